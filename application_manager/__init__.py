@@ -1,0 +1,1 @@
+"""The application manager: makes a cluster run what the live ApplicationTasks demand."""
