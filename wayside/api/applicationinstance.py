@@ -1,0 +1,113 @@
+"""ApplicationInstance: one running (or lingering) instance of a template."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from wayside.api.base import Condition, Identifier, JsonValue, Kind, Model, TemplateName, Time, conditions_field
+
+
+class ApplicationInstanceSpec(Model):
+    """What runs: a template with the values that the demands agree on."""
+
+    template: TemplateName = Field(description="The ApplicationTemplate, in the instance's namespace. Immutable.")
+    key: str | None = Field(
+        default=None,
+        max_length=1024,
+        description="The value of the template's key, lists and maps as JSON; absent where it has none. Immutable.",
+    )
+    parameters: dict[Identifier, JsonValue] = Field(
+        default_factory=dict, max_length=64, description="The merged values of the template's parameters."
+    )
+
+
+class ObjectReference(Model):
+    """An object that belongs to the instance."""
+
+    api_version: str = Field(max_length=255, description="The object's apiVersion.")
+    kind: str = Field(max_length=63, description="The object's kind.")
+    name: str = Field(max_length=253, description="The object's name.")
+    uid: str | None = Field(
+        default=None, max_length=63, description="The object's uid; absent until it was applied for the first time."
+    )
+
+
+class Demands(Model):
+    """The live tasks that the instance serves."""
+
+    count: int = Field(default=0, description="How many.")
+    names: list[Annotated[str, Field(max_length=253)]] = Field(
+        default_factory=list,
+        max_length=20,
+        description="The oldest 20.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+
+
+class InstancePhase(StrEnum):
+    """An instance's state in one word."""
+
+    PENDING = "Pending"
+    APPLIED = "Applied"
+    READY = "Ready"
+    LINGERING = "Lingering"
+    FAILED = "Failed"
+
+
+class ApplicationInstanceStatus(Model):
+    """What the instance consists of and how it is."""
+
+    phase: InstancePhase | None = Field(default=None, description="The state in one word.")
+    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
+    spec_hash: str | None = Field(
+        default=None, max_length=64, description="Digest of the manifests that were last applied in full."
+    )
+    release_time: Time | None = Field(
+        default=None, description="When the instance is removed, if no new demand comes: the end of its linger."
+    )
+    objects: list[ObjectReference] = Field(
+        default_factory=list,
+        max_length=128,
+        description="The objects that belong to it; written before they are applied.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    demands: Demands = Field(default=Demands(), description="The live tasks that it serves.")
+    conditions: list[Condition] = conditions_field(
+        "Applied: all objects are as the template says. Ready: its workloads are ready."
+    )
+
+
+class ApplicationInstance(Kind):
+    """One running (or lingering) instance of a template; the owner of all its objects."""
+
+    plural: ClassVar[str] = "applicationinstances"
+    short_name: ClassVar[str] = "appinst"
+    printer_columns: ClassVar[list[dict[str, str]]] = [
+        {"name": "Template", "type": "string", "jsonPath": ".spec.template"},
+        {"name": "Key", "type": "string", "jsonPath": ".spec.key"},
+        {"name": "Demands", "type": "integer", "jsonPath": ".status.demands.count"},
+        {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},
+        {"name": "Phase", "type": "string", "jsonPath": ".status.phase"},
+        {
+            "name": "Message",
+            "type": "string",
+            "jsonPath": '.status.conditions[?(@.type=="Applied")].message',
+            "priority": "1",
+        },
+        {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+    ]
+    object_validations: ClassVar[list[dict[str, str]]] = [
+        {
+            "rule": "self.spec.template == oldSelf.spec.template"
+            " && has(self.spec.key) == has(oldSelf.spec.key)"
+            " && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
+            "message": "spec.template and spec.key are immutable: delete this instance and create another",
+        },
+    ]
+
+    kind: str = "ApplicationInstance"
+    spec: ApplicationInstanceSpec = Field(description="What runs.")
+    status: ApplicationInstanceStatus | None = Field(default=None, description="What it consists of and how it is.")

@@ -1,0 +1,213 @@
+"""What all kinds share: strict camelCase models, durations, quantities, names and metadata."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.alias_generators import to_camel
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
+
+GROUP = "wayside.dev"
+VERSION = "v1alpha1"
+API_VERSION = f"{GROUP}/{VERSION}"
+
+MANAGED_BY_LABEL = "app.kubernetes.io/managed-by"
+MANAGED_BY = "wayside"
+
+
+class Model(BaseModel):
+    """Base of every part of a kind: camelCase on the wire, immutable, and a misspelt field is an error."""
+
+    model_config = ConfigDict(
+        alias_generator=to_camel, validate_by_name=True, validate_by_alias=True, extra="forbid", frozen=True
+    )
+
+    def to_json(self) -> dict[str, Any]:
+        """The object as it goes to the API server or into a file: camelCase, absent fields left out."""
+        return self.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+class _PatternString(str):
+    """A string that pydantic checks against a pattern and that keeps its text unchanged."""
+
+    pattern: ClassVar[str]
+    expectation: ClassVar[str]
+    maximum_length: ClassVar[int] = 20
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        if len(text) > cls.maximum_length or not re.fullmatch(cls.pattern, text):
+            raise ValueError(f"{text!r} is not {cls.expectation}")
+        return cls(text)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: type[Any], handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(
+            cls.parse,
+            core_schema.str_schema(strict=True),
+            serialization=core_schema.plain_serializer_function_ser_schema(str),
+        )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {"type": "string", "pattern": f"^{cls.pattern}$", "maxLength": cls.maximum_length}
+
+
+class Duration(_PatternString):
+    """A length of time such as ``500ms``, ``10s``, ``5m`` or ``2h``."""
+
+    pattern = r"[0-9]{1,9}(ms|s|m|h)"
+    expectation = "a duration: write a whole number and a unit, such as 500ms, 10s, 5m or 2h"
+    _UNITS: ClassVar[dict[str, int]] = {"ms": 10**6, "s": 10**9, "m": 60 * 10**9, "h": 3600 * 10**9}
+
+    @property
+    def ns(self) -> int:
+        """The duration in nanoseconds."""
+        digits = self.rstrip("hms")
+        return int(digits) * self._UNITS[self[len(digits) :]]
+
+    @property
+    def seconds(self) -> float:
+        """The duration in seconds."""
+        return self.ns / 1e9
+
+
+class Quantity(_PatternString):
+    """A size in Kubernetes notation, such as ``64Mi`` or ``1G``."""
+
+    pattern = r"[0-9]{1,12}(k|M|G|T|Ki|Mi|Gi|Ti)?"
+    expectation = "a size: write a whole number of bytes with or without a unit, such as 512Mi or 2G"
+    _UNITS: ClassVar[dict[str, int]] = {
+        "": 1,
+        "k": 10**3,
+        "M": 10**6,
+        "G": 10**9,
+        "T": 10**12,
+        "Ki": 2**10,
+        "Mi": 2**20,
+        "Gi": 2**30,
+        "Ti": 2**40,
+    }
+
+    @property
+    def bytes(self) -> int:
+        """The size in bytes."""
+        digits = re.match("[0-9]+", self)
+        assert digits is not None  # noqa: S101  the pattern guarantees it
+        return int(digits[0]) * self._UNITS[self[digits.end() :]]
+
+
+Expression = Annotated[str, Field(min_length=1, max_length=2048)]
+"""CEL source text."""
+
+ObjectName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")]
+"""A name of a Kubernetes object of ours (an RFC 1123 label)."""
+
+TemplateName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")]
+"""A template's name: shorter, since instances' and their objects' names are made from it."""
+
+ClientName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9._:-]+$")]
+"""The name of a vehicle or station."""
+
+Identifier = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+"""A name that expressions can use as a variable."""
+
+Time = Annotated[
+    str,
+    Field(
+        max_length=40,
+        pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?(Z|[+-][0-9]{2}:[0-9]{2})$",
+    ),
+]
+"""An RFC 3339 time, with up to nanoseconds."""
+
+JsonValue = Any
+"""Any JSON value; the schema says `x-kubernetes-preserve-unknown-fields`."""
+
+
+def validations(*rules: tuple[str, str]) -> ConfigDict:
+    """Model configuration with CEL validations for the CRD: pairs of a rule and the message of its refusal."""
+    return ConfigDict(
+        json_schema_extra={"x-kubernetes-validations": [{"rule": rule, "message": message} for rule, message in rules]}
+    )
+
+
+class OwnerReference(BaseModel):
+    """The object that owns this one."""
+
+    model_config = ConfigDict(alias_generator=to_camel, validate_by_name=True, validate_by_alias=True, extra="allow")
+
+    api_version: str
+    kind: str
+    name: str
+    uid: str
+    controller: bool = False
+
+
+class Metadata(BaseModel):
+    """The part of Kubernetes' ObjectMeta that we read; the rest passes through."""
+
+    model_config = ConfigDict(alias_generator=to_camel, validate_by_name=True, validate_by_alias=True, extra="allow")
+
+    name: str = Field(min_length=1, max_length=253)
+    namespace: str = "default"
+    uid: str = ""
+    labels: dict[str, str] = Field(default_factory=dict)
+    annotations: dict[str, str] = Field(default_factory=dict)
+    generation: int = 0
+    resource_version: str = ""
+    creation_timestamp: str = ""
+    deletion_timestamp: str | None = None
+    owner_references: list[OwnerReference] = Field(default_factory=list)
+
+
+class Condition(Model):
+    """One aspect of an object's state, in Kubernetes' usual form."""
+
+    type: str = Field(description="The aspect, e.g. Ready.", max_length=63)
+    status: str = Field(description="True, False or Unknown.", json_schema_extra={"enum": ["True", "False", "Unknown"]})
+    reason: str = Field(description="One word why, for programs.", max_length=63, pattern=r"^[A-Za-z][A-Za-z0-9]*$")
+    message: str = Field(default="", description="Why, for people.", max_length=4096)
+    observed_generation: int = Field(default=0, description="The generation of the spec that this speaks of.")
+    last_transition_time: Time = Field(description="When the status last changed.")
+
+
+def conditions_field(description: str) -> Any:
+    """A list of conditions, merged by type."""
+    return Field(
+        default_factory=list,
+        description=description,
+        max_length=16,
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]},
+    )
+
+
+class Kind(Model):
+    """A resource: apiVersion, kind, metadata and (in subclasses) spec and status.
+
+    Unknown fields beside `spec` and `status` are refused like those inside.
+    """
+
+    plural: ClassVar[str]
+    short_name: ClassVar[str]
+    printer_columns: ClassVar[list[dict[str, str]]] = []
+    selectable_fields: ClassVar[list[str]] = []
+    name_limit: ClassVar[int] = 63
+    object_validations: ClassVar[list[dict[str, str]]] = []
+
+    api_version: str = API_VERSION
+    kind: str
+    metadata: Metadata
+
+    @property
+    def name(self) -> str:
+        """The object's name."""
+        return self.metadata.name
+
+    @property
+    def namespace(self) -> str:
+        """The object's namespace."""
+        return self.metadata.namespace

@@ -1,0 +1,263 @@
+"""Detector: which data a detector takes in, how long it keeps it, and which rules it evaluates."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field, model_validator
+
+from wayside.api.base import (
+    ClientName,
+    Condition,
+    Duration,
+    Expression,
+    Kind,
+    Model,
+    ObjectName,
+    Quantity,
+    conditions_field,
+    validations,
+)
+
+Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
+"""A Zenoh endpoint such as tcp/zenoh:7447."""
+
+
+class ZenohMode(StrEnum):
+    """How the detector takes part in the Zenoh network."""
+
+    CLIENT = "client"
+    PEER = "peer"
+
+
+class Zenoh(Model):
+    """The detector's Zenoh session."""
+
+    mode: ZenohMode = Field(default=ZenohMode.PEER, description="client (of a router) or peer.")
+    connect: list[Endpoint] = Field(
+        default_factory=list,
+        max_length=16,
+        description="Endpoints to connect to, e.g. tcp/zenoh:7447. Lost connections are sought again.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    listen: list[Endpoint] = Field(
+        default_factory=list,
+        max_length=16,
+        description="Endpoints to listen on, e.g. tcp/0.0.0.0:7447. A peer without any listens on a free port.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    scouting: bool = Field(default=False, description="Whether to look for others by multicast.")
+
+
+class Client(Model):
+    """What is known of a client beforehand."""
+
+    name: ClientName = Field(description="The client's name, as it appears in the streams' keys.")
+    labels: dict[Annotated[str, Field(max_length=63)], Annotated[str, Field(max_length=256)]] = Field(
+        default_factory=dict, max_length=32, description="Facts for rules to use, e.g. labels.role."
+    )
+
+
+class Encoding(StrEnum):
+    """How the bytes of a stream are to be read."""
+
+    CDR = "cdr"
+    JSON = "json"
+
+
+class StreamBuffer(Model):
+    """How much of a stream is kept, per client."""
+
+    duration: Duration | None = Field(default=None, description="Samples older than this are forgotten.")
+    bytes: Quantity | None = Field(default=None, description="The oldest samples beyond this size are forgotten.")
+
+
+class Stream(Model):
+    """One kind of data of every client."""
+
+    model_config = validations(
+        (
+            "(self.encoding == 'cdr') == has(self.type)",
+            "type is for cdr streams, and they need it, e.g. geometry_msgs/msg/PoseStamped",
+        ),
+        (
+            "self.key.contains('${client:') != has(self.client)",
+            "key must capture the client, as ${client:*}, or client must name it; not both",
+        ),
+    )
+
+    name: ObjectName = Field(description="The name by which rules refer to the stream.")
+    key: str = Field(
+        min_length=1,
+        max_length=512,
+        description="The Zenoh key expression in key-format notation: ${client:*} captures the client's name, "
+        "e.g. vehicles/${client:*}/pose. A ROS topic is the key without its leading slash.",
+    )
+    client: ClientName | None = Field(
+        default=None, description="The client that the data belongs to, where the key captures none."
+    )
+    encoding: Encoding = Field(description="cdr (ROS 2 messages) or json.")
+    type: str | None = Field(
+        default=None,
+        max_length=255,
+        pattern=r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$",
+        description="The ROS 2 message type of a cdr stream, e.g. geometry_msgs/msg/PoseStamped.",
+    )
+    stamp: Expression | None = Field(
+        default=None,
+        description="CEL over msg: the sender's time in seconds. Default: header.stamp where the type has one, "
+        "else the receive time.",
+    )
+    stale_after: Duration | str | None = Field(
+        default=None,
+        description="Signals of the stream are unknown when its newest sample is older than this. "
+        "Default: clientTimeout. Never: not at all, for latched topics.",
+        json_schema_extra={"type": "string", "pattern": "^([0-9]{1,9}(ms|s|m|h)|Never)$", "maxLength": 20},
+    )
+    buffer: StreamBuffer = Field(
+        default=StreamBuffer(), description="How much is kept; the Detector's buffer where absent."
+    )
+
+    @model_validator(mode="after")
+    def _coherent(self) -> Stream:
+        if self.encoding is Encoding.CDR and self.type is None:
+            raise ValueError("a cdr stream needs its message type: give type, e.g. geometry_msgs/msg/PoseStamped")
+        if self.encoding is Encoding.JSON and self.type is not None:
+            raise ValueError("a json stream has no type: remove it")
+        captures = "${client:" in self.key
+        if captures and self.client is not None:
+            raise ValueError("key captures the client and client names one: remove one of them")
+        if not captures and self.client is None:
+            raise ValueError("key captures no client: write ${client:*} where its name stands, or give client")
+        if self.stale_after is not None and self.stale_after != "Never":
+            Duration.parse(self.stale_after)
+        return self
+
+    @property
+    def stale_after_ns(self) -> int | None:
+        """Nanoseconds, or None where not given or Never (see `never_stale`)."""
+        return None if self.stale_after is None or self.never_stale else Duration(self.stale_after).ns
+
+    @property
+    def never_stale(self) -> bool:
+        """Whether the newest sample holds forever."""
+        return self.stale_after == "Never"
+
+
+class Buffer(Model):
+    """How much is kept of all streams together, and of a stream that does not say."""
+
+    duration: Duration = Field(default=Duration("10s"), description="How long samples are kept.")
+    bytes: Quantity = Field(
+        default=Quantity("512Mi"), description="The cap over all streams: beyond it, the oldest samples are forgotten."
+    )
+
+
+class Clock(StrEnum):
+    """Which time is the detector's."""
+
+    WALL = "Wall"
+    DATA = "Data"
+
+
+class RuleSelector(Model):
+    """Picks EventRules of the Detector's namespace by their labels."""
+
+    match_labels: dict[Annotated[str, Field(max_length=317)], Annotated[str, Field(max_length=63)]] = Field(
+        default_factory=dict, max_length=16, description="All must match; an empty map selects every rule."
+    )
+
+    def matches(self, labels: dict[str, str]) -> bool:
+        """Whether a rule with these labels is selected."""
+        return all(labels.get(key) == value for key, value in self.match_labels.items())
+
+
+class DetectorSpec(Model):
+    """Streams, buffer, time and rules of a detector."""
+
+    zenoh: Zenoh = Field(default=Zenoh(), description="The Zenoh session.")
+    clients: list[Client] = Field(
+        default_factory=list,
+        max_length=1024,
+        description="What is known of clients beforehand; others appear with their first sample.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    streams: list[Stream] = Field(
+        min_length=1,
+        max_length=128,
+        description="The data to take in.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    buffer: Buffer = Field(default=Buffer(), description="How much is kept.")
+    client_timeout: Duration = Field(
+        default=Duration("30s"),
+        description="A client from which nothing was received this long is lost: its episodes end, reason ClientLost. "
+        "Counted from the detector's start at the earliest.",
+    )
+    clock: Clock = Field(
+        default=Clock.WALL,
+        description="Wall: a sample's time is when it was received. Data: its stamp, for simulated time, recordings.",
+    )
+    lateness: Duration = Field(
+        default=Duration("200ms"),
+        description="With clock Data: the tick t runs once a stamp of at least t + lateness was seen.",
+    )
+    max_ahead: Duration = Field(
+        default=Duration("1s"),
+        description="With clock Data: a sample whose stamp is further ahead of the rest is dropped and counted.",
+    )
+    rules: RuleSelector = Field(default=RuleSelector(), description="Which EventRules of the namespace are evaluated.")
+
+    @model_validator(mode="after")
+    def _unique_names(self) -> DetectorSpec:
+        for field, names in (("streams", [s.name for s in self.streams]), ("clients", [c.name for c in self.clients])):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"{field}: the name {twice[0]!r} is used twice: names must be unique")
+        return self
+
+    def stream(self, name: str) -> Stream | None:
+        """The stream of that name, if there is one."""
+        return next((stream for stream in self.streams if stream.name == name), None)
+
+    def buffer_duration_ns(self, stream: Stream) -> int:
+        """How long samples of the stream are kept, in nanoseconds."""
+        return (stream.buffer.duration or self.buffer.duration).ns
+
+    def stale_after_ns(self, stream: Stream) -> int | None:
+        """When a stream's newest sample is too old to be believed, in nanoseconds; None: never."""
+        if stream.never_stale:
+            return None
+        return self.client_timeout.ns if stream.stale_after_ns is None else stream.stale_after_ns
+
+
+class DetectorStatus(Model):
+    """What the application manager says of the detector."""
+
+    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
+    rules: int = Field(default=0, description="How many EventRules it selects.")
+    conditions: list[Condition] = conditions_field("Accepted: whether the detector can run.")
+
+
+class Detector(Kind):
+    """What a detector takes in, keeps and evaluates."""
+
+    plural: ClassVar[str] = "detectors"
+    short_name: ClassVar[str] = "det"
+    printer_columns: ClassVar[list[dict[str, str]]] = [
+        {"name": "Clock", "type": "string", "jsonPath": ".spec.clock"},
+        {"name": "Rules", "type": "integer", "jsonPath": ".status.rules"},
+        {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
+        {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+    ]
+
+    kind: str = "Detector"
+    spec: DetectorSpec = Field(description="Streams, buffer, time and rules.")
+    status: DetectorStatus | None = Field(
+        default=None, description="What the application manager says of the detector."
+    )
+
+    def known_labels(self) -> dict[str, dict[str, Any]]:
+        """Labels of the clients that are known beforehand, by client."""
+        return {client.name: dict(client.labels) for client in self.spec.clients}

@@ -1,0 +1,265 @@
+"""EventRule: what an event is (scope, signals, when, until, for) and what to do about it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field, model_validator
+
+from wayside.api.base import (
+    Condition,
+    Duration,
+    Expression,
+    Identifier,
+    JsonValue,
+    Kind,
+    Model,
+    ObjectName,
+    TemplateName,
+    conditions_field,
+    validations,
+)
+from wayside.api.classification import Classification
+
+
+class Aggregate(StrEnum):
+    """How the samples of a window become one value."""
+
+    LAST = "Last"
+    MIN = "Min"
+    MAX = "Max"
+    MEAN = "Mean"
+    COUNT = "Count"
+    AGE = "Age"
+
+
+WINDOWED = frozenset({Aggregate.MIN, Aggregate.MAX, Aggregate.MEAN, Aggregate.COUNT})
+"""The aggregates that need `over`."""
+
+
+class Position(Model):
+    """Where a client is, in metres of one common frame."""
+
+    stream: ObjectName = Field(description="The stream whose newest sample tells the position.")
+    x: Expression = Field(description="CEL over msg: metres along the first axis, e.g. msg.pose.position.x.")
+    y: Expression = Field(description="CEL over msg: metres along the second axis.")
+    z: Expression | None = Field(default=None, description="CEL over msg: metres along the third axis; 0 where absent.")
+
+
+class ClientScope(Model):
+    """The rule is evaluated once for each client."""
+
+    where: Expression | None = Field(
+        default=None,
+        description="CEL over client, labels and streams: only clients for which it is true. "
+        "Turning false ends an open episode, reason OutOfScope.",
+    )
+
+
+class PairsScope(Model):
+    """The rule is evaluated once for each unordered pair of clients; a is the one with the smaller name."""
+
+    position: Position = Field(description="Where a client is.")
+    within: float = Field(
+        gt=0,
+        le=1_000_000,
+        description="Metres. Only pairs at most this far apart can start an episode; a pair with an open episode "
+        "is always evaluated.",
+    )
+    where: Expression | None = Field(
+        default=None,
+        description="CEL over a, b and distance: only pairs for which it is true. "
+        "Turning false ends an open episode, reason OutOfScope.",
+    )
+
+
+class Scope(Model):
+    """Whom the rule is about: exactly one of the fields."""
+
+    model_config = validations(
+        ("has(self.client) != has(self.pairs)", "exactly one of client and pairs must be given"),
+    )
+
+    client: ClientScope | None = Field(default=None, description="Each client on its own. The default.")
+    pairs: PairsScope | None = Field(default=None, description="Each pair of clients near each other.")
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Scope:
+        if (self.client is None) == (self.pairs is None):
+            raise ValueError("exactly one of client and pairs must be given")
+        return self
+
+
+class Evaluation(Model):
+    """When the rule is evaluated."""
+
+    model_config = validations(
+        ("!self.every.endsWith('ms') || duration(self.every) >= duration('10ms')", "every: give 10ms or more"),
+    )
+
+    every: Duration = Field(
+        default=Duration("1s"), description="The rule is evaluated at each whole multiple of this; 10ms at the least."
+    )
+
+    @model_validator(mode="after")
+    def _not_too_often(self) -> Evaluation:
+        if self.every.ns < 10_000_000:
+            raise ValueError(f"every: {self.every} is too short: give 10ms or more")
+        return self
+
+
+class Signal(Model):
+    """A value computed from the samples of a stream."""
+
+    model_config = validations(
+        (
+            "!(self.aggregate in ['Min', 'Max', 'Mean', 'Count']) || has(self.over)",
+            "the aggregates Min, Max, Mean and Count need a window: give over, e.g. over: 5s",
+        ),
+        (
+            "(self.aggregate in ['Count', 'Age']) != has(self.value)",
+            "give value, e.g. value: msg.speed; but none for the aggregates Count and Age, which look at no value",
+        ),
+    )
+
+    name: Identifier = Field(description="The variable by which expressions use the signal.")
+    stream: ObjectName = Field(description="The stream of the Detector that it is computed from.")
+    value: Expression | None = Field(
+        default=None,
+        description="CEL over msg (the decoded sample), key (the captured chunks) and sample (stamp, received, "
+        "latency, size). Not needed for Count and Age.",
+    )
+    where: Expression | None = Field(
+        default=None, description="CEL over msg, key and sample: only samples for which it is true count."
+    )
+    over: Duration | None = Field(
+        default=None, description="The window (t - over, t]. Needed by Min, Max, Mean and Count."
+    )
+    aggregate: Aggregate = Field(
+        default=Aggregate.LAST,
+        description="How samples become one value. Last: the newest. Age: seconds since the last one was received.",
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Signal:
+        if self.aggregate in WINDOWED and self.over is None:
+            raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
+        if self.aggregate not in (Aggregate.COUNT, Aggregate.AGE) and self.value is None:
+            raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
+        if self.aggregate in (Aggregate.COUNT, Aggregate.AGE) and self.value is not None:
+            raise ValueError(f"aggregate {self.aggregate} looks at no value: remove value (where picks samples)")
+        return self
+
+
+class Deploy(Model):
+    """Demand an application for as long as the episode lasts."""
+
+    template: TemplateName = Field(description="The ApplicationTemplate, in the rule's namespace.")
+    priority: int = Field(
+        default=0, ge=-1_000_000, le=1_000_000, description="Tasks of higher priority are looked at first."
+    )
+    parameters: dict[Identifier, JsonValue] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="The template's parameters, with ${…} over the rule's variables at the start of the episode.",
+    )
+
+
+class Action(Model):
+    """What an episode leads to."""
+
+    name: ObjectName = Field(description="Unique within the rule.")
+    deploy: Deploy = Field(description="Emit an ApplicationTask that holds while the episode lasts.")
+
+
+class EventRuleSpec(Model):
+    """An event and its actions."""
+
+    description: str = Field(default="", max_length=1024, description="What the event is, for people.")
+    classification: Classification | None = Field(
+        default=None, description="Where the use case stands in the classification scheme."
+    )
+    enabled: bool = Field(
+        default=True, description="false: the rule is loaded and checked, but not evaluated; open episodes end."
+    )
+    dry_run: bool = Field(default=False, description="true: events are published, but no action runs.")
+    scope: Scope = Field(default=Scope(client=ClientScope()), description="Whom the rule is about.")
+    evaluation: Evaluation = Field(default=Evaluation(), description="When the rule is evaluated.")
+    signals: list[Signal] = Field(
+        default_factory=list,
+        max_length=64,
+        description="The values that the conditions use. In a pairs scope each client has its own: a.speed, b.speed.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    when: Expression = Field(description="CEL, boolean: an episode starts when it holds.")
+    until: Expression | None = Field(
+        default=None, description="CEL, boolean: an open episode ends when it holds. Default: not `when`."
+    )
+    for_: Duration = Field(
+        default=Duration("0s"), alias="for", description="`when` must hold this long before an episode starts."
+    )
+    cooldown: Duration = Field(
+        default=Duration("0s"), description="After an episode its subject rests this long; no onset falls into it."
+    )
+    unknown_timeout: Duration | None = Field(
+        default=None,
+        description="An open episode whose condition stays unknown this long ends, reason Unknown. "
+        "Default: the Detector's clientTimeout.",
+    )
+    actions: list[Action] = Field(
+        default_factory=list,
+        max_length=16,
+        description="What to do about it. Without any, the rule only publishes events.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+
+    @model_validator(mode="after")
+    def _unique_names(self) -> EventRuleSpec:
+        for field, names in (("signals", [s.name for s in self.signals]), ("actions", [a.name for a in self.actions])):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"{field}: the name {twice[0]!r} is used twice: names must be unique")
+        return self
+
+
+class EventRuleStatus(Model):
+    """What the application manager says of the rule."""
+
+    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
+    detectors: list[Annotated[str, Field(max_length=63)]] = Field(
+        default_factory=list,
+        max_length=256,
+        description="The Detectors that select the rule.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    conditions: list[Condition] = conditions_field("Accepted: whether the rule can be evaluated.")
+
+
+class EventRule(Kind):
+    """An event to detect in the data of vehicles and stations, and what to do about it."""
+
+    plural: ClassVar[str] = "eventrules"
+    short_name: ClassVar[str] = "er"
+    printer_columns: ClassVar[list[dict[str, str]]] = [
+        {"name": "Enabled", "type": "boolean", "jsonPath": ".spec.enabled"},
+        {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
+        {"name": "Detectors", "type": "string", "jsonPath": ".status.detectors"},
+        {"name": "When", "type": "string", "jsonPath": ".spec.when"},
+        {
+            "name": "Message",
+            "type": "string",
+            "jsonPath": '.status.conditions[?(@.type=="Accepted")].message',
+            "priority": "1",
+        },
+        {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+    ]
+
+    kind: str = "EventRule"
+    spec: EventRuleSpec = Field(description="The event and its actions.")
+    status: EventRuleStatus | None = Field(default=None, description="What the application manager says of the rule.")
+
+    def semantics(self) -> dict[str, Any]:
+        """The fields that decide which episodes there are; another value of any of them ends open episodes."""
+        spec = self.spec.to_json()
+        return {field: spec.get(field) for field in ("scope", "signals", "when", "until", "for")}

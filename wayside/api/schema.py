@@ -1,0 +1,121 @@
+"""Models to CRDs: pydantic's JSON schema made structural, plus what Kubernetes wants beside it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from wayside.api.base import GROUP, VERSION, Kind
+
+_KEPT = {
+    "type", "description", "pattern", "minLength", "maxLength", "minimum", "maximum", "exclusiveMinimum",
+    "minItems", "maxItems", "minProperties", "maxProperties", "enum", "default", "required",
+}  # fmt: skip
+
+
+def crd(kind: type[Kind]) -> dict[str, Any]:
+    """The CustomResourceDefinition of a kind."""
+    name = kind.__name__
+    version: dict[str, Any] = {
+        "name": VERSION,
+        "served": True,
+        "storage": True,
+        "schema": {"openAPIV3Schema": _object_schema(kind)},
+        "subresources": {"status": {}},
+        "additionalPrinterColumns": [_column(column) for column in kind.printer_columns],
+    }
+    if kind.selectable_fields:
+        version["selectableFields"] = [{"jsonPath": path} for path in kind.selectable_fields]
+    return {
+        "apiVersion": "apiextensions.k8s.io/v1",
+        "kind": "CustomResourceDefinition",
+        "metadata": {"name": f"{kind.plural}.{GROUP}"},
+        "spec": {
+            "group": GROUP,
+            "scope": "Namespaced",
+            "names": {
+                "kind": name,
+                "listKind": f"{name}List",
+                "plural": kind.plural,
+                "singular": name.lower(),
+                "shortNames": [kind.short_name],
+                "categories": ["wayside"],
+            },
+            "versions": [version],
+        },
+    }
+
+
+def _column(column: dict[str, str]) -> dict[str, Any]:
+    return {**column, "priority": int(column["priority"])} if "priority" in column else dict(column)
+
+
+def _object_schema(kind: type[Kind]) -> dict[str, Any]:
+    source = kind.model_json_schema(by_alias=True)
+    definitions = source.get("$defs", {})
+    properties = {field: _structural(source["properties"][field], definitions) for field in ("spec", "status")}
+    return {
+        "type": "object",
+        "description": (kind.__doc__ or "").strip(),
+        "required": ["spec"],
+        "properties": {
+            "apiVersion": {"type": "string"},
+            "kind": {"type": "string"},
+            "metadata": {"type": "object", "properties": {"name": {"type": "string", "maxLength": kind.name_limit}}},
+            **properties,
+        },
+        **({"x-kubernetes-validations": list(kind.object_validations)} if kind.object_validations else {}),
+    }
+
+
+def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Inline references, turn optional into absent, and keep only what a structural schema knows."""
+    node = _resolved(node, definitions)
+    result = {key: value for key, value in node.items() if key in _KEPT or key.startswith("x-kubernetes-")}
+    if "default" in result:
+        result["default"] = _without_nulls(result["default"])
+        if result["default"] is None:
+            del result["default"]
+    if "exclusiveMinimum" in result:
+        result["minimum"] = result.pop("exclusiveMinimum")
+        result["exclusiveMinimum"] = True
+    if result.get("type") == "object" or "properties" in node:
+        if "properties" in node:
+            result["properties"] = {name: _structural(child, definitions) for name, child in node["properties"].items()}
+        else:
+            # A map: the pattern of its keys cannot be said in a structural schema; the programs check it.
+            values = node.get("additionalProperties", {})
+            patterned = node.get("patternProperties", {})
+            values = next(iter(patterned.values())) if patterned else values
+            if isinstance(values, dict):
+                result["additionalProperties"] = _structural(values, definitions)
+            if result.get("x-kubernetes-preserve-unknown-fields"):
+                result.pop("additionalProperties", None)
+    elif result.get("type") == "array":
+        result["items"] = _structural(node.get("items", {}), definitions)
+    elif "type" not in result:
+        result["x-kubernetes-preserve-unknown-fields"] = True
+    return result
+
+
+def _without_nulls(value: Any) -> Any:
+    """Absent and null are one to us; a structural schema's default must leave null out."""
+    if isinstance(value, dict):
+        return {key: _without_nulls(child) for key, child in value.items() if child is not None}
+    return value
+
+
+def _resolved(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Follow `$ref`, and `anyOf` of one type and null; what stands beside the reference wins."""
+    beside = {key: value for key, value in node.items() if key not in ("$ref", "anyOf", "allOf")}
+    if "type" in beside and "anyOf" in node:
+        return beside  # the model says the schema by hand
+    if "$ref" in node:
+        target = _resolved(definitions[node["$ref"].rsplit("/", 1)[1]], definitions)
+        return {**target, **beside}
+    for combinator in ("anyOf", "allOf"):
+        if combinator in node:
+            choices = [choice for choice in node[combinator] if choice.get("type") != "null"]
+            if len(choices) != 1:
+                raise ValueError(f"a structural schema cannot say a choice of types: {node}")
+            return {**_resolved(choices[0], definitions), **beside}
+    return beside
