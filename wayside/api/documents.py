@@ -1,0 +1,250 @@
+"""YAML files to kinds: every error names the file, the line and the field, and says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from wayside.api import API_VERSION, KINDS
+from wayside.api.base import Kind
+
+FieldPath = tuple[str | int, ...]
+
+_YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something wrong at one place of a file."""
+
+    file: str
+    line: int
+    column: int
+    field: str
+    message: str
+
+    def __str__(self) -> str:
+        where = f"{self.file}:{self.line}:{self.column}: " if self.line else f"{self.file}: "
+        return where + (f"{self.field}: " if self.field else "") + self.message
+
+
+class DocumentError(Exception):
+    """Files that cannot be used; `problems` has all that is wrong with them."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        super().__init__("\n".join(map(str, problems)))
+        self.problems = tuple(problems)
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """One object of a file, and where its fields stand."""
+
+    object: Kind
+    file: str
+    marks: dict[FieldPath, tuple[int, int]] = field(repr=False, compare=False)
+
+    @property
+    def line(self) -> int:
+        """The line on which the object begins."""
+        return self.marks.get((), (1, 1))[0]
+
+    def problem(self, path: FieldPath, message: str) -> Problem:
+        """A problem at a field, e.g. ("spec", "signals", 0, "value"); its closest ancestor where it is absent."""
+        line, column = _mark(self.marks, path)
+        return Problem(self.file, line, column, field_text(path), message)
+
+
+def field_text(path: FieldPath) -> str:
+    """A field's path as people write it, e.g. spec.signals[0].value."""
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def load_documents(paths: Iterable[str | Path]) -> list[Document]:
+    """Read all objects of the files (a folder stands for its *.yaml, *.yml and *.json files).
+
+    Raises:
+        DocumentError: with every problem of every file: unreadable, no YAML, not of our kinds, or fields that do
+            not fit them.
+    """
+    documents: list[Document] = []
+    problems: list[Problem] = []
+    for file in _files(paths, problems):
+        try:
+            text = file.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
+            problems.append(Problem(str(file), 0, 0, "", f"cannot be read: {reason}"))
+            continue
+        for node in _nodes(text, str(file), problems):
+            document = _document(node, str(file), problems)
+            if document is not None:
+                documents.append(document)
+    if problems:
+        raise DocumentError(problems)
+    return documents
+
+
+def parse_object(raw: dict[str, Any]) -> Kind:
+    """An object from the API server as its kind.
+
+    Raises:
+        ValueError: it is of none of our kinds, or its fields do not fit; the text names each field.
+    """
+    kind = _kind_of(raw)
+    try:
+        return kind.model_validate(raw)
+    except ValidationError as error:
+        raise ValueError(
+            "; ".join(f"{field_text(path)}: {message}" for path, message in _messages(error, raw))
+        ) from None
+
+
+def _files(paths: Iterable[str | Path], problems: list[Problem]) -> Iterator[Path]:
+    for path in map(Path, paths):
+        if path.is_dir():
+            inside = sorted(child for child in path.iterdir() if child.suffix in (".yaml", ".yml", ".json"))
+            if not inside:
+                problems.append(Problem(str(path), 0, 0, "", "the folder holds no .yaml, .yml or .json file"))
+            yield from inside
+        elif path.exists():
+            yield path
+        else:
+            problems.append(Problem(str(path), 0, 0, "", "there is no such file: check the path"))
+
+
+def _nodes(text: str, file: str, problems: list[Problem]) -> Iterator[yaml.Node]:
+    try:
+        for node in yaml.compose_all(text, Loader=_YAML_LOADER):
+            if node is not None and not (isinstance(node, yaml.ScalarNode) and node.value == ""):
+                yield node
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
+        source = text.splitlines()[line - 1] if 0 < line <= len(text.splitlines()) else ""
+        problems.append(Problem(file, line, column, "", f"is not YAML: {error.problem}{_quote_hint(source)}"))
+
+
+def _quote_hint(line: str) -> str:
+    """An expression that starts with a quote or a `!` means something else to YAML."""
+    _, _, value = line.partition(": ")
+    if value.lstrip()[:1] in ('"', "'", "!", "[", "{", "&", "*"):
+        return (
+            "; an expression that begins like this must be quoted as a whole: '"
+            + value.strip().replace("'", "''")
+            + "'"
+        )
+    return ""
+
+
+def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document | None:
+    marks: dict[FieldPath, tuple[int, int]] = {}
+    try:
+        raw = _value(node, (), marks)
+    except _TagError as error:
+        problems.append(Problem(file, *error.mark, field_text(error.path), error.message))
+        return None
+    try:
+        if not isinstance(raw, dict):
+            raise ValueError(f"is not an object but {raw!r}: each document needs apiVersion, kind, metadata and spec")
+        kind = _kind_of(raw)
+    except ValueError as error:
+        problems.append(Problem(file, *_mark(marks, ()), "", str(error)))
+        return None
+    try:
+        return Document(kind.model_validate(raw), file, marks)
+    except ValidationError as error:
+        for path, message in _messages(error, raw):
+            problems.append(Problem(file, *_mark(marks, path), field_text(path), message))
+        return None
+
+
+def _kind_of(raw: dict[str, Any]) -> type[Kind]:
+    kind = KINDS.get(str(raw.get("kind")))
+    if raw.get("apiVersion") != API_VERSION or kind is None:
+        raise ValueError(
+            f"apiVersion {raw.get('apiVersion')!r}, kind {raw.get('kind')!r} is none of ours: "
+            f"write apiVersion: {API_VERSION} and one of the kinds {', '.join(KINDS)}"
+        )
+    return kind
+
+
+class _TagError(Exception):
+    def __init__(self, path: FieldPath, mark: tuple[int, int], message: str) -> None:
+        super().__init__(message)
+        self.path, self.mark, self.message = path, mark, message
+
+
+def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, int]]) -> Any:
+    """The node as plain Python; notes where each field stands."""
+    mark = (node.start_mark.line + 1, node.start_mark.column + 1)
+    marks[path] = mark
+    if node.tag.startswith("!"):
+        written = f"{node.tag} {node.value}".strip() if isinstance(node, yaml.ScalarNode) else node.tag
+        raise _TagError(path, mark, f"YAML takes {node.tag} for a tag: quote the expression, '{written}'")
+    if isinstance(node, yaml.MappingNode):
+        result: dict[str, Any] = {}
+        for key_node, child in node.value:
+            key = str(key_node.value)
+            if key in result:
+                key_mark = (key_node.start_mark.line + 1, key_node.start_mark.column + 1)
+                raise _TagError((*path, key), key_mark, "is given twice: remove one")
+            result[key] = _value(child, (*path, key), marks)
+        return result
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(child, (*path, index), marks) for index, child in enumerate(node.value)]
+    if node.tag == "tag:yaml.org,2002:timestamp":
+        return node.value  # times stay text
+    return yaml.SafeLoader("").construct_object(node)
+
+
+def _mark(marks: dict[FieldPath, tuple[int, int]], path: FieldPath) -> tuple[int, int]:
+    while path and path not in marks:
+        path = path[:-1]
+    return marks.get(path, (1, 1))
+
+
+def _messages(error: ValidationError, raw: Any) -> Iterator[tuple[FieldPath, str]]:
+    """Pydantic's errors in our words, with the paths as the author wrote them."""
+    for item in error.errors(include_url=False):
+        path = _written(item["loc"], raw)
+        match item["type"]:
+            case "missing":
+                yield path, "is missing: give it"
+            case "extra_forbidden":
+                yield path, "there is no such field: check its spelling and its place"
+            case "value_error":
+                yield path, str(item["ctx"]["error"])
+            case _:
+                yield path, f"{item['msg'][0].lower()}{item['msg'][1:]}; given: {_short(item['input'])}"
+
+
+def _written(location: tuple[int | str, ...], raw: Any) -> FieldPath:
+    """Drop the parts of a location that pydantic adds and that stand in no file (function and union tags)."""
+    path: list[str | int] = []
+    here = raw
+    for index, part in enumerate(location):
+        last = index == len(location) - 1
+        if isinstance(here, dict) and (part in here or last):
+            here = here.get(part)
+        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+            here = here[part]
+        elif not last:
+            continue
+        else:
+            break
+        path.append(part)
+    return tuple(path)
+
+
+def _short(value: Any, limit: int = 80) -> str:
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 1] + "…"
