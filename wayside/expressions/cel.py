@@ -1,0 +1,227 @@
+"""The one interface to CEL: declare variables, compile an expression, evaluate it on values.
+
+An `Environment` holds the declared variables and compiles; an `Expression` is evaluated as often as wanted, from any
+thread. Unknown values follow Kleene's logic: CEL carries an error through `&&`, `||`, `!` and `?:` exactly as Kleene
+carries the unknown, so what is unknown is left out of the values (see `projection`) and an error means unknown.
+"""
+
+from __future__ import annotations
+
+import datetime
+import enum
+import math
+import re
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from cel_expr_python import cel
+
+from wayside.expressions.diagnostics import EMPTY, diagnose
+from wayside.expressions.errors import EvaluationError, ExpressionError, position
+from wayside.expressions.numbers import MAX_EXACT, doubled
+from wayside.expressions.projection import project, tree
+from wayside.expressions.syntax import Path, parse, paths
+from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
+
+Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int | bool, "Value"]
+"""What an expression yields: plain data. An int is one beyond 2^53."""
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_CACHE_SIZE = 1024
+
+
+class Kind(enum.Enum):
+    """The type of a variable or a result; DYN is checked only at evaluation."""
+
+    DYN = "any value"
+    DOUBLE = "a number"
+    STRING = "a text"
+    BOOL = "a boolean"
+    MAP = "a map"
+    LIST = "a list"
+
+
+_TYPES: Final = {
+    Kind.DYN: cel.Type.DYN,
+    Kind.DOUBLE: cel.Type.DOUBLE,
+    Kind.STRING: cel.Type.STRING,
+    Kind.BOOL: cel.Type.BOOL,
+    Kind.MAP: cel.Type.Map(cel.Type.STRING, cel.Type.DYN),
+    Kind.LIST: cel.Type.List(cel.Type.DYN),
+}
+_PYTHON: Final[Mapping[Kind, type | tuple[type, ...]]] = {
+    Kind.DOUBLE: (float, int),
+    Kind.STRING: str,
+    Kind.BOOL: bool,
+    Kind.MAP: dict,
+    Kind.LIST: list,
+}
+_NAMED_KINDS: Final = {"DOUBLE": Kind.DOUBLE, "INT": Kind.DOUBLE, "UINT": Kind.DOUBLE, "STRING": Kind.STRING}
+
+
+class Environment:
+    """The variables that expressions may use. Immutable; compiled expressions are cached."""
+
+    def __init__(self, variables: Mapping[str, Kind]) -> None:
+        for name in variables:
+            if not _NAME.fullmatch(name):
+                raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
+        self.variables: Mapping[str, Kind] = dict(variables)
+        self._env = cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables.items()})
+        self._cache: dict[tuple[str, Kind], Expression] = {}
+
+    def compile(self, source: str, *, result: Kind = Kind.DYN) -> Expression:
+        """Compiles `source`; where its type can be told only at evaluation, `result` is checked then.
+
+        Raises ExpressionError, pointing into `source`, for what does not parse, has the wrong type or names what is
+        not declared.
+        """
+        if not isinstance(source, str):
+            raise _not_text(source)
+        cached = self._cache.get((source, result))
+        if cached is not None:
+            return cached
+        if not source.strip():
+            raise ExpressionError("the expression is empty", source=source, hint=EMPTY)
+        rewritten = doubled(source)
+        try:
+            program = self._env.compile(rewritten.text)
+            node = parse(program.serialize())
+        except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
+            raise diagnose(str(error), source, rewritten, self.variables) from None
+        _check_static(program.return_type(), result, source)
+        expression = Expression(source, program, paths(node, frozenset(self.variables)), result)
+        if len(self._cache) >= _CACHE_SIZE:
+            self._cache.clear()  # a bound against rules that come and go for months; refilling costs 50 µs each
+        self._cache[source, result] = expression
+        return expression
+
+
+class Expression:
+    """A compiled expression. `paths` are the literal paths it reads, `names` the variables among them."""
+
+    __slots__ = ("_program", "_read", "names", "paths", "result", "source")
+
+    def __init__(self, source: str, program: cel.Expression, read: frozenset[Path], result: Kind) -> None:
+        self.source = source
+        self.paths = read
+        self.names = frozenset(str(path[0]) for path in read)
+        self.result = result
+        self._program = program
+        self._read = tree(read)
+
+    def __repr__(self) -> str:
+        return f"Expression({self.source!r})"
+
+    def evaluate(self, values: Mapping[str, object]) -> Value:
+        """The result on `values`, in which null stays null; integral results are doubles, maps are sorted by key.
+
+        Raises EvaluationError where the expression fails, reads a variable or key that is not there, or yields
+        another type than it was compiled for.
+        """
+        return self._run(values, known=False)
+
+    def evaluate_or_unknown(
+        self, values: Mapping[str, object], on_unknown: Callable[[Reason, str], None] | None = None
+    ) -> Value | Unknown:
+        """The result on `values`, or UNKNOWN where it depends on what is absent, null or NaN, or the expression fails.
+
+        `on_unknown` is told the reason and a message. Never raises for what the values hold.
+        """
+        try:
+            value = self._run(values, known=True)
+        except EvaluationError as error:
+            if on_unknown is not None:
+                on_unknown(Reason.ABSENT if error.absent else Reason.ERROR, error.message)
+            return UNKNOWN
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            if on_unknown is not None:
+                on_unknown(Reason.ABSENT, "the result is null" if value is None else "the result is not a number")
+            return UNKNOWN
+        return value
+
+    def _run(self, values: Mapping[str, object], *, known: bool) -> Value:
+        data = project(self._read, values, known=known)
+        try:
+            outcome = self._program.eval(data=data)
+            value = outcome.plain_value()
+            failed = isinstance(value, str) and outcome.type() == cel.Type.ERROR
+        except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
+            raise EvaluationError(_clean(str(error))) from None
+        if failed:
+            message = _clean(value)
+            raise EvaluationError(message, absent=message.startswith(_ABSENT) or (known and "null_type" in message))
+        result = _plain(value)
+        if self.result is not Kind.DYN:
+            self._check(result)
+        return result
+
+    def _check(self, value: Value) -> None:
+        wanted = _PYTHON[self.result]
+        if isinstance(value, wanted) and not (isinstance(value, bool) and self.result is Kind.DOUBLE):
+            return
+        raise EvaluationError(f"must be {self.result.value}, is {_describe(value)}", absent=value is None)
+
+
+def _check_static(actual: cel.Type, wanted: Kind, source: str) -> None:
+    name = actual.name()
+    kind = _NAMED_KINDS.get(name)
+    if wanted is Kind.DYN or name == "DYN" or wanted is kind or name.split("<")[0] == wanted.name:
+        return
+    start = len(source) - len(source.lstrip())
+    line, column = position(source, start)
+    is_text = kind.value if kind else name.lower()
+    raise ExpressionError(f"must be {wanted.value}, is {is_text}", source=source, line=line, column=column)
+
+
+def _not_text(source: object) -> ExpressionError:
+    if source is None:
+        return ExpressionError("the expression is empty", source="", hint=EMPTY)
+    written = str(source).lower() if isinstance(source, bool) else str(source)
+    return ExpressionError(
+        f"an expression must be a text, is {type(source).__name__} {written}",
+        source=written,
+        hint=f'put it in quotes: "{written}"',
+    )
+
+
+def _plain(value: object) -> Value:
+    if value is None or isinstance(value, (bool, float, str)):
+        return value
+    if isinstance(value, int):
+        return float(value) if -MAX_EXACT <= value <= MAX_EXACT else value
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):  # CEL's order differs between processes
+        return {key: _plain(value[key]) for key in sorted(value, key=str)}
+    if isinstance(value, (bytearray, bytes)):
+        return bytes(value)
+    if isinstance(value, datetime.datetime):
+        return value.isoformat().replace("+00:00", "Z")
+    if isinstance(value, datetime.timedelta):
+        return value.total_seconds()
+    raise EvaluationError(f"yields {_describe(value)}, which is no data")
+
+
+def _describe(value: object) -> str:
+    if value is None:
+        return "null"
+    names = {bool: "a boolean", float: "a number", int: "a number", str: "a text", list: "a list", dict: "a map"}
+    return names.get(type(value), f"a value of type {type(value).__name__}")
+
+
+_ABSENT = ("no value for ", "no key ", "no index ")
+_CLEANING: Final = (
+    (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
+    (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
+    (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list of \2"),
+    (re.compile(r"^\w+: No matching overloads found : (.*)$"), r"the operation does not take these types: \1"),
+    (re.compile(r"^[A-Z_]+: (.*?)(?: \[[A-Z_]+\])?$", re.DOTALL), r"\1"),
+)
+
+
+def _clean(message: str) -> str:
+    for pattern, replacement in _CLEANING:
+        if pattern.search(message):
+            return pattern.sub(replacement, message)
+    return message

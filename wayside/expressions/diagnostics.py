@@ -1,0 +1,138 @@
+"""Turns what CEL says about an expression into errors that point into the author's text and name the remedy."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Collection
+
+from wayside.expressions.errors import ExpressionError, position
+from wayside.expressions.lexer import TokenKind, tokens
+from wayside.expressions.numbers import Doubled
+
+_ENTRY = re.compile(r"^(?:[A-Z_]+: )?ERROR: <input>:(-?\d+):(-?\d+): (.*)$", re.MULTILINE)
+_UNDECLARED = re.compile(r"undeclared reference to '([^']*)'")
+_OVERLOAD = re.compile(r"found no matching overload for '([^']*)' applied to '(.*)'")
+_UNRECOGNISED = re.compile(r"token recognition error at: '(.*)'$")
+_UNEXPECTED = re.compile(r"(?:mismatched|extraneous|no viable alternative at) input '(.*?)'(?: expecting .*)?$")
+_MISSING = re.compile(r"missing '(.*?)' at ")
+
+_WORDS = {
+    "and": "CEL writes `&&`",
+    "or": "CEL writes `||`",
+    "not": "CEL writes `!`",
+    "AND": "CEL writes `&&`",
+    "OR": "CEL writes `||`",
+    "NOT": "CEL writes `!`",
+    "if": "CEL writes `condition ? this : that`",
+    "else": "CEL writes `condition ? this : that`",
+    "True": "CEL writes `true`",
+    "False": "CEL writes `false`",
+    "yes": "CEL writes `true`",
+    "no": "CEL writes `false`",
+    "None": "CEL writes `null`",
+    "nil": "CEL writes `null`",
+}
+_SIGNS = {"=": "CEL compares with `==`", "&": "CEL writes `&&`", "|": "CEL writes `||`", "'": "", '"': ""}
+_QUOTE = "a text is not closed, or YAML took its quotes: quote the whole expression and use the other quotes inside"
+EMPTY = "YAML takes a leading `!`, `#` or quote for itself: put the whole expression in quotes, as in '!braking'"
+
+
+def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]) -> ExpressionError:
+    """The first error of CEL's report, the further ones in its `others`."""
+    errors: list[ExpressionError] = []
+    lines = _line_starts(compiled.text)
+    for line, column, text in _ENTRY.findall(report):
+        start = lines[min(max(int(line), 1), len(lines)) - 1]
+        offset = start + max(int(column), 1) - 1
+        at = compiled.origin[offset] if offset < len(compiled.origin) else len(source)
+        if source[at : at + 1] == "." and (undeclared := _UNDECLARED.search(text)):
+            at = source.rfind(undeclared[1].split(".")[0], 0, at)  # of `x.y`, CEL points at the dot
+        message, hint = _explain(text.removesuffix("[INVALID_ARGUMENT]").strip(), source, at, names)
+        author_line, author_column = position(source, at)
+        errors.append(ExpressionError(message, source=source, line=author_line, column=author_column, hint=hint))
+    if not errors:
+        return ExpressionError(report, source=source)
+    errors.sort(key=lambda error: (error.line, error.column))
+    errors[0].others = tuple(errors[1:])
+    return errors[0]
+
+
+def _line_starts(text: str) -> list[int]:
+    return [0, *(match.end() for match in re.finditer("\n", text))]
+
+
+def _explain(text: str, source: str, at: int, names: Collection[str]) -> tuple[str, str | None]:
+    text = text.removeprefix("Syntax error: ")
+    if match := _UNDECLARED.search(text):
+        return _undeclared(match[1], source, at, names)
+    if match := _OVERLOAD.search(text):
+        return _overload(match[1], match[2])
+    if match := _UNRECOGNISED.search(text):
+        sign = match[1].strip()[:1]
+        return f"unexpected `{sign}`", _SIGNS[sign] or _QUOTE if sign in _SIGNS else None
+    if match := _UNEXPECTED.search(text):
+        if match[1] == "<EOF>":
+            return "the expression ends too early", _stray_sign(source)
+        word = _word_at(source, at) or match[1]
+        return f"unexpected `{word}`", _WORDS.get(word) or _after(source, at) or _stray_sign(source)
+    if match := _MISSING.search(text):
+        return f"missing `{match[1]}`", None
+    return text, None
+
+
+def _undeclared(name: str, source: str, at: int, names: Collection[str]) -> tuple[str, str | None]:
+    name = name.removeprefix(".").split(".")[0]
+    if _is_call(source, at, name):
+        return f"there is no function `{name}`", None
+    message = f"`{name}` is not declared here"
+    if name in _WORDS:
+        return message, _WORDS[name]
+    close = difflib.get_close_matches(name, names, n=1)
+    if close:
+        return message, f"did you mean `{close[0]}`?"
+    known = ", ".join(f"`{each}`" for each in sorted(names)[:12]) or "nothing"
+    return message, f"declared: {known}; a text needs quotes of its own, which YAML must not eat: '\"{name}\"'"
+
+
+def _overload(function: str, arguments: str) -> tuple[str, str | None]:
+    operator = function.replace("_", "").replace("@", "") if function.startswith(("_", "-", "!", "@")) else function
+    message = f"`{operator}` does not take {arguments}"
+    if operator == "%":
+        return message, "`%` takes integers only: double(int(a) % int(b))"
+    if "double" in arguments and re.search(r"\bu?int\b", arguments):
+        return message, "numbers are doubles here: wrap the integer, as in double(int(x))"
+    if operator in ("&&", "||", "!"):
+        return message, "it takes booleans"
+    if operator == "?:":
+        return message, "it takes a boolean, and two values of one type"
+    return message, None
+
+
+def _is_call(source: str, at: int, name: str) -> bool:
+    """CEL points at the bracket of a call that it cannot resolve, and at the name of anything else."""
+    return source[at : at + 1] == "(" or source[at : at + len(name) + 1] == f"{name}("
+
+
+def _word_at(source: str, at: int) -> str | None:
+    for token in tokens(source):
+        if token.start <= at < token.end:
+            return token.text
+    return None
+
+
+def _after(source: str, at: int) -> str | None:
+    """The remedy where the cause is what stands before: CEL takes `not` for a name, and stumbles over what follows."""
+    before = [token for token in tokens(source) if token.end <= at and token.kind is not TokenKind.SPACE]
+    if not before:
+        return None
+    if before[-1].kind in (TokenKind.INT, TokenKind.FLOAT):
+        return "a number takes no unit: metres, seconds and radians go without saying"
+    return _WORDS.get(before[-1].text)
+
+
+def _stray_sign(source: str) -> str | None:
+    for token in tokens(source):
+        if token.kind is TokenKind.OTHER and token.text in _SIGNS:
+            return _SIGNS[token.text] or _QUOTE
+    return None

@@ -1,0 +1,295 @@
+"""`${…}` in the texts of a field: compiled once, rendered often.
+
+A text that is one `${…}` alone takes the expression's value with its type; null drops the field, that is its key or
+list item. Inside other text the value becomes text: a text as it is, integral numbers without a point, `true` and
+`false`, lists and maps as JSON; null is an error there. `$${` is a literal `${`. Braces are matched with CEL's strings
+respected, and values are never evaluated again. Keys of maps are texts like others, and always become text.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from wayside.expressions.cel import Environment, Expression
+from wayside.expressions.errors import EvaluationError, ExpressionError, InterpolationError, position
+from wayside.expressions.lexer import TokenKind, tokens
+from wayside.expressions.numbers import MAX_EXACT
+from wayside.expressions.syntax import Path
+
+Json = None | bool | int | float | str | list["Json"] | dict[str, "Json"]
+"""What JSON and YAML hold."""
+
+LITERAL: Final = "write `$${` for a literal `${`"
+
+
+@dataclass(frozen=True, slots=True)
+class Embedded:
+    """An expression in the text of the field at `path`; it begins at `offset`, behind its `${`."""
+
+    expression: Expression
+    path: str
+    text: str
+    offset: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Literal:
+    value: Json
+
+
+@dataclass(frozen=True, slots=True)
+class _Mixed:
+    """Text with expressions inside, in turn."""
+
+    parts: tuple[str | Embedded, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Map:
+    members: tuple[tuple[str | _Mixed, _Node], ...]
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class _List:
+    items: tuple[_Node, ...]
+
+
+_Node = _Literal | Embedded | _Mixed | _Map | _List
+
+
+class _Dropped:
+    """What a null alone renders to: the field disappears."""
+
+
+_DROPPED: Final = _Dropped()
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledTemplate:
+    """A field, or a tree of fields, whose expressions, `embedded`, are compiled."""
+
+    root: _Node
+    embedded: tuple[Embedded, ...]
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The variables that its expressions use."""
+        return frozenset(name for each in self.embedded for name in each.expression.names)
+
+    @property
+    def paths(self) -> frozenset[Path]:
+        """The literal paths that its expressions read."""
+        return frozenset(path for each in self.embedded for path in each.expression.paths)
+
+    def render(self, values: Mapping[str, object], *, integers: bool = False) -> Json:
+        """The fields with the values filled in; None where the whole was dropped.
+
+        With `integers`, integral doubles become integers throughout, as manifests need them. Raises
+        InterpolationError where an expression fails, is null inside a text, or yields what JSON cannot hold.
+        """
+        result = _render(self.root, values, integers)
+        return None if isinstance(result, _Dropped) else result
+
+
+def compile_template(value: Json, environment: Environment, *, path: str = "") -> CompiledTemplate:
+    """Compiles all texts and keys of `value`, which stands at `path`.
+
+    Raises InterpolationError for the first expression that does not compile, with all further ones in its `others`.
+    """
+    compiler = _Compiler(environment)
+    root = compiler.node(value, path)
+    if compiler.errors:
+        first = compiler.errors[0]
+        first.others = (*first.others, *compiler.errors[1:])
+        raise first
+    return CompiledTemplate(root, tuple(compiler.embedded))
+
+
+class _Compiler:
+    """Walks a value and collects the expressions and the errors in it."""
+
+    def __init__(self, environment: Environment) -> None:
+        self.environment = environment
+        self.embedded: list[Embedded] = []
+        self.errors: list[InterpolationError] = []
+
+    def node(self, value: Json, path: str) -> _Node:
+        if isinstance(value, str):
+            return self.text(value, path)
+        if isinstance(value, Mapping):
+            return _Map(tuple(self.member(key, each, path) for key, each in value.items()), path)
+        if isinstance(value, (list, tuple)):
+            return _List(tuple(self.node(each, f"{path}[{index}]") for index, each in enumerate(value)))
+        return _Literal(value)
+
+    def member(self, key: str, value: Json, path: str) -> tuple[str | _Mixed, _Node]:
+        below = _join(path, str(key))
+        name = self.text(key, below) if isinstance(key, str) else _Literal(key)
+        node = self.node(value, below)
+        match name:
+            case _Mixed():
+                return name, node
+            case Embedded():
+                return _Mixed((name,)), node
+            case _Literal(str() as literal):
+                return literal, node
+        return key, node
+
+    def text(self, text: str, path: str) -> _Literal | Embedded | _Mixed:
+        parts: list[str | Embedded] = []
+        literal: list[str] = []
+        at = 0
+        while (start := text.find("${", at)) >= 0:
+            if start > at and text[start - 1] == "$":
+                literal.append(text[at : start - 1] + "${")
+                at = start + 2
+                continue
+            literal.append(text[at:start])
+            end = _closing(text, start + 2)
+            if end is None:
+                line, column = position(text, start)
+                error = InterpolationError("`${` is not closed", path=path, line=line, column=column, hint=LITERAL)
+                self.errors.append(error)
+                return _Literal(text)
+            if joined := "".join(literal):
+                parts.append(joined)
+            literal = []
+            parts.extend(self.expression(text, path, start + 2, end))
+            at = end + 1
+        if rest := "".join(literal) + text[at:]:
+            parts.append(rest)
+        if len(parts) == 1:
+            return parts[0] if isinstance(parts[0], Embedded) else _Literal(parts[0])
+        return _Mixed(tuple(parts)) if parts else _Literal("")
+
+    def expression(self, text: str, path: str, start: int, end: int) -> tuple[Embedded, ...]:
+        try:
+            expression = self.environment.compile(text[start:end])
+        except ExpressionError as error:
+            self.errors.extend(_relocated(each, text, path, start) for each in (error, *error.others))
+            return ()
+        embedded = Embedded(expression, path, text, start)
+        self.embedded.append(embedded)
+        return (embedded,)
+
+
+def _closing(text: str, start: int) -> int | None:
+    """The offset of the brace that closes the expression starting at `start`."""
+    depth = 0
+    for token in tokens(text, start):
+        if token.text == "{" and token.kind is TokenKind.OPEN:
+            depth += 1
+        elif token.text == "}" and token.kind is TokenKind.CLOSE:
+            if depth == 0:
+                return token.start
+            depth -= 1
+    return None
+
+
+def _relocated(error: ExpressionError, text: str, path: str, start: int) -> InterpolationError:
+    """The error of an expression, as one of the text around it; a shell's `${HOME}` is the usual mistake."""
+    lines = error.source.split("\n")
+    offset = start + sum(len(line) + 1 for line in lines[: error.line - 1]) + error.column - 1
+    line, column = position(text, offset)
+    message = error.message
+    if not error.source.strip():
+        hint = f"write an expression between the braces; {LITERAL}"
+    else:
+        hint = f"{error.hint}; {LITERAL}" if error.hint else LITERAL
+    return InterpolationError(message, path=path, line=line, column=column, hint=hint)
+
+
+def _render(node: _Node, values: Mapping[str, object], integers: bool) -> Json | _Dropped:
+    match node:
+        case _Literal(value):
+            return _numbers(value, integers) if integers else value
+        case Embedded():
+            value = _json(node, node.expression, values)
+            if value is None:
+                return _DROPPED
+            return _numbers(value, integers)
+        case _Mixed():
+            return _joined(node, values)
+        case _List(items):
+            each = (_render(item, values, integers) for item in items)
+            return [item for item in each if not isinstance(item, _Dropped)]
+        case _Map(members, path):
+            result: dict[str, Json] = {}
+            for key, member in members:
+                rendered = _render(member, values, integers)
+                if isinstance(rendered, _Dropped):
+                    continue
+                name = key if isinstance(key, str) else _joined(key, values)
+                if name in result:
+                    raise InterpolationError(f"two keys render to {name!r}", path=path, hint="make them differ")
+                result[name] = rendered
+            return result
+
+
+def _joined(mixed: _Mixed, values: Mapping[str, object]) -> str:
+    return "".join(part if isinstance(part, str) else _text(part, values) for part in mixed.parts)
+
+
+def _text(embedded: Embedded, values: Mapping[str, object]) -> str:
+    value = _json(embedded, embedded.expression, values)
+    if value is None:
+        hint = 'give a value for that case, as in `x == null ? "" : x`'
+        raise _failure(embedded, f"`{embedded.expression.source.strip()}` is null inside a text", hint)
+    if isinstance(value, str):
+        return value
+    return json.dumps(_numbers(value, integers=True), ensure_ascii=False, separators=(",", ":"))
+
+
+def _json(embedded: Embedded, expression: Expression, values: Mapping[str, object]) -> Json:
+    try:
+        return _checked(expression.evaluate(values))
+    except EvaluationError as error:
+        raise _failure(embedded, f"`{expression.source.strip()}`: {error.message}", None) from None
+
+
+def _failure(embedded: Embedded, message: str, hint: str | None) -> InterpolationError:
+    line, column = position(embedded.text, embedded.offset)
+    return InterpolationError(message, path=embedded.path, line=line, column=column, hint=hint)
+
+
+def _checked(value: object) -> Json:
+    """The value as JSON. Raises EvaluationError for NaN, infinities and bytes, which JSON cannot hold."""
+    match value:
+        case float() if not math.isfinite(value):
+            raise EvaluationError(f"yields {value}, which JSON cannot hold")
+        case None | bool() | int() | float() | str():
+            return value
+        case list():
+            return [_checked(item) for item in value]
+        case dict():
+            return {_key_text(key): _checked(item) for key, item in value.items()}
+    raise EvaluationError(f"yields {type(value).__name__}, which JSON cannot hold")
+
+
+def _key_text(key: object) -> str:
+    return key if isinstance(key, str) else json.dumps(key)
+
+
+def _numbers(value: Json, integers: bool) -> Json:
+    if not integers:
+        return value
+    match value:
+        case float() if value.is_integer() and abs(value) <= MAX_EXACT:
+            return int(value)
+        case list():
+            return [_numbers(item, integers) for item in value]
+        case dict():
+            return {key: _numbers(item, integers) for key, item in value.items()}
+    return value
+
+
+def _join(path: str, key: str) -> str:
+    """The path of a member; keys with signs of their own are quoted, as in `metadata.labels["wayside.dev/x"]`."""
+    if key.replace("_", "").replace("-", "").isalnum():
+        return f"{path}.{key}" if path else key
+    return f"{path}[{json.dumps(key, ensure_ascii=False)}]"

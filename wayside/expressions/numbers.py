@@ -1,0 +1,153 @@
+"""Numbers are doubles: rewrites an expression so that CEL, which never mixes integers with doubles, sees only doubles.
+
+    speed > 3                 →  speed > 3.0
+    size(points) / 2          →  double(size(points)) / 2.0
+    ranges[0] + ranges[i + 1] →  ranges[0] + ranges[dyn(i + 1.0)]
+
+Integer literals become doubles, and so do the results of functions that count, and of `int(x)`, which cuts off the
+fraction. A literal index stays an integer; any other index is wrapped in `dyn()`, because a list takes an integral
+double as its index at run time, but not when types are checked. Integers stay where only integers work: beside `%`,
+as the argument of `timestamp`, and beyond 2^53, where a double would be another number. Strings, comments and `3u` are
+left alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from wayside.expressions.lexer import Token, TokenKind, tokens
+
+MAX_EXACT = 2**53
+"""Up to here every integer is a double as well."""
+
+_COUNTING_METHODS = frozenset(
+    {"size"}
+    | {f"get{part}" for part in ("FullYear", "Month", "Date", "DayOfMonth", "DayOfWeek", "DayOfYear")}
+    | {f"get{part}" for part in ("Hours", "Minutes", "Seconds", "Milliseconds")}
+)
+_PAIRS = {")": "(", "]": "[", "}": "{"}
+
+
+@dataclass(frozen=True, slots=True)
+class Doubled:
+    """An expression after the pass; `origin[i]` is the offset in the author's text that character i stems from."""
+
+    text: str
+    origin: tuple[int, ...]
+
+
+def doubled(source: str) -> Doubled:
+    """Rewrites `source` as the module says. Never fails: what does not parse is left for CEL to report."""
+    scanned = list(tokens(source))
+    significant = [token for token in scanned if token.kind not in (TokenKind.SPACE, TokenKind.COMMENT)]
+    before, after, replaced = _edits(significant)
+    text: list[str] = []
+    origin: list[int] = []
+    for token in scanned:
+        own = replaced.get(token.start)
+        for piece, inserted in (
+            (before.get(token.start, ""), True),
+            (own if own is not None else token.text, own is not None),
+            (after.get(token.start, ""), True),
+        ):
+            text.append(piece)
+            origin.extend([token.start] * len(piece) if inserted else range(token.start, token.end))
+    return Doubled("".join(text), tuple(origin))
+
+
+def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int, str]]:
+    """What to insert before and after, and what to replace, by the start of the token it concerns."""
+    matches = _matches(line)
+    before: dict[int, str] = {}
+    after: dict[int, str] = {}
+    replaced: dict[int, str] = {}
+
+    def wrap(first: int, last: int, function: str) -> None:
+        start, end = line[first].start, line[last].start
+        before[start] = before.get(start, "") + f"{function}("
+        after[end] = ")" + after.get(end, "")
+
+    for i, token in enumerate(line):
+        if token.kind is TokenKind.INT and not _stays_integer(line, matches, i, i):
+            value = int(token.text, 0) if token.text.startswith("0x") else int(token.text)
+            if value <= MAX_EXACT:
+                replaced[token.start] = f"{value}.0"
+        elif token.text == "[" and i in matches and _ends_operand(line, i - 1):
+            if not _is_lone_literal(line, i + 1, matches[i]):
+                wrap(i + 1, matches[i] - 1, "dyn")
+        elif token.text in _COUNTING_METHODS and i + 1 in matches and line[i + 1].text == "(":
+            if i > 0 and line[i - 1].text == ".":
+                wrap(_operand_start(line, matches, i - 2), matches[i + 1], "double")
+            elif token.text == "size":
+                wrap(i, matches[i + 1], "double")
+        elif (
+            token.text == "int"
+            and i + 1 in matches
+            and line[i + 1].text == "("
+            and not _stays_integer(line, matches, i, matches[i + 1])
+        ):
+            wrap(i, matches[i + 1], "double")
+    return before, after, replaced
+
+
+def _matches(line: list[Token]) -> dict[int, int]:
+    """The partner of each bracket, both ways; brackets without one are left out."""
+    result: dict[int, int] = {}
+    pending: list[int] = []
+    for i, token in enumerate(line):
+        if token.kind is TokenKind.OPEN:
+            pending.append(i)
+        elif token.kind is TokenKind.CLOSE and pending and line[pending[-1]].text == _PAIRS[token.text]:
+            partner = pending.pop()
+            result[partner], result[i] = i, partner
+    return result
+
+
+def _stays_integer(line: list[Token], matches: dict[int, int], i: int, last: int) -> bool:
+    """Whether the operand from token i to token `last` stands where CEL takes only an integer."""
+    previous, following = line[i - 1].text if i else "", line[last + 1].text if last + 1 < len(line) else ""
+    if "%" in (previous, following):
+        return True
+    first = i - 1 if previous == "-" else i  # a sign belongs to the literal
+    if first == 0 or first - 1 not in matches or matches[first - 1] != last + 1:
+        return False
+    opening = line[first - 1].text
+    if opening == "[":
+        return _ends_operand(line, first - 2)
+    return opening == "(" and first > 1 and line[first - 2].text == "timestamp"
+
+
+def _is_lone_literal(line: list[Token], first: int, end: int) -> bool:
+    if end - first == 2 and line[first].text == "-":
+        first += 1
+    literals = (TokenKind.INT, TokenKind.UINT, TokenKind.FLOAT, TokenKind.STRING)
+    return end == first or (end - first == 1 and line[first].kind in literals)
+
+
+def _ends_operand(line: list[Token], i: int) -> bool:
+    """Whether a bracket behind token i is an index, not a list of its own."""
+    if i < 0:
+        return False
+    token = line[i]
+    if token.kind is TokenKind.NAME:
+        return token.text != "in" or (i > 0 and line[i - 1].text == ".")
+    return token.kind in (TokenKind.STRING, TokenKind.CLOSE)
+
+
+def _operand_start(line: list[Token], matches: dict[int, int], i: int) -> int:
+    """The first token of the chain `a.b(c)[d]` whose last token is i."""
+    while i >= 0:
+        if line[i].kind is TokenKind.CLOSE and i in matches:
+            i = matches[i]
+            called = line[i].text == "(" and i > 0 and line[i - 1].kind is TokenKind.NAME and line[i - 1].text != "in"
+            if called or (line[i].text in "[{" and _ends_operand(line, i - 1)):
+                i -= 1
+                if not called:
+                    continue
+        if i > 0 and line[i - 1].text == ".":
+            if i == 1 or not _ends_operand(line, i - 2):
+                return i - 1  # a leading dot, as in `.speed`
+            i -= 2
+            continue
+        return i
+    return 0

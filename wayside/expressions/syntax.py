@@ -1,0 +1,235 @@
+"""The syntax tree of a compiled expression, decoded from the CheckedExpr that CEL serialises, and the paths it reads.
+
+The binding offers the tree only as protobuf; the few messages it takes are decoded here, so protobuf is no dependency.
+Field numbers are those of `cel/expr/syntax.proto`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+Step = str | int
+Path = tuple[Step, ...]
+"""A variable and the fields and literal indices below it: `msg.points[2].x` is ("msg", "points", 2, "x")."""
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A literal."""
+
+    value: bool | int | float | str | bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """A variable, a loop variable or the name of a type."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Select:
+    """`operand.field`, or `has(operand.field)` where `test_only`."""
+
+    operand: Node
+    field: str
+    test_only: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A function or operator (`_+_`, `_[_]`, …); `target` where it is called as a method."""
+
+    function: str
+    target: Node | None
+    arguments: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Collection:
+    """A list or map literal; of a map, keys and values in turn."""
+
+    is_map: bool
+    elements: tuple[Node, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A macro such as `all`, `exists`, `filter` or `map`, unfolded."""
+
+    over: Node
+    variables: tuple[str, ...]
+    accumulator: str
+    initial: Node
+    body: tuple[Node, ...]
+    result: Node
+
+
+Node = Constant | Name | Select | Call | Collection | Loop
+
+
+def parse(serialized: bytes) -> Node:
+    """The tree of an expression, from what `serialize()` of the binding returns (an Any that holds a CheckedExpr)."""
+    checked = _fields(_only(_fields(serialized), 2))
+    return _node(_only(checked, 4))
+
+
+def paths(node: Node, variables: frozenset[str]) -> frozenset[Path]:
+    """The longest literal paths below `variables` that the tree reads; loop variables of the same name do not count."""
+    return frozenset(_paths(node, variables))
+
+
+def _paths(node: Node, free: frozenset[str]) -> Iterator[Path]:
+    path = _path(node, free)
+    if path is not None:
+        yield path
+        return
+    match node:
+        case Select(operand):
+            yield from _paths(operand, free)
+        case Call(_, target, arguments):
+            for part in (target, *arguments) if target is not None else arguments:
+                yield from _paths(part, free)
+        case Collection(_, elements):
+            for part in elements:
+                yield from _paths(part, free)
+        case Loop(over, names, accumulator, initial, body, result):
+            yield from _paths(over, free)
+            yield from _paths(initial, free)
+            for part in body:
+                yield from _paths(part, free.difference(names, (accumulator,)))
+            yield from _paths(result, free - {accumulator})
+
+
+def _path(node: Node, free: frozenset[str]) -> Path | None:
+    match node:
+        case Name(name):
+            name = name.removeprefix(".")
+            return (name,) if name in free else None
+        case Select(operand, field):
+            above = _path(operand, free)
+            return None if above is None else (*above, field)
+        case Call("_[_]", None, (container, Constant(str() | int() as index))) if not isinstance(index, bool):
+            above = _path(container, free)
+            return None if above is None or (isinstance(index, int) and index < 0) else (*above, index)
+    return None
+
+
+_Fields = dict[int, list[bytes | int]]
+_WIDTHS = {1: 8, 5: 4}
+
+
+def _fields(data: bytes) -> _Fields:
+    """The fields of a protobuf message by number: numbers as they are, the rest as bytes."""
+    result: _Fields = {}
+    at = 0
+    while at < len(data):
+        key, at = _varint(data, at)
+        wire = key & 7
+        value: bytes | int
+        if wire == 0:
+            value, at = _varint(data, at)
+        else:
+            length, at = (_WIDTHS[wire], at) if wire in _WIDTHS else _varint(data, at)
+            value, at = data[at : at + length], at + length
+        result.setdefault(key >> 3, []).append(value)
+    return result
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80:
+            return value, at
+
+
+def _only(fields: _Fields, number: int) -> bytes:
+    values = fields.get(number, [b""])
+    value = values[-1]
+    return value if isinstance(value, bytes) else b""
+
+
+def _text(fields: _Fields, number: int) -> str:
+    return _only(fields, number).decode()
+
+
+def _nodes(fields: _Fields, number: int) -> tuple[Node, ...]:
+    return tuple(_node(part) for part in fields.get(number, ()) if isinstance(part, bytes))
+
+
+def _node(data: bytes) -> Node:
+    fields = _fields(data)
+    for number, decode in _DECODERS.items():
+        if number in fields:
+            return decode(_fields(_only(fields, number)))
+    raise ValueError("an expression of a kind that this version of CEL should not produce")
+
+
+def _constant(fields: _Fields) -> Constant:
+    for number, values in fields.items():
+        value = values[-1]
+        match number, value:
+            case 2, int():
+                return Constant(bool(value))
+            case 3, int():
+                return Constant(value - 2**64 if value >= 2**63 else value)
+            case 4, int():
+                return Constant(value)
+            case 5, bytes():
+                return Constant(struct.unpack("<d", value)[0])
+            case 6, bytes():
+                return Constant(value.decode())
+            case 7, bytes():
+                return Constant(value)
+    return Constant(None)
+
+
+def _name(fields: _Fields) -> Name:
+    return Name(_text(fields, 1))
+
+
+def _select(fields: _Fields) -> Select:
+    return Select(_node(_only(fields, 1)), _text(fields, 2), test_only=3 in fields)
+
+
+def _call(fields: _Fields) -> Call:
+    target = _node(_only(fields, 1)) if 1 in fields else None
+    return Call(_text(fields, 2), target, _nodes(fields, 3))
+
+
+def _list(fields: _Fields) -> Collection:
+    return Collection(is_map=False, elements=_nodes(fields, 1))
+
+
+def _map(fields: _Fields) -> Collection:
+    entries = [_fields(entry) for entry in fields.get(2, ()) if isinstance(entry, bytes)]
+    return Collection(
+        is_map=True, elements=tuple(part for entry in entries for n in (3, 4) for part in _nodes(entry, n))
+    )
+
+
+def _loop(fields: _Fields) -> Loop:
+    return Loop(
+        over=_node(_only(fields, 2)),
+        variables=tuple(name for name in (_text(fields, 1), _text(fields, 8)) if name),
+        accumulator=_text(fields, 3),
+        initial=_node(_only(fields, 4)),
+        body=(*_nodes(fields, 5), *_nodes(fields, 6)),
+        result=_node(_only(fields, 7)),
+    )
+
+
+_DECODERS: Mapping[int, Callable[[_Fields], Node]] = {
+    3: _constant,
+    4: _name,
+    5: _select,
+    6: _call,
+    7: _list,
+    8: _map,
+    9: _loop,
+}

@@ -1,0 +1,43 @@
+"""The third truth value: `UNKNOWN` is what an expression yields when it cannot tell.
+
+It has no truth of its own: `if value:` on an unknown raises, so no caller takes it for false by accident.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Final, Self, final
+
+
+@final
+class Unknown:
+    """The type of the one value `UNKNOWN`; compare with `is`."""
+
+    _single: Self | None = None
+
+    def __new__(cls) -> Self:
+        """The one instance."""
+        if cls._single is None:
+            cls._single = super().__new__(cls)
+        return cls._single
+
+    def __bool__(self) -> bool:
+        raise TypeError("unknown is neither true nor false: compare with `is UNKNOWN` first")
+
+    def __repr__(self) -> str:
+        return "unknown"
+
+    def __reduce__(self) -> tuple[type[Unknown], tuple[()]]:
+        return (Unknown, ())
+
+
+UNKNOWN: Final = Unknown()
+
+
+class Reason(enum.Enum):
+    """Why an expression is unknown; callers count the two apart."""
+
+    ABSENT = "Absent"
+    """An input is not there: a variable, key or index is missing, or a value is null or NaN."""
+    ERROR = "Error"
+    """The expression failed on inputs that are there: a wrong type, a division by zero, too many iterations."""
