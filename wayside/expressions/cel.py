@@ -3,6 +3,8 @@
 An `Environment` holds the declared variables and compiles; an `Expression` is evaluated as often as wanted, from any
 thread. Unknown values follow Kleene's logic: CEL carries an error through `&&`, `||`, `!` and `?:` exactly as Kleene
 carries the unknown, so what is unknown is left out of the values (see `projection`) and an error means unknown.
+(A NaN that arises inside an expression, by 0/0 or inf − inf, is not left out of anything: it compares false, as IEEE
+says, and is unknown only as the result.)
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import enum
 import math
 import re
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Final
 
 from cel_expr_python import cel
@@ -19,7 +22,7 @@ from cel_expr_python import cel
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
 from wayside.expressions.numbers import MAX_EXACT, doubled
-from wayside.expressions.projection import project, tree
+from wayside.expressions.projection import missing_path, project, tree
 from wayside.expressions.syntax import Path, parse, paths
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
 
@@ -56,7 +59,17 @@ _PYTHON: Final[Mapping[Kind, type | tuple[type, ...]]] = {
     Kind.MAP: dict,
     Kind.LIST: list,
 }
-_NAMED_KINDS: Final = {"DOUBLE": Kind.DOUBLE, "INT": Kind.DOUBLE, "UINT": Kind.DOUBLE, "STRING": Kind.STRING}
+_NAMED_KINDS: Final = {
+    "BOOL": Kind.BOOL,
+    "DOUBLE": Kind.DOUBLE,
+    "INT": Kind.DOUBLE,
+    "UINT": Kind.DOUBLE,
+    "STRING": Kind.STRING,
+}
+_RESERVED: Final = (
+    "as break const continue else false for function if import in let loop namespace null package return true var void"
+    " while"
+)
 
 
 class Environment:
@@ -66,7 +79,9 @@ class Environment:
         for name in variables:
             if not _NAME.fullmatch(name):
                 raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
-        self.variables: Mapping[str, Kind] = dict(variables)
+            if name in _RESERVED.split():
+                raise ValueError(f"variable {name!r}: a word that CEL reserves; choose another name")
+        self.variables: Mapping[str, Kind] = MappingProxyType(dict(variables))
         self._env = cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables.items()})
         self._cache: dict[tuple[str, Kind], Expression] = {}
 
@@ -86,11 +101,11 @@ class Environment:
         rewritten = doubled(source)
         try:
             program = self._env.compile(rewritten.text)
-            node = parse(program.serialize())
+            read = paths(parse(program.serialize()), frozenset(self.variables))
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
             raise diagnose(str(error), source, rewritten, self.variables) from None
         _check_static(program.return_type(), result, source)
-        expression = Expression(source, program, paths(node, frozenset(self.variables)), result)
+        expression = Expression(source, program, read, result)
         if len(self._cache) >= _CACHE_SIZE:
             self._cache.clear()  # a bound against rules that come and go for months; refilling costs 50 µs each
         self._cache[source, result] = expression
@@ -119,7 +134,13 @@ class Expression:
         Raises EvaluationError where the expression fails, reads a variable or key that is not there, or yields
         another type than it was compiled for.
         """
-        return self._run(values, known=False)
+        try:
+            return self._run(values, known=False)
+        except EvaluationError as error:
+            missing = missing_path(self.paths, values) if error.absent else None
+            if missing is None:
+                raise
+            raise EvaluationError(missing, absent=True) from None
 
     def evaluate_or_unknown(
         self, values: Mapping[str, object], on_unknown: Callable[[Reason, str], None] | None = None
@@ -141,7 +162,10 @@ class Expression:
         return value
 
     def _run(self, values: Mapping[str, object], *, known: bool) -> Value:
-        data = project(self._read, values, known=known)
+        try:
+            data = project(self._read, values, known=known)
+        except RecursionError:
+            raise EvaluationError("the values are nested too deeply") from None
         try:
             outcome = self._program.eval(data=data)
             value = outcome.plain_value()

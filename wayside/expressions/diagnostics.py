@@ -35,6 +35,7 @@ _WORDS = {
 }
 _SIGNS = {"=": "CEL compares with `==`", "&": "CEL writes `&&`", "|": "CEL writes `||`", "'": "", '"': ""}
 _QUOTE = "a text is not closed, or YAML took its quotes: quote the whole expression and use the other quotes inside"
+_DEPTH = "at most 32 levels, where each operator of a chain like `a + b` is one: balance it with brackets"
 EMPTY = "YAML takes a leading `!`, `#` or quote for itself: put the whole expression in quotes, as in '!braking'"
 
 
@@ -52,7 +53,8 @@ def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]
         author_line, author_column = position(source, at)
         errors.append(ExpressionError(message, source=source, line=author_line, column=author_column, hint=hint))
     if not errors:
-        return ExpressionError(report, source=source)
+        message, hint = _explain(re.sub(r"^[A-Z_]+: | \[[A-Z_]+\]$", "", report), source, 0, names)
+        return ExpressionError(message, source=source, hint=hint)
     errors.sort(key=lambda error: (error.line, error.column))
     errors[0].others = tuple(errors[1:])
     return errors[0]
@@ -76,6 +78,8 @@ def _explain(text: str, source: str, at: int, names: Collection[str]) -> tuple[s
             return "the expression ends too early", _stray_sign(source)
         word = _word_at(source, at) or match[1]
         return f"unexpected `{word}`", _WORDS.get(word) or _after(source, at) or _stray_sign(source)
+    if "recursion" in text:
+        return "the expression is nested too deeply", _DEPTH
     if match := _MISSING.search(text):
         return f"missing `{match[1]}`", None
     return text, None

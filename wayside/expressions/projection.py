@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import difflib
 from collections.abc import Iterable, Mapping
 from typing import Final, cast
 
@@ -61,16 +62,31 @@ def normalise(value: object) -> object:
     return None if result is _ABSENT else result
 
 
+def missing_path(paths: Iterable[Path], values: Mapping[str, object]) -> str | None:
+    """Says which of the paths leads nowhere in `values`, and what it may have meant; None if none does."""
+    for path in sorted(paths, key=str):
+        at: object = values
+        for depth, step in enumerate(path):
+            if not isinstance(at, Mapping):
+                break
+            if step not in at:
+                written = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path[: depth + 1])
+                close = difflib.get_close_matches(str(step), [str(key) for key in at], n=1)
+                return f"there is no `{written[1:]}`" + (f"; did you mean `{close[0]}`?" if close else "")
+            at = at[step]
+    return None
+
+
 def _project(below: Tree | None, value: object, known: bool) -> object:
     if below is None:
         return _convert(value, known)
-    if isinstance(value, Mapping):
-        return _members(((key, value[key], sub) for key, sub in below.items() if key in value), known)
+    if type(value) is dict or isinstance(value, Mapping):  # the abstract class is slow to ask
+        return _members([(key, value[key], sub) for key, sub in below.items() if key in value], known)
     if isinstance(value, (list, tuple)) or _is_array(value):
         return _items(below, cast("list[object]", value), known)
     if _is_record(value):
         present = _field_names(value)
-        return _members(((key, getattr(value, str(key)), sub) for key, sub in below.items() if key in present), known)
+        return _members([(key, getattr(value, str(key)), sub) for key, sub in below.items() if key in present], known)
     return _convert(value, known)
 
 
