@@ -1,0 +1,29 @@
+"""Rules, checked and compiled against a Detector: the manager reports what is wrong, the engine runs what is right."""
+
+from wayside.rules.compiled import (
+    ClientSubject,
+    CompiledDeploy,
+    CompiledPosition,
+    CompiledRule,
+    CompiledSignal,
+    CompiledStream,
+    PairSubject,
+)
+from wayside.rules.compiling import RuleProblem, RuleError, compile_rule, compile_stream, stream_problems
+from wayside.rules.fields import Fields
+
+__all__ = [
+    "ClientSubject",
+    "CompiledDeploy",
+    "CompiledPosition",
+    "CompiledRule",
+    "CompiledSignal",
+    "CompiledStream",
+    "Fields",
+    "PairSubject",
+    "RuleProblem",
+    "RuleError",
+    "compile_rule",
+    "compile_stream",
+    "stream_problems",
+]

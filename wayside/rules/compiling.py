@@ -1,0 +1,258 @@
+"""Compiles a rule against the Detector that is to evaluate it, and says all that is wrong with it."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from wayside.api import Detector, EventRule
+from wayside.api.detector import Stream
+from wayside.api.documents import FieldPath, field_text
+from wayside.api.eventrule import PairsScope, Signal
+from wayside.expressions import (
+    CompiledTemplate,
+    Environment,
+    Expression,
+    ExpressionError,
+    InterpolationError,
+    Kind,
+    Path,
+    compile_template,
+)
+from wayside.rules.compiled import (
+    ClientSubject,
+    CompiledDeploy,
+    CompiledPosition,
+    CompiledRule,
+    CompiledSignal,
+    CompiledStream,
+    PairSubject,
+)
+from wayside.rules.fields import Fields, unknown_fields
+from wayside.rules.variables import (
+    MEMBER_OF_CLIENT,
+    RESERVED,
+    SAMPLE_MEMBERS,
+    client_environment,
+    condition_environment,
+    pairs_environment,
+    sample_environment,
+    stamp_environment,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RuleProblem:
+    """Why a rule cannot be evaluated: the field, and what to do."""
+
+    path: FieldPath
+    message: str
+
+    def __str__(self) -> str:
+        return f"{field_text(self.path)}: {self.message}"
+
+
+class RuleError(Exception):
+    """A rule that cannot be evaluated; `problems` has all reasons."""
+
+    def __init__(self, problems: Iterable[RuleProblem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("; ".join(map(str, self.problems)))
+
+
+def compile_rule(rule: EventRule, detector: Detector, fields: Mapping[str, Fields] | None = None) -> CompiledRule:
+    """The rule as the engine evaluates it.
+
+    `fields` has the message fields of the streams that are known to have no others; what an expression reads beside
+    them is a problem.
+
+    Raises:
+        RuleError: with every problem of the rule.
+    """
+    compiler = _RuleCompiler(rule, detector, fields or {})
+    compiled = compiler.compile()
+    if compiler.problems or compiled is None:
+        raise RuleError(compiler.problems)
+    return compiled
+
+
+def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> CompiledStream:
+    """The stream's own expressions.
+
+    Raises:
+        RuleError: with every problem of them.
+    """
+    problems = list(stream_problems(stream, index, fields))
+    if problems:
+        raise RuleError(problems)
+    stamp = None if stream.stamp is None else stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
+    return CompiledStream(stream.name, stamp)
+
+
+def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
+    """What is wrong with the expressions of a Detector's stream."""
+    if stream.stamp is None:
+        return
+    path: FieldPath = ("spec", "streams", index, "stamp")
+    try:
+        expression = stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
+    except ExpressionError as error:
+        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        return
+    if fields is not None:
+        yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, "msg", fields))
+
+
+class _RuleCompiler:
+    """Goes through a rule once and collects the problems on the way."""
+
+    def __init__(self, rule: EventRule, detector: Detector, fields: Mapping[str, Fields]) -> None:
+        self.rule = rule
+        self.spec = rule.spec
+        self.detector = detector
+        self.fields = fields
+        self.problems: list[RuleProblem] = []
+
+    def compile(self) -> CompiledRule | None:
+        """The compiled rule, or None where problems forbid it."""
+        subject = self._subject()
+        signals = [self._signal(index, signal) for index, signal in enumerate(self.spec.signals)]
+        environment = condition_environment(self.spec)
+        when = self._condition(("spec", "when"), self.spec.when, environment)
+        until = self._condition(("spec", "until"), self.spec.until, environment)
+        deploys = [
+            self._deploy(index, action.name, environment) for index, action in enumerate(self.spec.actions)
+        ]  # fmt: skip
+        if self.problems or subject is None or when is None:
+            return None
+        spec = self.spec
+        return CompiledRule(
+            name=self.rule.name,
+            subject=subject,
+            signals=tuple(signal for signal in signals if signal is not None),
+            when=when,
+            until=until,
+            every_ns=spec.evaluation.every.ns,
+            for_ns=spec.for_.ns,
+            cooldown_ns=spec.cooldown.ns,
+            unknown_timeout_ns=(spec.unknown_timeout or self.detector.spec.client_timeout).ns,
+            enabled=spec.enabled,
+            dry_run=spec.dry_run,
+            deploys=tuple(deploy for deploy in deploys if deploy is not None),
+            classification=None if spec.classification is None else spec.classification.to_json(),
+            digest=_digest(self.rule),
+        )
+
+    def _subject(self) -> ClientSubject | PairSubject | None:
+        scope = self.spec.scope
+        if scope.pairs is not None:
+            return self._pairs(scope.pairs)
+        assert scope.client is not None  # noqa: S101  the model holds exactly one
+        return ClientSubject(
+            self._condition(("spec", "scope", "client", "where"), scope.client.where, client_environment())
+        )
+
+    def _pairs(self, pairs: PairsScope) -> PairSubject | None:
+        at: FieldPath = ("spec", "scope", "pairs")
+        position = pairs.position
+        stream = self._stream((*at, "position", "stream"), position.stream)
+        axes = {}
+        for axis in ("x", "y", "z"):
+            source = getattr(position, axis)
+            if source is not None:
+                axes[axis] = self._sample((*at, "position", axis), source, stream, Kind.DOUBLE)
+        where = self._condition((*at, "where"), pairs.where, pairs_environment())
+        x, y = axes["x"], axes["y"]
+        if x is None or y is None:
+            return None
+        return PairSubject(CompiledPosition(position.stream, x, y, axes.get("z")), pairs.within, where)
+
+    def _signal(self, index: int, signal: Signal) -> CompiledSignal | None:
+        at: FieldPath = ("spec", "signals", index)
+        if signal.name in RESERVED:
+            self._problem((*at, "name"), f"{signal.name} is a name that every scope gives itself: choose another")
+        stream = self._stream((*at, "stream"), signal.stream)
+        value = self._sample((*at, "value"), signal.value, stream, Kind.DYN)
+        where = self._sample((*at, "where"), signal.where, stream, Kind.BOOL)
+        over = None if signal.over is None else signal.over.ns
+        if stream is not None and over is not None:
+            kept = self.detector.spec.buffer_duration_ns(stream)
+            if over > kept:
+                self._problem(
+                    (*at, "over"),
+                    f"{signal.over} is longer than the {kept / 1e9:g} s that Detector {self.detector.name} keeps of "
+                    f"stream {stream.name}: shorten it, or raise the stream's buffer.duration",
+                )
+        return CompiledSignal(signal.name, signal.stream, signal.aggregate, value, where, over)
+
+    def _deploy(self, index: int, action: str, environment: Environment) -> CompiledDeploy | None:
+        deploy = self.spec.actions[index].deploy
+        at: FieldPath = ("spec", "actions", index, "deploy", "parameters")
+        parameters: CompiledTemplate
+        try:
+            parameters = compile_template(dict(deploy.parameters), environment)
+        except InterpolationError as error:
+            for each in (error, *error.others):
+                self._problem(at, str(each))
+            return None
+        self._members(at, parameters.paths)
+        return CompiledDeploy(action, deploy.template, deploy.priority, parameters)
+
+    def _stream(self, path: FieldPath, name: str) -> Stream | None:
+        stream = self.detector.spec.stream(name)
+        if stream is None:
+            names = [stream.name for stream in self.detector.spec.streams]
+            close = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(names)}"
+            self._problem(path, f"Detector {self.detector.name} has no stream {name}; {hint}")
+        return stream
+
+    def _condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
+        expression = self._expression(path, source, environment, Kind.BOOL)
+        if expression is not None:
+            self._members(path, expression.paths)
+        return expression
+
+    def _sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind) -> Expression | None:
+        expression = self._expression(path, source, sample_environment(), kind)
+        if expression is None:
+            return None
+        known: Fields = dict.fromkeys(SAMPLE_MEMBERS)
+        for text in unknown_fields(expression.paths, "sample", known):
+            self._problem(path, text)
+        if stream is not None and stream.name in self.fields:
+            for text in unknown_fields(expression.paths, "msg", self.fields[stream.name]):
+                self._problem(path, f"{text} (stream {stream.name}, type {stream.type})")
+        return expression
+
+    def _expression(
+        self, path: FieldPath, source: str | None, environment: Environment, kind: Kind
+    ) -> Expression | None:
+        if source is None:
+            return None
+        try:
+            return environment.compile(source, result=kind)
+        except ExpressionError as error:
+            for each in (error, *error.others):
+                self._problem(path, str(each))
+            return None
+
+    def _members(self, path: FieldPath, paths: Iterable[Path]) -> None:
+        """A pair's a and b are maps: CEL itself does not know what is in them."""
+        if self.spec.scope.pairs is None:
+            return
+        members: dict[str, Fields | None] = dict.fromkeys((*MEMBER_OF_CLIENT, *(s.name for s in self.spec.signals)))
+        members["position"] = dict.fromkeys(("x", "y", "z"))
+        for text in sorted({*unknown_fields(paths, "a", members), *unknown_fields(paths, "b", members)}):
+            self._problem(path, text)
+
+    def _problem(self, path: FieldPath, message: str) -> None:
+        self.problems.append(RuleProblem(path, message))
+
+
+def _digest(rule: EventRule) -> str:
+    text = json.dumps(rule.semantics(), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,32 @@
+"""Which fields a message has: finds misspelt ones before any sample has come."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+
+from wayside.expressions import Path
+
+Fields = Mapping[str, "Fields | None"]
+"""The fields of a message by name; None below a field: it has none of its own, or they are not known."""
+
+
+def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iterable[str]:
+    """A message for each path that starts at the variable and names a field that is not there."""
+    for path in sorted(paths, key=str):
+        if path[0] != variable:
+            continue
+        here: Fields | None = fields
+        for depth, step in enumerate(path[1:], start=1):
+            if here is None or not isinstance(step, str):
+                break
+            if step not in here:
+                yield _message(".".join(map(str, path[:depth])), step, here)
+                break
+            here = here[step]
+
+
+def _message(parent: str, step: str, here: Fields) -> str:
+    close = difflib.get_close_matches(step, here, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(here)) or 'no fields'}"
+    return f"{parent} has no field {step}; {hint}"
