@@ -1,0 +1,169 @@
+"""Demands: what the deploy actions of open episodes ask for, and their form as ApplicationTasks.
+
+A demand is held while its episode is open. It has a name that follows from what it is, so that a detector which
+restarts finds its own tasks again, and never makes two of one.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from wayside.api.applicationtask import (
+    HOLDER_LABEL,
+    RULE_DIGEST_ANNOTATION,
+    ApplicationTask,
+    ApplicationTaskSpec,
+    Requester,
+    TaskEvent,
+)
+from wayside.api.base import JsonValue, Metadata
+from wayside.api.classification import Classification
+from wayside.times import format_time, parse_time
+
+_LABEL_LIMIT = 63
+_DIGEST_BYTES = 10  # 16 letters of base32
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What one deploy action of one open episode asks for."""
+
+    rule: str
+    action: str
+    template: str
+    priority: int
+    parameters: Mapping[str, JsonValue]
+    """Evaluated; the only part that may change while the episode is open."""
+    detector: str
+    holder: str
+    namespace: str
+    subject: str
+    """As in the event's key, e.g. ``car1+car2``."""
+    subjects: tuple[str, ...]
+    """The clients that the episode is about."""
+    episode: str
+    """The episode's id."""
+    onset_time: int
+    """Nanoseconds since the epoch."""
+    start_time: int
+    """Nanoseconds since the epoch."""
+    classification: Mapping[str, JsonValue] | None
+    values: Mapping[str, JsonValue]
+    """The rule's variables at the start."""
+    rule_digest: str
+    """Of the rule's semantics under which the episode started."""
+
+    @cached_property
+    def name(self) -> str:
+        """The name of the task: the same demand always has the same one. At most 63 characters."""
+        parts = (self.holder, self.rule, self.action, self.subject, str(self.start_time))
+        return f"{self.rule[:46]}-{_digest(*parts)}"
+
+
+def holder_label(holder: str) -> str:
+    """The value of the label `wayside.dev/holder`: the holder, shortened with a digest where a label has no room."""
+    if len(holder) <= _LABEL_LIMIT:
+        return holder
+    return f"{holder[:46]}-{_digest(holder)}"
+
+
+def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
+    """The demand as an object for the API server or a file.
+
+    Absent and null are one in a resource, so null parameters and values are left out, and so are NaN and infinities
+    (JSON has none).
+
+    Args:
+        demand: what is wanted.
+        end_time: when the episode ended, in nanoseconds since the epoch; None while it is open.
+
+    Raises:
+        ValueError: a part of it does not fit into an ApplicationTask, e.g. a subject that is too long.
+    """
+    return ApplicationTask(
+        metadata=Metadata(
+            name=demand.name,
+            namespace=demand.namespace,
+            labels={HOLDER_LABEL: holder_label(demand.holder)},
+            annotations={RULE_DIGEST_ANNOTATION: demand.rule_digest} if demand.rule_digest else {},
+        ),
+        spec=ApplicationTaskSpec(
+            template=demand.template,
+            priority=demand.priority,
+            parameters=plain(demand.parameters),
+            requester=Requester(detector=demand.detector, holder=demand.holder, subjects=list(demand.subjects)),
+            event=TaskEvent(
+                id=demand.episode,
+                rule=demand.rule,
+                action=demand.action,
+                subject=demand.subject,
+                onset_time=format_time(demand.onset_time),
+                start_time=format_time(demand.start_time),
+                classification=None
+                if demand.classification is None
+                else Classification.model_validate(demand.classification),
+                values=plain(demand.values),
+            ),
+            end_time=None if end_time is None else format_time(end_time),
+        ),
+    )
+
+
+def from_task(task: ApplicationTask) -> Demand | None:
+    """The demand that a task stands for; None where no detector emitted it (no holder or no event)."""
+    spec = task.spec
+    if spec.event is None or spec.requester.holder is None or spec.requester.detector is None:
+        return None
+    event = spec.event
+    return Demand(
+        rule=event.rule,
+        action=event.action,
+        template=spec.template,
+        priority=spec.priority,
+        parameters=spec.parameters,
+        detector=spec.requester.detector,
+        holder=spec.requester.holder,
+        namespace=task.metadata.namespace,
+        subject=event.subject,
+        subjects=tuple(spec.requester.subjects),
+        episode=event.id,
+        onset_time=parse_time(event.onset_time),
+        start_time=parse_time(event.start_time),
+        classification=None if event.classification is None else event.classification.to_json(),
+        values=event.values,
+        rule_digest=task.metadata.annotations.get(RULE_DIGEST_ANNOTATION, ""),
+    )
+
+
+def plain(values: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    """The values as JSON can carry them: nulls, NaN and infinities are left out, tuples become lists."""
+    return {key: _plain(value) for key, value in values.items() if not _is_null(value)}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(child) for key, child in value.items() if not _is_null(child)}
+    if isinstance(value, list | tuple):
+        # An item's place has a meaning, so here null stays.
+        return [None if _is_null(item) else _plain(item) for item in value]
+    return value
+
+
+def _is_null(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and not math.isfinite(value))
+
+
+def _digest(*parts: str) -> str:
+    """16 lowercase letters and digits of a hash over the parts, length-prefixed so that no two lists agree."""
+    state = hashlib.sha256()
+    for part in parts:
+        data = part.encode()
+        state.update(len(data).to_bytes(8, "big"))
+        state.update(data)
+    return base64.b32encode(state.digest()[:_DIGEST_BYTES]).decode().lower()

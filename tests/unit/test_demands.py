@@ -1,0 +1,99 @@
+"""A demand keeps its name, and comes back whole from its task."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detector.engine.demands import Demand, from_task, holder_label, to_task
+from wayside.api import ApplicationTask
+from wayside.api.applicationtask import HOLDER_LABEL
+
+DEMAND = Demand(
+    rule="lidar-vehicles-close",
+    action="record",
+    template="scene-recorder",
+    priority=3,
+    parameters={"vehicles": ["car1", "car2"], "rateHz": 10.0},
+    detector="intersection-a",
+    holder="intersection-a",
+    namespace="default",
+    subject="car1+car2",
+    subjects=("car1", "car2"),
+    episode="abc",
+    onset_time=1_767_225_600_000_000_001,
+    start_time=1_767_225_602_000_000_002,
+    classification={"overarchingPurpose": ["Safety"]},
+    values={"distance": 149.5, "a": {"client": "car1"}},
+    rule_digest="0123",
+)
+NAME = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
+
+
+def changed(**fields: Any) -> Demand:
+    return dataclasses.replace(DEMAND, **fields)
+
+
+def test_comes_back_from_its_task_through_json() -> None:
+    stored = json.loads(json.dumps(to_task(DEMAND).to_json()))
+    assert from_task(ApplicationTask.model_validate(stored)) == DEMAND
+
+
+def test_the_name_does_not_depend_on_what_may_change() -> None:
+    assert changed(parameters={}, values={}, template="other", rule_digest="9").name == DEMAND.name
+
+
+@pytest.mark.parametrize(
+    "fields", [{"holder": "b"}, {"rule": "r"}, {"action": "x"}, {"subject": "car1"}, {"start_time": 5}]
+)
+def test_the_name_tells_demands_apart(fields: dict[str, Any]) -> None:
+    assert changed(**fields).name != DEMAND.name
+
+
+def test_parts_of_the_name_do_not_run_into_each_other() -> None:
+    assert changed(holder="ab", rule="c" * 60).name != changed(holder="a", rule="b" + "c" * 60).name
+    assert changed(action="ab", subject="c").name != changed(action="a", subject="bc").name
+
+
+@given(st.from_regex(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?", fullmatch=True), st.text(max_size=20))
+def test_the_name_is_one_that_kubernetes_takes(rule: str, subject: str) -> None:
+    name = changed(rule=rule, subject=subject).name
+    assert len(name) <= 63
+    assert NAME.fullmatch(name)
+
+
+def test_a_holder_longer_than_a_label_is_shortened_and_stays_apart() -> None:
+    holders = ["d" * 60 + ".pod-1", "d" * 60 + ".pod-2", "d"]
+    labels = [holder_label(holder) for holder in holders]
+    assert labels[2] == "d"
+    assert len(set(labels)) == 3
+    assert all(len(label) <= 63 for label in labels)
+    assert to_task(changed(holder=holders[0])).metadata.labels[HOLDER_LABEL] == labels[0]
+
+
+def test_what_json_cannot_carry_is_left_out() -> None:
+    values = {"nan": float("nan"), "none": None, "list": [1.0, float("inf")], "map": {"x": float("-inf"), "y": (1,)}}
+    task = to_task(changed(values=values, parameters={"gone": None, "kept": False}))
+    assert task.spec.event is not None
+    assert task.spec.event.values == {"list": [1.0, None], "map": {"y": [1]}}
+    assert task.spec.parameters == {"kept": False}
+
+
+def test_an_ended_demand_says_when() -> None:
+    assert to_task(DEMAND, 1_767_225_604_000_000_003).spec.end_time == "2026-01-01T00:00:04.000000003Z"
+
+
+def test_a_persons_task_is_no_demand() -> None:
+    task = {"metadata": {"name": "mine"}, "spec": {"template": "scene-recorder"}}
+    assert from_task(ApplicationTask.model_validate(task | {"kind": "ApplicationTask"})) is None
+
+
+def test_what_does_not_fit_is_refused_by_field() -> None:
+    with pytest.raises(ValueError, match="subject"):
+        to_task(changed(subject="x" * 600))

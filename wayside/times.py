@@ -1,0 +1,50 @@
+"""Times as RFC 3339 text and as integer nanoseconds since the epoch, without loss either way."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+
+_SECOND = 1_000_000_000
+_PATTERN = re.compile(
+    r"(?P<whole>[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2})"
+    r"(?:\.(?P<fraction>[0-9]{1,9}))?"
+    r"(?P<zone>Z|[+-][0-9]{2}:[0-9]{2})"
+)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def format_time(ns: int) -> str:
+    """The time in UTC, always with nine digits: ``2026-01-01T00:00:00.123456789Z``.
+
+    Args:
+        ns: nanoseconds since the epoch; years 1 to 9999.
+
+    Raises:
+        ValueError: outside those years.
+    """
+    seconds, fraction = divmod(ns, _SECOND)
+    try:
+        whole = datetime.fromtimestamp(seconds, UTC)
+    except (OverflowError, OSError, ValueError) as error:
+        raise ValueError(f"{ns} ns since the epoch is no time of the years 1 to 9999") from error
+    return f"{whole.year:04}-{whole:%m-%dT%H:%M:%S}.{fraction:09}Z"
+
+
+def parse_time(text: str) -> int:
+    """Nanoseconds since the epoch of an RFC 3339 time with up to nine digits after the second.
+
+    Raises:
+        ValueError: it is none.
+    """
+    match = _PATTERN.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{text!r} is no time: write it like 2026-01-01T00:00:00.123456789Z")
+    try:
+        whole = datetime.fromisoformat(match["whole"] + match["zone"].replace("Z", "+00:00"))
+    except ValueError as error:
+        raise ValueError(f"{text!r} is no time: {error}") from error
+    # Not timestamp(): a float has no room for nanoseconds.
+    since = whole - _EPOCH
+    fraction = int((match["fraction"] or "").ljust(9, "0"))
+    return (since.days * 86_400 + since.seconds) * _SECOND + fraction
