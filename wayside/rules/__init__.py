@@ -9,7 +9,7 @@ from wayside.rules.compiled import (
     CompiledStream,
     PairSubject,
 )
-from wayside.rules.compiling import RuleProblem, RuleError, compile_rule, compile_stream, stream_problems
+from wayside.rules.compiling import RuleError, RuleProblem, compile_rule, compile_stream, stream_problems
 from wayside.rules.fields import Fields
 
 __all__ = [
@@ -21,8 +21,8 @@ __all__ = [
     "CompiledStream",
     "Fields",
     "PairSubject",
-    "RuleProblem",
     "RuleError",
+    "RuleProblem",
     "compile_rule",
     "compile_stream",
     "stream_problems",
