@@ -1,0 +1,199 @@
+"""A real control plane of one machine: etcd, kube-apiserver and kube-controller-manager on loopback ports.
+
+What is real: storage, admission, authentication, RBAC, TLS, garbage collection, the controllers of the workloads.
+What is missing: nodes. Pods are created and stay pending until a test marks them (see `tests.cluster.pods`).
+
+The order of the start matters once: the CRDs come before the controller manager, because its garbage collector looks
+for new kinds only every 30 s, and would leave the children of an ApplicationInstance alone until then.
+
+`python -m tests.cluster.controlplane` runs one until Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+from tests.cluster.api import Api, ApiError, Unreachable
+from tests.cluster.binaries import Binaries, ensure_binaries
+from tests.cluster.children import Child
+from tests.cluster.controlplane import commands
+from tests.cluster.controlplane.kubeconfig import new_token, write_kubeconfig
+from tests.cluster.controlplane.ports import free_ports
+from tests.cluster.crds import apply_crds
+from tests.cluster.waiting import wait_until
+
+READY_TIMEOUT = 60.0  # s, for each program; a loaded machine takes ten times the usual 2 s
+
+
+class ControlPlane:
+    """A control plane with data of its own; a context manager that starts and removes it.
+
+    Attributes:
+        folder: its data, certificates and logs (`*.log`); gone after `stop()`.
+        kubeconfig: for an administrator (group system:masters).
+        binaries: where its programs are, kubectl among them.
+        refused_crds: why, by file name; empty unless a CRD is wrong.
+        started_in: seconds that each program took to be ready.
+    """
+
+    def __init__(self, binaries: Binaries | None = None, crds: Path | None = None):
+        """Prepare; nothing runs yet. `crds`: the folder to install CRDs from."""
+        self.binaries = binaries or ensure_binaries()
+        self.crds = crds
+        self.folder = Path(tempfile.mkdtemp(prefix="wayside-controlplane-"))
+        self.kubeconfig = self.folder / "kubeconfig"
+        self.refused_crds: Mapping[str, ApiError] = {}
+        self.started_in: dict[str, float] = {}
+        etcd_port, etcd_peer_port, api_port = free_ports(3)
+        self._setup = commands.Setup(self.binaries, self.folder, etcd_port, etcd_peer_port, api_port)
+        self._token = new_token()
+        self._etcd: Child | None = None
+        self._api_server: Child | None = None
+        self._controller_manager: Child | None = None
+
+    @property
+    def url(self) -> str:
+        """Where the API server listens; the same after a restart."""
+        return f"https://127.0.0.1:{self._setup.api_port}"
+
+    def api(self, namespace: str = "default") -> Api:
+        """Return an administrator's client whose default namespace is `namespace`."""
+        return Api(self.kubeconfig, namespace)
+
+    def start(self) -> None:
+        """Start all and wait until each is ready.
+
+        Raises:
+            TimeoutError: one is not; the message has the end of its log.
+        """
+        try:
+            commands.write_tokens(self._setup, self._token)
+            self._etcd = self._start_etcd()
+            self.start_api_server()
+            if self.crds is not None:
+                self.refused_crds = apply_crds(self.api(), self.crds)
+            self.start_controller_manager()
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Kill all and remove the data: nobody needs it any more, so there is nothing to wait for."""
+        for child in (self._controller_manager, self._api_server, self._etcd):
+            if child is not None:
+                child.kill9()
+        self._controller_manager = self._api_server = self._etcd = None
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _start_etcd(self) -> Child:
+        # Not waited for: the API server does so itself, and starts loading meanwhile.
+        return Child("etcd", commands.etcd(self._setup), self.folder / "etcd.log")
+
+    def start_api_server(self) -> None:
+        """Start the API server, on the same port and data as before, and wait until it is ready."""
+        began = time.monotonic()
+        log = self.folder / "kube-apiserver.log"
+        child = self._api_server = Child("kube-apiserver", commands.kube_apiserver(self._setup), log)
+        self._wait(child, self._setup.serving_certificate.exists, "kube-apiserver has its certificate")
+        write_kubeconfig(self.kubeconfig, self.url, self._setup.serving_certificate.read_bytes(), self._token)
+        api = self.api()
+        self._wait(child, lambda: api.raw("/readyz") == "ok", "kube-apiserver answers ok on /readyz")
+        self.started_in["kube-apiserver"] = time.monotonic() - began
+
+    def stop_api_server(self) -> None:
+        """Kill the API server, as a failure of its machine does: connections break, the data stays in etcd."""
+        assert self._api_server is not None, "the API server does not run"
+        self._api_server.kill9()
+        self._api_server = None
+
+    @contextmanager
+    def outage(self) -> Iterator[None]:
+        """Keep the API server away for the duration of the block; after it, all works again."""
+        self.stop_api_server()
+        try:
+            yield
+        finally:
+            self.start_api_server()
+
+    def start_controller_manager(self) -> None:
+        """Start the controller manager and wait until it serves a new namespace."""
+        began = time.monotonic()
+        log = self.folder / "kube-controller-manager.log"
+        command = commands.kube_controller_manager(self._setup)
+        child = self._controller_manager = Child("kube-controller-manager", command, log)
+        api = self.api()
+        # It has no port open; that the default namespace gets its account says that its controllers run.
+        self._wait(
+            child,
+            lambda: api.find("ServiceAccount", "default") is not None,
+            "kube-controller-manager made the service account of the default namespace",
+        )
+        self.started_in["kube-controller-manager"] = time.monotonic() - began
+
+    def stop_controller_manager(self) -> None:
+        """Kill the controller manager."""
+        assert self._controller_manager is not None, "the controller manager does not run"
+        self._controller_manager.kill9()
+        self._controller_manager = None
+
+    def kubectl(self, *arguments: str) -> str:
+        """Run kubectl as the administrator and return its stdout.
+
+        Raises:
+            RuntimeError: it failed; with its stderr.
+        """
+        command = [str(self.binaries.kubectl), f"--kubeconfig={self.kubeconfig}", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        if done.returncode != 0:
+            raise RuntimeError(f"kubectl {' '.join(arguments)}: exit code {done.returncode}\n{done.stderr}")
+        return done.stdout
+
+    def kubeconfig_with_token(self, name: str, token: str) -> Path:
+        """Write a kubeconfig for whom the token belongs to and return its path; `name` names the file."""
+        path = self.folder / f"kubeconfig-{name}"
+        write_kubeconfig(path, self.url, self._setup.serving_certificate.read_bytes(), token)
+        return path
+
+    def kubeconfig_of_service_account(self, namespace: str, name: str) -> Path:
+        """Return the path of a kubeconfig for a service account, valid for an hour: what RBAC allows it, no more."""
+        request = {
+            "apiVersion": "authentication.k8s.io/v1",
+            "kind": "TokenRequest",
+            "spec": {"expirationSeconds": 3600},
+        }
+        answer = self.api(namespace).post("ServiceAccount", name, "token", request)
+        return self.kubeconfig_with_token(f"{namespace}-{name}", str(answer["status"]["token"]))
+
+    def tails(self, lines: int = 40) -> str:
+        """Return the ends of all logs, for messages."""
+        children = (self._etcd, self._api_server, self._controller_manager)
+        return "\n".join(child.tail(lines) for child in children if child is not None)
+
+    def memory(self) -> dict[str, int]:
+        """Return the resident bytes of each running program."""
+        children = (self._etcd, self._api_server, self._controller_manager)
+        return {child.name: child.resident_bytes() for child in children if child is not None}
+
+    def _wait(self, child: Child, ready: Callable[[], bool], what: str) -> None:
+        def look() -> bool:
+            if not child.alive:
+                raise RuntimeError(f"{child.name} ended instead of: {what}\n{self.tails()}")
+            return ready()
+
+        wait_until(look, bool, timeout=READY_TIMEOUT, what=what, transient=(Unreachable, ApiError), diagnose=self.tails)
+
+    def __enter__(self) -> ControlPlane:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()

@@ -1,0 +1,112 @@
+"""The command lines of the control plane, and why each flag is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.cluster.binaries import Binaries
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that the command lines depend on."""
+
+    binaries: Binaries
+    folder: Path
+    etcd_port: int
+    etcd_peer_port: int
+    api_port: int
+
+    @property
+    def serving_certificate(self) -> Path:
+        """PEM that kube-apiserver writes at its first start: its certificate, then the CA that signed it."""
+        return self.folder / "certificates" / "apiserver.crt"
+
+    @property
+    def serving_key(self) -> Path:
+        """The key of the certificate. It signs the service accounts' tokens as well: no other tool for keys needed."""
+        return self.folder / "certificates" / "apiserver.key"
+
+    @property
+    def tokens(self) -> Path:
+        """Who may come: `token,user,uid,"group,…"` a line."""
+        return self.folder / "tokens.csv"
+
+    @property
+    def kubeconfig(self) -> Path:
+        """An administrator's."""
+        return self.folder / "kubeconfig"
+
+
+def write_tokens(setup: Setup, administrator: str) -> None:
+    """Write the file of those whom the API server lets in."""
+    setup.tokens.touch(mode=0o600)
+    setup.tokens.write_text(f'{administrator},administrator,administrator,"system:masters"\n')
+
+
+def etcd(setup: Setup) -> list[str]:
+    """Return the command line of etcd."""
+    client = f"http://127.0.0.1:{setup.etcd_port}"
+    peer = f"http://127.0.0.1:{setup.etcd_peer_port}"
+    return [
+        str(setup.binaries.etcd),
+        f"--data-dir={setup.folder / 'etcd'}",
+        f"--listen-client-urls={client}",
+        f"--advertise-client-urls={client}",
+        f"--listen-peer-urls={peer}",
+        f"--initial-advertise-peer-urls={peer}",
+        f"--initial-cluster=default={peer}",
+        "--unsafe-no-fsync",  # the data lives as long as the machine does, and fsync is most of a write's time
+        "--log-level=warn",
+    ]
+
+
+def kube_apiserver(setup: Setup) -> list[str]:
+    """Return the command line of kube-apiserver: its defaults, with as few exceptions as one machine needs."""
+    return [
+        str(setup.binaries.kube_apiserver),
+        f"--etcd-servers=http://127.0.0.1:{setup.etcd_port}",
+        "--bind-address=127.0.0.1",
+        "--advertise-address=127.0.0.1",
+        f"--secure-port={setup.api_port}",
+        f"--cert-dir={setup.serving_certificate.parent}",
+        f"--token-auth-file={setup.tokens}",
+        "--authorization-mode=Node,RBAC",
+        "--service-account-issuer=https://kubernetes.default.svc",
+        f"--service-account-signing-key-file={setup.serving_key}",
+        f"--service-account-key-file={setup.serving_key}",
+        "--service-cluster-ip-range=10.96.0.0/16",
+        "--endpoint-reconciler-type=none",  # a Service `kubernetes` with a loopback address would be refused anyway
+    ]
+
+
+CONTROLLERS = (
+    "deployment-controller",
+    "replicaset-controller",
+    "statefulset-controller",
+    "daemonset-controller",
+    "job-controller",
+    "endpointslice-controller",
+    "garbage-collector-controller",
+    "namespace-controller",
+    "resourcequota-controller",
+    "serviceaccount-controller",
+    "root-ca-certificate-publisher-controller",
+    "clusterrole-aggregation-controller",
+    "validatingadmissionpolicy-status-controller",
+)
+
+
+def kube_controller_manager(setup: Setup) -> list[str]:
+    """Return the command line of kube-controller-manager: the controllers that work without nodes."""
+    return [
+        str(setup.binaries.kube_controller_manager),
+        f"--kubeconfig={setup.kubeconfig}",
+        f"--controllers={','.join(CONTROLLERS)}",
+        f"--root-ca-file={setup.serving_certificate}",
+        "--leader-elect=false",  # it is alone, and a lease would delay its restart
+        "--secure-port=0",
+        "--kube-api-qps=1000",  # the default of 20 a second would be what a test of 100 Deployments measures
+        "--kube-api-burst=2000",
+    ]

