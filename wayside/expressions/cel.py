@@ -238,7 +238,7 @@ _ABSENT = ("no value for ", "no key ", "no index ")
 _CLEANING: Final = (
     (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
     (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
-    (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list of \2"),
+    (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list"),
     (re.compile(r"^\w+: No matching overloads found : (.*)$"), r"the operation does not take these types: \1"),
     (re.compile(r"^[A-Z_]+: (.*?)(?: \[[A-Z_]+\])?$", re.DOTALL), r"\1"),
 )

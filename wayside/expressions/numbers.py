@@ -44,14 +44,11 @@ def doubled(source: str) -> Doubled:
     text: list[str] = []
     origin: list[int] = []
     for token in scanned:
-        own = replaced.get(token.start)
-        for piece, inserted in (
-            (before.get(token.start, ""), True),
-            (own if own is not None else token.text, own is not None),
-            (after.get(token.start, ""), True),
-        ):
-            text.append(piece)
-            origin.extend([token.start] * len(piece) if inserted else range(token.start, token.end))
+        own = replaced.get(token.start, token.text)
+        text += (before.get(token.start, ""), own, after.get(token.start, ""))
+        origin += [token.start] * len(text[-3])
+        origin += range(token.start, token.end) if own == token.text else [token.start] * len(own)
+        origin += [token.end - 1] * len(text[-1])
     return Doubled("".join(text), tuple(origin))
 
 

@@ -159,6 +159,8 @@ def _integer(value: int) -> int | float:
 
 
 def _key(key: object) -> object:
+    if type(key) is str:
+        return key.replace("\0", "␀") if "\0" in key else key
     return key.tolist() if _is_array(key) else key  # type: ignore[attr-defined]
 
 
