@@ -147,7 +147,8 @@ class Expression:
     ) -> Value | Unknown:
         """The result on `values`, or UNKNOWN where it depends on what is absent, null or NaN, or the expression fails.
 
-        `on_unknown` is told the reason and a message. Never raises for what the values hold.
+        `on_unknown` is told the reason and a message. Never raises for what the values hold. Null being unknown,
+        `x == null` is never true: ask `has(msg.x)`, which is false for an absent, null or NaN field.
         """
         try:
             value = self._run(values, known=True)
