@@ -1,0 +1,1 @@
+"""Where the data comes from: keys, codecs and the Zenoh session."""

@@ -1,0 +1,1 @@
+"""Codecs: from the bytes of a message to plain maps, lists, strings and doubles."""

@@ -1,0 +1,36 @@
+"""Encoded names can be read back, fit into keys, and keep subjects apart."""
+
+import re
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wayside.names import decode, encode, subject_text
+
+texts = st.text(st.characters(exclude_categories=["Cs"]), min_size=1)
+subjects = st.tuples(st.lists(texts, max_size=3), st.none() | texts)
+
+
+@given(texts)
+def test_what_is_encoded_can_be_read_back(text: str) -> None:
+    assert decode(encode(text)) == text
+
+
+@given(texts)
+def test_an_encoded_name_holds_only_safe_characters(text: str) -> None:
+    assert re.fullmatch(r"(?:[A-Za-z0-9_.-]|%[0-9A-F]{2})+", encode(text))
+
+
+@given(subjects, subjects)
+def test_different_subjects_have_different_texts(
+    one: tuple[list[str], str | None], other: tuple[list[str], str | None]
+) -> None:
+    assert (subject_text(*one) == subject_text(*other)) == (one == other)
+
+
+def test_subjects_read_as_the_design_says() -> None:
+    assert subject_text(["car1"]) == "car1"
+    assert subject_text(["car1", "car2"], "north") == "car1+car2~north"
+    assert subject_text([]) == "~fleet"
+    assert subject_text([], "a/b") == "~fleet~a%2Fb"
+    assert subject_text(["urn:car~1"]) == "urn%3Acar%7E1"

@@ -1,0 +1,31 @@
+"""Names inside keys and object names: percent-encoded, and joined so that no two subjects read the same."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from urllib.parse import unquote_to_bytes
+
+FLEET = "~fleet"
+"""The subject of a rule over the whole fleet."""
+
+_OUTSIDE = re.compile(rb"[^A-Za-z0-9_.-]")
+
+
+def encode(text: str) -> str:
+    """The text with every byte (UTF-8) outside `[A-Za-z0-9_.-]` as `%XX`: one chunk of a key, whatever it held."""
+    return _OUTSIDE.sub(lambda found: b"%%%02X" % found[0][0], text.encode()).decode("ascii")
+
+
+def decode(text: str) -> str:
+    """What `encode` was given. Raises ValueError where the bytes are not UTF-8."""
+    return unquote_to_bytes(text).decode()
+
+
+def subject_text(clients: Sequence[str], element: str | None = None) -> str:
+    """A subject in one word: `car1`, `car1+car2`, `~fleet` for no client; an element of `each` follows after `~`.
+
+    `+` and `~` never occur in an encoded name, so different subjects have different texts.
+    """
+    text = "+".join(map(encode, clients)) if clients else FLEET
+    return text if element is None else f"{text}~{encode(element)}"
