@@ -1,0 +1,70 @@
+"""Finding the API server and who we are in its cluster: a kubeconfig, or the pod's own account."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from kubernetes.aio.client import ApiClient, Configuration
+from kubernetes.aio.config import ConfigException, kube_config, load_incluster_config, load_kube_config
+
+from detector.cluster.api import Api
+
+_OWN_NAMESPACE = Path("/var/run/secrets/kubernetes.io/serviceaccount/namespace")
+_IN_CLUSTER = "KUBERNETES_SERVICE_HOST"
+_CONNECTIONS = 32
+
+
+class NoClusterError(Exception):
+    """There is no way to an API server; the text says what to give."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A connection and the namespace that it is meant for."""
+
+    api: Api
+    namespace: str
+
+
+@asynccontextmanager
+async def connect(namespace: str | None = None, kubeconfig: Path | None = None) -> AsyncIterator[Cluster]:
+    """Set up the one connection that all parts share. Nothing is sent yet: the server may be away.
+
+    Args:
+        namespace: where to work. Default: the kubeconfig context's, or the pod's own.
+        kubeconfig: a file. Default: `KUBECONFIG`; in a pod without it, the pod's account; else `~/.kube/config`.
+
+    Raises:
+        NoClusterError: there is neither, or it cannot be read.
+    """
+    configuration = Configuration()
+    configuration.connection_pool_maxsize = _CONNECTIONS
+    found = await _load(configuration, kubeconfig)
+    api = Api(ApiClient(configuration))
+    try:
+        yield Cluster(api, namespace or found)
+    finally:
+        await api.close()
+
+
+async def _load(configuration: Configuration, kubeconfig: Path | None) -> str:
+    """Fill in the configuration; the default namespace."""
+    try:
+        if kubeconfig is None and "KUBECONFIG" not in os.environ and _IN_CLUSTER in os.environ:
+            load_incluster_config(configuration)  # type: ignore[no-untyped-call]
+            return _OWN_NAMESPACE.read_text().strip()  # noqa: ASYNC240  once, at the start
+        file = str(kubeconfig) if kubeconfig else os.environ.get("KUBECONFIG", kube_config.KUBE_CONFIG_DEFAULT_LOCATION)
+        loader = await load_kube_config(  # type: ignore[no-untyped-call]
+            file, client_configuration=configuration, persist_config=False
+        )
+        context = loader.current_context.get("context", {})
+        return str(context.get("namespace") or "default")
+    except (ConfigException, OSError) as error:
+        raise NoClusterError(
+            f"no API server: {error}. Set KUBECONFIG to a kubeconfig file, or run in a pod with a service account; "
+            "or run without a cluster, with --detector FILE and --rules FILE"
+        ) from error

@@ -1,0 +1,73 @@
+"""What the API server may answer, sorted by what the caller should do about it."""
+
+from __future__ import annotations
+
+import json
+
+
+class ApiError(Exception):
+    """A request to the API server failed. The text is what the server said, or why it said nothing."""
+
+    def __init__(self, code: int, reason: str, message: str) -> None:
+        super().__init__(f"{code} {reason}: {message}" if code else f"{reason}: {message}")
+        self.code = code
+        """The HTTP status; 0 where there was no answer."""
+        self.reason = reason
+        """In the words of the API, e.g. `Forbidden`."""
+        self.message = message
+
+
+class UnavailableError(ApiError):
+    """No answer, or one that says to come back later: the same request may succeed soon."""
+
+    def __init__(self, code: int, reason: str, message: str, retry_after: float = 0.0) -> None:
+        super().__init__(code, reason, message)
+        self.retry_after = retry_after
+        """Seconds that the server asks to wait; 0 where it does not say."""
+
+
+class RefusedError(ApiError):
+    """The server understood and refuses: the same request will fail again until somebody changes something."""
+
+
+class NotFoundError(RefusedError):
+    """There is no such object, namespace or kind."""
+
+
+class AlreadyExistsError(RefusedError):
+    """An object of this name exists."""
+
+
+class ConflictError(RefusedError):
+    """The object is not the one, or not in the state, that the request expected: read it again."""
+
+
+class GoneError(RefusedError):
+    """The server no longer has the history from which to continue a watch: list again."""
+
+
+_UNAVAILABLE_CODES = frozenset({401, 408, 429})
+"""Beside 5xx. 401 because a token that has just been rotated is read again with the next request."""
+
+
+def error_of(code: int, body: bytes, retry_after: str | None = None) -> ApiError:
+    """The error that an answer stands for.
+
+    Args:
+        code: the HTTP status, 400 or more (or that of a watch's ERROR event).
+        body: the answer, usually a Status object.
+        retry_after: the header, in seconds.
+    """
+    reason, message = "Unknown", body[:500].decode(errors="replace").strip()
+    try:
+        status = json.loads(body)
+        reason, message = str(status.get("reason", reason)), str(status.get("message", message))
+    except (ValueError, AttributeError):
+        pass  # a proxy's page in place of a Status: its beginning is the message
+    if code in _UNAVAILABLE_CODES or code >= 500:
+        wait = float(retry_after) if retry_after and retry_after.isdigit() else 0.0
+        return UnavailableError(code, reason, message, wait)
+    if code == 409:
+        return (AlreadyExistsError if reason == "AlreadyExists" else ConflictError)(code, reason, message)
+    kind = {404: NotFoundError, 410: GoneError}.get(code, RefusedError)
+    return kind(code, reason, message)
