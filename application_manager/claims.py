@@ -1,0 +1,139 @@
+"""What one task asks for by itself: an instance and values for it, or why it cannot be had.
+
+Pure, and independent of all other tasks: it depends on the task's spec and on the template's parameters and key only.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+from typing import Any
+
+from application_manager import parameters, values
+from wayside.api import ApplicationTask, ApplicationTemplate
+from wayside.expressions import CompiledTemplate, Environment, InterpolationError, Kind, compile_template
+
+MAXIMUM_KEY_LENGTH = 1024  # characters, as ApplicationInstance's spec.key allows
+
+
+class Refused(StrEnum):
+    """Why a task does not count: reasons of its condition Accepted=False."""
+
+    TEMPLATE_NOT_FOUND = "TemplateNotFound"
+    TEMPLATE_INVALID = "TemplateInvalid"
+    INVALID_PARAMETERS = "InvalidParameters"
+    INVALID_KEY = "InvalidKey"
+    CONFLICT = "Conflict"
+    INSTANCE_NOT_MANAGED = "InstanceNotManaged"
+    INVALID_TASK = "InvalidTask"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A task that cannot be served, with the reason for programs and for people."""
+
+    reason: Refused
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A task's demand on one instance; `parameters` are those that the task itself gives."""
+
+    task: ApplicationTask
+    instance: str
+    key: str | None
+    parameters: Mapping[str, Any]
+
+
+def claim(template: ApplicationTemplate | None, task: ApplicationTask) -> Claim | Refusal:
+    """What the task asks for of its template, None where there is no such template."""
+    if template is None:
+        return Refusal(
+            Refused.TEMPLATE_NOT_FOUND,
+            f"spec.template: there is no ApplicationTemplate {task.spec.template!r} in namespace {task.namespace}: "
+            "create it, or correct the rule that emitted this task",
+        )
+    declared = template.spec.parameters
+    problems = parameters.problems(declared, task.spec.parameters, template.name, "spec.parameters")
+    if problems:
+        return Refusal(Refused.INVALID_PARAMETERS, "; ".join(problems))
+    given = parameters.given(task.spec.parameters)
+    if template.spec.key is None:
+        return Claim(task, template.name, None, given)
+    try:
+        key = instance_key(template, parameters.with_defaults(declared, given))
+    except InterpolationError as error:
+        return Refusal(Refused.INVALID_KEY, f"the key of template {template.name}, {error}")
+    if len(key) > MAXIMUM_KEY_LENGTH:
+        return Refusal(
+            Refused.INVALID_KEY,
+            f"the key of template {template.name}, {template.spec.key}, has {len(key)} characters for this task, "
+            f"more than {MAXIMUM_KEY_LENGTH}: make it from shorter parameters",
+        )
+    return Claim(task, instance_name(template.name, key), key, given)
+
+
+def instance_name(template: str, key: str | None) -> str:
+    """The instance's name: the template's, and with a key 10 characters that stand for it."""
+    if key is None:
+        return template
+    digest = hashlib.sha256(key.encode()).digest()
+    return f"{template}-{base64.b32encode(digest)[:10].decode().lower()}"
+
+
+def instance_key(template: ApplicationTemplate, complete: Mapping[str, Any]) -> str:
+    """The key's value as text, from a task's parameters completed by the defaults.
+
+    Raises InterpolationError where the key does not compile, reads what is no parameter, or has no value.
+    """
+    declared = tuple(sorted(template.spec.parameters))
+    compiled = _compiled_key(template.spec.key or "", declared)
+    value = compiled.render({"parameters": {name: complete.get(name) for name in declared}})
+    if value is None:
+        raise InterpolationError(
+            "is null for this task", path="spec.key", hint="give the parameters that it is made from"
+        )
+    return values.text(value)
+
+
+@lru_cache(maxsize=1024)
+def _compiled_key(source: str, declared: tuple[str, ...]) -> CompiledTemplate:
+    compiled = compile_template(source, Environment({"parameters": Kind.MAP}), path="spec.key")
+    check_paths(compiled, {"parameters": declared})
+    return compiled
+
+
+def check_paths(compiled: CompiledTemplate, known: Mapping[str, tuple[str, ...]]) -> None:
+    """See that every `${name.member}` names a member that there is.
+
+    Raises InterpolationError for the first that does not, with all others in its `others`.
+    """
+    errors = []
+    for each in compiled.embedded:
+        for path in sorted(each.expression.paths, key=str):
+            members = known.get(str(path[0]))
+            if members is None or len(path) < 2 or path[1] in members:
+                continue
+            hint = f"there {'is' if len(members) == 1 else 'are'} {', '.join(members) or 'none'}"
+            if each.text.strip() != f"${{{each.expression.source}}}":
+                hint += "; write `$${` for a literal `${`"
+            errors.append(_unknown_member(each.text, each.offset, each.path, f"{path[0]}.{path[1]}", hint))
+    if errors:
+        raise _joined(errors)
+
+
+def _unknown_member(text: str, offset: int, path: str, name: str, hint: str) -> InterpolationError:
+    line_start = text.rfind("\n", 0, offset) + 1
+    line, column = text.count("\n", 0, offset) + 1, offset - line_start + 1
+    return InterpolationError(f"`{name}` is not known", path=path, line=line, column=column, hint=hint)
+
+
+def _joined(errors: list[InterpolationError]) -> InterpolationError:
+    first, *others = errors
+    first.others = tuple(others)
+    return first

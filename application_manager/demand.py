@@ -1,0 +1,266 @@
+"""Demand: what should run, as a pure function of what is live.
+
+`demand` looks at one namespace: its templates, tasks, instances with their status, the Leases of its holders and the
+time. The result does not depend on the order in which anything arrived. It falls into independent parts: each task
+claims an instance by itself (`claims`), and `decide` looks at one instance and the tasks that claim it. The operator
+calls just these parts for what changed; `demand` is their sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from application_manager import parameters
+from application_manager.claims import Claim, Refusal, Refused, claim
+from application_manager.leases import LeaseView
+from application_manager.times import parse_time
+from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
+from wayside.api.applicationtemplate import Lifecycle, LossPolicy
+from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Duration
+
+LINGER_ANNOTATION = "wayside.dev/linger"
+"""On an instance: its template's linger, for when the template is gone."""
+
+HOLDER_LOST = "HolderLost"
+FINISH_LOST_AFTER = 3600.0  # s that a holder may be lost before its tasks are finished
+
+
+class Standing(StrEnum):
+    """What a task is to the demand."""
+
+    COUNTS = "Counts"
+    REFUSED = "Refused"
+    LAPSED = "Lapsed"
+    FINISHED = "Finished"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of one task; reason and message are those of its condition Accepted, or Finished."""
+
+    standing: Standing
+    reason: str
+    message: str
+    instance: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What should become of one instance.
+
+    Attributes:
+        parameters: the merged values; None where they stay as they are.
+        tasks: the tasks that contribute, in their order.
+        verdicts: of all tasks that claim the instance, by task name.
+        release_time: when it goes, in seconds since 1970; None: it stays.
+        next_change: when this decision changes by itself, in seconds since 1970; None: not at all.
+    """
+
+    name: str
+    template: str
+    key: str | None
+    parameters: dict[str, object] | None
+    tasks: tuple[str, ...]
+    verdicts: dict[str, Verdict]
+    release_time: float | None
+    next_change: float | None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether any task demands it."""
+        return bool(self.tasks)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What should become of a whole namespace, by name; only instances that exist or should."""
+
+    instances: dict[str, Decision]
+    verdicts: dict[str, Verdict]
+    next_change: float | None
+
+
+def demand(
+    templates: Iterable[ApplicationTemplate],
+    tasks: Iterable[ApplicationTask],
+    instances: Iterable[ApplicationInstance],
+    leases: Mapping[str, LeaseView],
+    now: float,
+) -> Outcome:
+    """What should run in one namespace.
+
+    Args:
+        templates: all of the namespace, as all else.
+        tasks: those being deleted count no more.
+        instances: with their status, which holds the deadline of a linger.
+        leases: by holder; a holder that is missing is not lost.
+        now: seconds since 1970.
+    """
+    by_name = {each.name: each for each in templates}
+    existing = {each.name: each for each in instances}
+    claimed: dict[str, list[Claim]] = {}
+    verdicts: dict[str, Verdict] = {}
+    for task in tasks:
+        verdict = claim_or_verdict(by_name.get(task.spec.template), task)
+        if isinstance(verdict, Claim):
+            claimed.setdefault(verdict.instance, []).append(verdict)
+        else:
+            verdicts[task.name] = verdict
+    decisions: dict[str, Decision] = {}
+    for name in sorted(claimed.keys() | existing.keys()):
+        instance, claims = existing.get(name), claimed.get(name, [])
+        template = instance.spec.template if instance else claims[0].task.spec.template
+        decision = decide(
+            name,
+            template,
+            template=by_name.get(template),
+            claims=claims,
+            instance=instance,
+            leases=leases,
+            now=now,
+        )
+        verdicts |= decision.verdicts
+        if decision.wanted or instance:
+            decisions[name] = decision
+    changes = [each.next_change for each in decisions.values() if each.next_change is not None]
+    return Outcome(decisions, verdicts, min(changes, default=None))
+
+
+def claim_or_verdict(template: ApplicationTemplate | None, task: ApplicationTask) -> Claim | Verdict:
+    """What the task claims, or its verdict where it claims nothing, because it has ended or is refused."""
+    if task.spec.end_time is not None:
+        return Verdict(Standing.FINISHED, "Ended", f"the demand ended at {task.spec.end_time}")
+    if task.metadata.deletion_timestamp is not None:
+        return Verdict(Standing.FINISHED, "Deleted", "the task is being deleted")
+    claimed = claim(template, task)
+    if isinstance(claimed, Refusal):
+        return Verdict(Standing.REFUSED, claimed.reason, claimed.message)
+    return claimed
+
+
+def decide(
+    name: str,
+    template_name: str,
+    *,
+    template: ApplicationTemplate | None,
+    claims: Iterable[Claim],
+    instance: ApplicationInstance | None,
+    leases: Mapping[str, LeaseView],
+    now: float,
+) -> Decision:
+    """What should become of the instance, given the tasks that claim it."""
+    ordered = sorted(claims, key=lambda each: precedence(each.task))
+    if instance is not None and not is_managed(instance):
+        return _left_alone(instance, ordered)
+    verdicts: dict[str, Verdict] = {}
+    changes: list[float] = []
+    live: list[Claim] = []
+    lifecycle = template.spec.lifecycle if template else Lifecycle()
+    for each in ordered:
+        lapse, change = _lapse(each.task, lifecycle, leases, now)
+        if change is not None:
+            changes.append(change)
+        if lapse is None:
+            live.append(each)
+        else:
+            verdicts[each.task.name] = lapse
+    declared = template.spec.parameters if template else {}
+    merged = parameters.merge(declared, [parameters.Contribution(each.task.name, each.parameters) for each in live])
+    contributing = [each for each in live if each.task.name not in merged.conflicts]
+    for each in live:
+        conflict = merged.conflicts.get(each.task.name)
+        verdicts[each.task.name] = (
+            Verdict(Standing.REFUSED, Refused.CONFLICT, conflict.message())
+            if conflict
+            else Verdict(Standing.COUNTS, "Accepted", f"counts for instance {name}", name)
+        )
+    key = contributing[0].key if contributing else instance.spec.key if instance else None
+    release_time = None
+    if not contributing and instance is not None:
+        release_time = _release_time(instance, template, now)
+        changes.append(release_time)
+    return Decision(
+        name=name,
+        template=template_name,
+        key=key,
+        parameters=merged.parameters if contributing else None,
+        tasks=tuple(each.task.name for each in contributing),
+        verdicts=verdicts,
+        release_time=release_time,
+        next_change=min((change for change in changes if change > now), default=None),
+    )
+
+
+def precedence(task: ApplicationTask) -> tuple[int, str, str]:
+    """The order of tasks: priority descending, then creation, then name; never times that the sender claims."""
+    return (-task.spec.priority, task.metadata.creation_timestamp, task.name)
+
+
+def is_managed(instance: ApplicationInstance) -> bool:
+    """Whether the manager made the instance; a person's is never changed or released."""
+    return instance.metadata.labels.get(MANAGED_BY_LABEL) == MANAGED_BY
+
+
+def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
+    message = (
+        f"ApplicationInstance {instance.name} was made by a person and is left alone: "
+        "delete it, or give it another name, so that tasks can be served"
+    )
+    refused = Verdict(Standing.REFUSED, Refused.INSTANCE_NOT_MANAGED, message)
+    verdicts = {each.task.name: refused for each in claims}
+    spec = instance.spec
+    return Decision(instance.name, spec.template, spec.key, None, (), verdicts, None, None)
+
+
+def _release_time(instance: ApplicationInstance, template: ApplicationTemplate | None, now: float) -> float:
+    """The deadline that the status holds, or a new one: linger begins when we see that no demand is left."""
+    if instance.status is not None and instance.status.release_time is not None:
+        return parse_time(instance.status.release_time)
+    return now + linger_of(instance, template).seconds
+
+
+def linger_of(instance: ApplicationInstance, template: ApplicationTemplate | None) -> Duration:
+    """How long the instance lingers: as its template says, or said while there was one."""
+    if template is not None:
+        return template.spec.lifecycle.linger
+    noted = instance.metadata.annotations.get(LINGER_ANNOTATION)
+    try:
+        return Duration.parse(noted) if noted else Lifecycle().linger
+    except ValueError:
+        return Lifecycle().linger  # somebody wrote something else into the annotation
+
+
+def _lapse(
+    task: ApplicationTask, lifecycle: Lifecycle, leases: Mapping[str, LeaseView], now: float
+) -> tuple[Verdict | None, float | None]:
+    """The task's verdict where its holder is lost, None where it counts; and when that changes by itself.
+
+    What the status says of a loss survives our own restart: the holder counts as lost until its Lease is seen to be
+    renewed, since a new manager has not observed anything yet.
+    """
+    holder = task.spec.requester.holder
+    view = leases.get(holder) if holder else None
+    if holder is None or view is None or lifecycle.on_detector_loss.policy is LossPolicy.HOLD:
+        return None, None
+    limit = view.duration + lifecycle.on_detector_loss.after.seconds
+    lost_since = _lost_since(task)
+    if view.unchanged < limit and (view.renewed or lost_since is None):
+        return None, now + limit - view.unchanged
+    since = now if lost_since is None else lost_since
+    if now - since >= FINISH_LOST_AFTER:
+        message = f"holder {holder} has been lost for over an hour"
+        return Verdict(Standing.FINISHED, "DetectorLost", message), None
+    message = (
+        f"holder {holder} is lost: its Lease wayside-{holder} was not renewed for {limit:g} s; "
+        "the demand counts again when it is"
+    )
+    return Verdict(Standing.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER
+
+
+def _lost_since(task: ApplicationTask) -> float | None:
+    for condition in task.status.conditions if task.status else ():
+        if condition.type == "Accepted" and condition.status == "False" and condition.reason == HOLDER_LOST:
+            return parse_time(condition.last_transition_time)
+    return None

@@ -1,0 +1,116 @@
+"""Whether the holders of demands are still there, judged by their Leases and by our own clock alone.
+
+A Lease lapses when it has been *observed unchanged* for long enough, on a clock of ours that runs only while we reach
+the API server: the holder's clock may be wrong, and an outage stops its renewals as well as our looking. Pure: fed with
+what was seen and when.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+DEFAULT_DURATION = 15.0  # s, of a Lease that says none, and of a holder that has no Lease yet
+LEASE_PREFIX = "wayside-"
+
+HolderKey = tuple[str, str]
+"""Namespace and holder."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseView:
+    """A holder's Lease as of now.
+
+    Attributes:
+        unchanged: for how many seconds it has been observed unchanged.
+        duration: the Lease's own duration in seconds.
+        renewed: whether it was seen to change since we began to look.
+    """
+
+    unchanged: float
+    duration: float = DEFAULT_DURATION
+    renewed: bool = True
+
+
+class HealthyTime:
+    """Seconds during which we reached the API server.
+
+    The time between two looks counts when both succeeded and were at most `longest` seconds apart; a longer gap means
+    that we ourselves stood still, and then nothing can be said about others.
+    """
+
+    def __init__(self, longest: float = 5.0) -> None:
+        self._longest = longest
+        self._last: float | None = None
+        self.elapsed = 0.0
+
+    def look(self, now: float, *, succeeded: bool) -> None:
+        """Note a look at the API server at `now`, in seconds of a monotonic clock."""
+        if not succeeded:
+            self._last = None
+            return
+        if self._last is not None and 0 < now - self._last <= self._longest:
+            self.elapsed += now - self._last
+        self._last = now
+
+
+@dataclass(slots=True)
+class _Observation:
+    identity: str
+    since: float  # healthy seconds
+    duration: float = DEFAULT_DURATION
+    renewed: bool = False
+
+
+@dataclass(slots=True)
+class LeaseBook:
+    """What was observed of all Leases; times are healthy seconds (see `HealthyTime.elapsed`)."""
+
+    _observed: dict[HolderKey, _Observation] = field(default_factory=dict)
+
+    def observe(self, key: HolderKey, lease: Mapping[str, Any] | None, at: float) -> bool:
+        """Note the holder's Lease as it is, None where there is none. Returns whether it changed, i.e. was renewed."""
+        identity = _identity(lease)
+        known = self._observed.get(key)
+        if known is None:
+            self._observed[key] = _Observation(identity, at, _duration(lease))
+            return False
+        if identity == known.identity:
+            return False
+        # A Lease that disappears is no sign of life; one that appears or changes is.
+        if lease is not None:
+            known.since, known.renewed = at, True
+            known.duration = _duration(lease)
+        known.identity = identity
+        return lease is not None
+
+    def view(self, key: HolderKey, at: float) -> LeaseView:
+        """The holder's Lease at `at`. A holder never heard of counts as observed, without a Lease, from now on."""
+        known = self._observed.setdefault(key, _Observation(_identity(None), at))
+        return LeaseView(max(0.0, at - known.since), known.duration, known.renewed)
+
+    def forget_except(self, keys: Iterable[HolderKey]) -> None:
+        """Drop what concerns no holder of interest any more."""
+        kept = set(keys)
+        for key in [key for key in self._observed if key not in kept]:
+            del self._observed[key]
+
+
+def lease_name(holder: str) -> str:
+    """The name of the holder's Lease."""
+    return LEASE_PREFIX + holder
+
+
+def _identity(lease: Mapping[str, Any] | None) -> str:
+    """What a renewal changes: the Lease's spec and its uid, not its labels or managed fields."""
+    if lease is None:
+        return ""
+    uid = lease.get("metadata", {}).get("uid", "")
+    return f"{uid} {json.dumps(lease.get('spec', {}), sort_keys=True)}"
+
+
+def _duration(lease: Mapping[str, Any] | None) -> float:
+    seconds = (lease or {}).get("spec", {}).get("leaseDurationSeconds")
+    return float(seconds) if seconds else DEFAULT_DURATION

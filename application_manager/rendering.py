@@ -1,0 +1,182 @@
+"""Rendering: a template and an instance give manifests, and the same two give the same bytes.
+
+Pure. A `Renderer` holds a template compiled once; `render` fills in an instance. What the template may not do is said
+with the field, the value and the remedy; then nothing is rendered at all.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+from application_manager import parameters, values
+from application_manager.claims import check_paths
+from application_manager.policy import Policy
+from wayside.api import ApplicationInstance, ApplicationTemplate
+from wayside.api.base import API_VERSION, MANAGED_BY, MANAGED_BY_LABEL
+from wayside.expressions import CompiledTemplate, Environment, InterpolationError, Kind, compile_template
+
+INSTANCE_LABEL = "wayside.dev/instance"
+TEMPLATE_LABEL = "wayside.dev/template"
+
+_INSTANCE_VARIABLES = ("name", "key", "namespace")
+_ENVIRONMENT = Environment({"parameters": Kind.MAP, "instance": Kind.MAP})
+_RESERVED_METADATA = ("ownerReferences", "generateName", "uid", "resourceVersion", "managedFields", "finalizers")
+
+Manifest = dict[str, Any]
+
+
+class RenderError(Exception):
+    """A template that cannot be rendered; `problems` holds all that is wrong, each with field, value and remedy."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("; ".join(problems))
+        self.problems = tuple(problems)
+
+
+@dataclass(frozen=True, slots=True)
+class Rendering:
+    """The objects of an instance: manifests without owner, which `owned` adds, and a digest of them all."""
+
+    manifests: tuple[Manifest, ...]
+    digest: str
+
+
+class Renderer:
+    """A template, compiled.
+
+    Raises RenderError for expressions that do not compile or name what there is not, and for kinds not allowed.
+    """
+
+    def __init__(self, template: ApplicationTemplate, policy: Policy) -> None:
+        self.template = template
+        self._policy = policy
+        self._keyed = template.spec.key is not None
+        self._manifests: list[CompiledTemplate] = []
+        problems: list[str] = []
+        known = {"parameters": tuple(sorted(template.spec.parameters)), "instance": _INSTANCE_VARIABLES}
+        for index, manifest in enumerate(template.spec.manifests):
+            path = f"spec.manifests[{index}]"
+            kind_problem = policy.kind_problem(manifest["apiVersion"], manifest["kind"])
+            if kind_problem:
+                problems.append(f"{path}.kind: {kind_problem}")
+            try:
+                compiled = compile_template(manifest, _ENVIRONMENT, path=path)
+                check_paths(compiled, known)
+            except InterpolationError as error:
+                problems += [str(each) for each in (error, *error.others)]
+            else:
+                self._manifests.append(compiled)
+        if problems:
+            raise RenderError(problems)
+
+    def render(self, instance: ApplicationInstance) -> Rendering:
+        """The instance's objects.
+
+        Raises RenderError where an expression fails on the instance's values, or a manifest may not be as it is.
+        """
+        spec = self.template.spec
+        problems = parameters.problems(spec.parameters, instance.spec.parameters, self.template.name, "spec.parameters")
+        if problems:
+            raise RenderError(problems)
+        complete = parameters.with_defaults(spec.parameters, instance.spec.parameters)
+        variables = {
+            "parameters": {name: complete.get(name) for name in spec.parameters},
+            "instance": {"name": instance.name, "key": instance.spec.key, "namespace": instance.namespace},
+        }
+        manifests: list[Manifest] = []
+        for index, compiled in enumerate(self._manifests):
+            path = f"spec.manifests[{index}]"
+            try:
+                # Copied, since a template without ${…} somewhere gives out its own parts.
+                manifest = cast("Manifest", copy.deepcopy(compiled.render(variables, integers=True)))
+            except InterpolationError as error:
+                problems.append(str(error))
+                continue
+            found = [f"{path}.{field}: {problem}" for field, problem in self._problems(manifest, instance)]
+            problems += found
+            if not found:
+                manifests.append(_labelled(self._policy.completed(manifest), instance))
+        problems += _duplicates(manifests)
+        if problems:
+            raise RenderError(problems)
+        return Rendering(tuple(manifests), digest(manifests))
+
+    def _problems(self, manifest: Manifest, instance: ApplicationInstance) -> Iterator[tuple[str, str]]:
+        metadata = manifest.get("metadata")
+        if not isinstance(metadata, dict):
+            yield "metadata", "is missing: give metadata.name"
+            return
+        name = metadata.get("name")
+        if not isinstance(name, str) or not name:
+            yield "metadata.name", f"{values.shown(name)} is no name: give a text, e.g. ${{instance.name}}"
+        elif self._keyed and instance.name not in name:
+            yield (
+                "metadata.name",
+                f"{name!r} would be the same for several instances: with spec.key, each name must contain "
+                "${instance.name}",
+            )
+        namespace = metadata.get("namespace", instance.namespace)
+        if namespace != instance.namespace:
+            yield (
+                "metadata.namespace",
+                f"{namespace!r} is not the template's own namespace, {instance.namespace}: remove the field, "
+                "or make the template in that namespace",
+            )
+        for field in _RESERVED_METADATA:
+            if field in metadata:
+                yield f"metadata.{field}", "is the manager's to say: remove it"
+        for field in ("labels", "annotations"):
+            texts = metadata.get(field)
+            if texts is not None and not isinstance(texts, dict):
+                yield f"metadata.{field}", f"{values.shown(texts)} is no map: give names and texts"
+        yield from self._policy.pod_problems(manifest)
+
+
+def digest(manifests: list[Manifest]) -> str:
+    """A digest of manifests: equal exactly if their canonical bytes are."""
+    return hashlib.sha256(values.canonical(manifests).encode()).hexdigest()
+
+
+def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
+    """The manifest with the instance, which has a uid by now, as its owner and controller."""
+    owner = {
+        "apiVersion": API_VERSION,
+        "kind": instance.kind,
+        "name": instance.name,
+        "uid": instance.metadata.uid,
+        "controller": True,
+    }
+    return {**manifest, "metadata": {**manifest["metadata"], "ownerReferences": [owner]}}
+
+
+def object_key(manifest: Mapping[str, Any]) -> tuple[str, str, str]:
+    """What tells the objects of one instance apart: apiVersion, kind and name."""
+    return manifest["apiVersion"], manifest["kind"], manifest["metadata"]["name"]
+
+
+def _labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
+    metadata = manifest["metadata"]
+    own = {
+        MANAGED_BY_LABEL: MANAGED_BY,
+        INSTANCE_LABEL: instance.name,
+        TEMPLATE_LABEL: instance.spec.template,
+    }
+    return {
+        **manifest,
+        "metadata": {**metadata, "namespace": instance.namespace, "labels": {**(metadata.get("labels") or {}), **own}},
+    }
+
+
+def _duplicates(manifests: list[Manifest]) -> list[str]:
+    seen: set[tuple[str, str, str]] = set()
+    found = []
+    for manifest in manifests:
+        key = object_key(manifest)
+        if key in seen:
+            found.append(f"spec.manifests: {key[1]} {key[2]!r} is there twice: give each its own name")
+        seen.add(key)
+    return found

@@ -1,0 +1,89 @@
+"""Templates, tasks and instances for the tests of the manager's core, as short as they can be said."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from application_manager.times import format_time
+from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
+
+NOW = 1_790_000_000.0
+
+DEPLOYMENT: dict[str, Any] = {
+    "apiVersion": "apps/v1",
+    "kind": "Deployment",
+    "metadata": {"name": "${instance.name}"},
+    "spec": {
+        "replicas": 1,
+        "selector": {"matchLabels": {"app": "${instance.name}"}},
+        "template": {
+            "metadata": {"labels": {"app": "${instance.name}"}},
+            "spec": {"containers": [{"name": "main", "image": "registry.example/app:1"}]},
+        },
+    },
+}
+
+
+def template(name: str = "app", **spec: Any) -> ApplicationTemplate:
+    return ApplicationTemplate.model_validate(
+        {
+            "kind": "ApplicationTemplate",
+            "metadata": {"name": name, "namespace": "site"},
+            "spec": {"manifests": [DEPLOYMENT], **spec},
+        }
+    )
+
+
+def task(
+    name: str,
+    parameters: dict[str, Any] | None = None,
+    *,
+    of: str = "app",
+    priority: int = 0,
+    created: int = 0,
+    holder: str | None = None,
+    ended: bool = False,
+    accepted_condition: tuple[str, str, float] | None = None,
+) -> ApplicationTask:
+    """`accepted_condition`: status, reason and transition time of the condition Accepted."""
+    spec: dict[str, Any] = {"template": of, "priority": priority, "parameters": parameters or {}}
+    if holder:
+        spec["requester"] = {"holder": holder}
+    if ended:
+        spec["endTime"] = format_time(NOW)
+    raw: dict[str, Any] = {
+        "kind": "ApplicationTask",
+        "metadata": {"name": name, "namespace": "site", "creationTimestamp": format_time(NOW - 3600 + created)},
+        "spec": spec,
+    }
+    if accepted_condition:
+        status, reason, since = accepted_condition
+        condition = {"type": "Accepted", "status": status, "reason": reason, "lastTransitionTime": format_time(since)}
+        raw["status"] = {"conditions": [condition]}
+    return ApplicationTask.model_validate(raw)
+
+
+def instance(
+    name: str = "app",
+    *,
+    of: str = "app",
+    key: str | None = None,
+    parameters: dict[str, Any] | None = None,
+    by_person: bool = False,
+    release_at: float | None = None,
+    annotations: dict[str, str] | None = None,
+) -> ApplicationInstance:
+    raw: dict[str, Any] = {
+        "kind": "ApplicationInstance",
+        "metadata": {
+            "name": name,
+            "namespace": "site",
+            "uid": f"uid-{name}",
+            "labels": {} if by_person else {"app.kubernetes.io/managed-by": "wayside"},
+            "annotations": annotations or {},
+        },
+        "spec": {"template": of, "key": key, "parameters": parameters or {}},
+    }
+    if release_at is not None:
+        raw["status"] = {"releaseTime": format_time(release_at)}
+    return ApplicationInstance.model_validate(raw)

@@ -1,0 +1,67 @@
+"""Leases lapse by what we observe, on a clock that runs only while we reach the API server."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from application_manager.leases import DEFAULT_DURATION, HealthyTime, LeaseBook, LeaseView
+
+KEY = ("site", "det")
+
+
+def lease(renewed: str, duration: int = 3, **metadata: Any) -> dict[str, Any]:
+    return {
+        "metadata": {"uid": "u", **metadata},
+        "spec": {"holderIdentity": "det", "leaseDurationSeconds": duration, "renewTime": renewed},
+    }
+
+
+def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
+    book = LeaseBook()
+    assert book.observe(KEY, lease("2020-01-01T00:00:00Z"), 10.0) is False
+    assert book.view(KEY, 12.0) == LeaseView(2.0, 3.0, renewed=False)
+    assert book.observe(KEY, lease("2020-01-01T00:00:01Z"), 13.0) is True
+    assert book.view(KEY, 14.5) == LeaseView(1.5, 3.0, renewed=True)
+
+
+def test_seeing_the_same_again_is_no_renewal() -> None:
+    book = LeaseBook()
+    book.observe(KEY, lease("a"), 0.0)
+    assert book.observe(KEY, lease("a", resourceVersion="9", labels={"x": "y"}), 5.0) is False
+    assert book.view(KEY, 6.0).unchanged == 6.0
+
+
+def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
+    book = LeaseBook()
+    book.observe(KEY, lease("a"), 0.0)
+    assert book.observe(KEY, None, 4.0) is False
+    assert book.view(KEY, 5.0).unchanged == 5.0
+    assert book.observe(KEY, lease("a"), 6.0) is True
+    assert book.view(KEY, 6.0).unchanged == 0.0
+
+
+def test_a_holder_without_a_lease_counts_from_when_we_first_heard_of_it() -> None:
+    book = LeaseBook()
+    assert book.view(KEY, 7.0) == LeaseView(0.0, DEFAULT_DURATION, renewed=False)
+    assert book.view(KEY, 9.0).unchanged == 2.0
+
+
+def test_what_concerns_nobody_is_forgotten() -> None:
+    book = LeaseBook()
+    book.observe(KEY, lease("a"), 0.0)
+    book.forget_except([])
+    assert book.view(KEY, 8.0).unchanged == 0.0
+
+
+def test_an_outage_does_not_count() -> None:
+    time = HealthyTime(longest=5)
+    for now, succeeded in ((0, True), (1, True), (2, False), (20, False), (21, True), (22, True)):
+        time.look(float(now), succeeded=succeeded)
+    assert time.elapsed == 2.0
+
+
+def test_a_time_in_which_we_stood_still_does_not_count() -> None:
+    time = HealthyTime(longest=5)
+    for now in (0.0, 60.0, 61.0):
+        time.look(now, succeeded=True)
+    assert time.elapsed == 1.0
