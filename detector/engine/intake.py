@@ -35,7 +35,7 @@ class Intake:
         self.dropped = 0
 
     def putter(self, stream: str) -> Callable[[str, bytes], None]:
-        """A function that takes a message of the stream: its key and payload. Thread-safe; never waits for the engine."""
+        """A function that takes a message of the stream: its key and payload. Thread-safe; never waits."""
         lock, now = self._lock, self._now
 
         def put(key: str, payload: bytes) -> None:
@@ -57,8 +57,7 @@ class Intake:
     def drain(self, until: int) -> list[Arrival]:
         """What was queued, in order. Everything that comes from now on is received after `until`."""
         with self._lock:
-            if self._last < until:
-                self._last = until
+            self._last = max(self._last, until)
             queue, self._queue = self._queue, []
             self._bytes = 0
         return queue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from wayside.api.eventrule import Aggregate
@@ -54,7 +54,9 @@ class CompiledDeploy:
     action: str
     template: str
     priority: int
-    parameters: CompiledTemplate
+    source: str
+    """The parameters as written, in canonical JSON."""
+    parameters: CompiledTemplate = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True)

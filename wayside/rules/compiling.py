@@ -199,7 +199,7 @@ class _RuleCompiler:
                 self._problem(at, str(each))
             return None
         self._members(at, parameters.paths)
-        return CompiledDeploy(action, deploy.template, deploy.priority, parameters)
+        return CompiledDeploy(action, deploy.template, deploy.priority, _canonical(deploy.parameters), parameters)
 
     def _stream(self, path: FieldPath, name: str) -> Stream | None:
         stream = self.detector.spec.stream(name)
@@ -254,5 +254,8 @@ class _RuleCompiler:
 
 
 def _digest(rule: EventRule) -> str:
-    text = json.dumps(rule.semantics(), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(_canonical(rule.semantics()).encode()).hexdigest()[:16]
+
+
+def _canonical(value: object) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))

@@ -1,0 +1,73 @@
+"""Who is there: a client is known from its first sample until nothing was received from it for `clientTimeout`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from detector.engine.buffer import Buffer
+
+
+@dataclass(slots=True)
+class Presence:
+    """Since when a client is known, and when something was last received from it; nanoseconds."""
+
+    since: int
+    last: int
+
+
+class Clients:
+    """The known clients and their labels."""
+
+    def __init__(self, labels: Mapping[str, Mapping[str, str]], timeout: int) -> None:
+        """`labels` are those of clients known beforehand; `timeout` is in nanoseconds."""
+        self._labels = labels
+        self._timeout = timeout
+        self._present: dict[str, Presence] = {}
+
+    def heard(self, client: str, time: int) -> None:
+        """A sample of the client, or a restored episode about it."""
+        presence = self._present.get(client)
+        if presence is None:
+            self._present[client] = Presence(time, time)
+        elif time > presence.last:
+            presence.last = time
+
+    def lose(self, now: int) -> list[str]:
+        """Forget the clients that have timed out; returns them."""
+        lost = [name for name, presence in self._present.items() if now - presence.last > self._timeout]
+        for name in lost:
+            del self._present[name]
+        return lost
+
+    def gap(self, time: int) -> None:
+        """Nobody could be heard up to `time`: timeouts count from there at the earliest."""
+        for presence in self._present.values():
+            presence.since = min(presence.since, time)
+            presence.last = time
+
+    def since(self, client: str) -> int:
+        """Since when the client is known, in nanoseconds since the epoch."""
+        return self._present[client].since
+
+    def labels(self, client: str) -> Mapping[str, str]:
+        """The labels that the Detector gives the client."""
+        return self._labels.get(client, {})
+
+    def __contains__(self, client: str) -> bool:
+        return client in self._present
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(self._present))
+
+
+def fresh_streams(client: str, streams: Mapping[str, int | None], buffer: Buffer, now: int) -> list[str]:
+    """The names of the client's streams that are not stale; `streams` has each one's staleAfter, None for never."""
+    return [stream for stream, limit in streams.items() if is_fresh(client, stream, limit, buffer, now)]
+
+
+def is_fresh(client: str, stream: str, limit: int | None, buffer: Buffer, now: int) -> bool:
+    """Whether the newest sample is at most `limit` nanoseconds old (None: of any age)."""
+    lane = buffer.lane(client, stream)
+    newest = None if lane is None else lane.newest
+    return newest is not None and (limit is None or now - newest.time <= limit)

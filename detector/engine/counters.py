@@ -1,0 +1,50 @@
+"""What was counted: every drop, unknown and error, by its cause."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from wayside.expressions import Reason
+
+
+@dataclass(slots=True)
+class RuleCounters:
+    """What happened in the evaluation of one rule."""
+
+    evaluations: int = 0
+    started: int = 0
+    ended: int = 0
+    unknowns: int = 0
+    """Values that were not there when an expression needed them."""
+    errors: int = 0
+    """Expressions that failed on values that were there."""
+    last_error: str = ""
+
+    def note(self, reason: Reason, message: str) -> None:
+        """Count an expression's unknown result."""
+        if reason is Reason.ERROR:
+            self.errors += 1
+            self.last_error = message
+        else:
+            self.unknowns += 1
+
+
+@dataclass(slots=True)
+class Counters:
+    """What happened in the engine."""
+
+    samples: Counter[str] = field(default_factory=Counter)
+    """Samples taken into the buffer, by stream."""
+    undecodable: Counter[str] = field(default_factory=Counter)
+    """Payloads that could not be read when a rule or the clock needed them, by stream."""
+    last_undecodable: dict[str, str] = field(default_factory=dict)
+    unnamed: Counter[str] = field(default_factory=Counter)
+    """Samples dropped since their key names no valid client, by stream."""
+    rules: dict[str, RuleCounters] = field(default_factory=dict)
+
+    def rule(self, name: str) -> RuleCounters:
+        """The counters of a rule."""
+        if name not in self.rules:
+            self.rules[name] = RuleCounters()
+        return self.rules[name]

@@ -1,0 +1,232 @@
+"""The evaluation of one rule: its subjects' states, tick by tick, and the episodes that are open."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from detector.engine.clients import Clients
+from detector.engine.counters import RuleCounters
+from detector.engine.demands import Demand
+from detector.engine.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
+from detector.engine.events import Event
+from detector.engine.scopes import Candidate, Members, Views, candidates, snapshot
+from wayside.expressions import UNKNOWN, Expression, InterpolationError
+from wayside.names import subject_text
+from wayside.rules import CompiledDeploy, CompiledRule
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Whose episodes these are."""
+
+    detector: str
+    holder: str
+    namespace: str
+
+
+@dataclass(slots=True)
+class Episode:
+    """An open episode. Times are nanoseconds since the epoch."""
+
+    id: str
+    members: Members
+    onset: int
+    start: int
+    values: Mapping[str, Any]
+    variables: Mapping[str, Any] | None
+    """What the conditions saw at the start; None in a restored episode until its next evaluation."""
+    demands: dict[str, Demand] = field(default_factory=dict)
+    """By action; an action whose parameters cannot be rendered yet has none."""
+
+
+class RuleRun:
+    """A rule and the states of its subjects."""
+
+    def __init__(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> None:
+        self.rule = rule
+        self.counters = counters
+        self._identity = identity
+        self._timing = _timing(rule)
+        self.version = 0
+        """Changes whenever the demands do."""
+        self._states: dict[Members, SubjectState] = {}
+        self._open: dict[Members, Episode] = {}
+
+    def due(self, now: int) -> bool:
+        """Whether the rule is evaluated at this tick."""
+        return self.rule.enabled and now % self.rule.every_ns == 0
+
+    def tick(self, now: int, views: Views, clients: Clients) -> Iterator[Event]:
+        """Evaluate the rule for all subjects; yields what started and ended, in order of the subjects."""
+        events = [*self._lost(now, clients)]
+        for candidate in candidates(self.rule, views, clients, self._in_progress()):
+            self.counters.evaluations += 1
+            events += self._subject(now, candidate)
+        self._states = {members: state for members, state in self._states.items() if not state.idle_at(now)}
+        yield from sorted(events, key=lambda event: event.subject)
+
+    def gap(self, time: int) -> None:
+        """Time went on (or back) without ticks: open episodes hold, what was pending is forgotten."""
+        for state in self._states.values():
+            state.gap()
+            state.rests_until = min(state.rests_until, time + self._timing.cooldown)
+
+    def restore(self, demands: list[Demand]) -> None:
+        """Take up an episode that was open before a restart, from the demands of its actions."""
+        first = demands[0]
+        self._states[first.subjects] = SubjectState(is_open=True)
+        self._open[first.subjects] = Episode(
+            first.episode,
+            first.subjects,
+            first.onset_time,
+            first.start_time,
+            first.values,
+            None,
+            {demand.action: demand for demand in demands},
+        )
+
+    def change_actions(self, rule: CompiledRule) -> None:
+        """Go on with a rule that differs in nothing that decides which episodes there are."""
+        changed = {deploy.action for deploy in {*rule.deploys} ^ {*self.rule.deploys}}
+        self.rule = rule
+        self._timing = _timing(rule)
+        for episode in self._open.values():
+            for action in changed:
+                episode.demands.pop(action, None)
+            self._render(episode)
+
+    def end_all(self, now: int, reason: Reason) -> Iterator[Event]:
+        """End every open episode, in order of the subjects, and forget what was pending."""
+        for members in sorted(self._open):
+            yield self._ended(now, self._open.pop(members), reason, {})
+        self._states.clear()
+
+    def demands(self) -> Iterator[Demand]:
+        """What the open episodes ask for."""
+        if not self.rule.dry_run:
+            for episode in self._open.values():
+                yield from episode.demands.values()
+
+    def _in_progress(self) -> Iterator[Members]:
+        return (members for members, state in self._states.items() if state.is_open or state.onset is not None)
+
+    @property
+    def open_episodes(self) -> int:
+        """How many episodes are open."""
+        return len(self._open)
+
+    def _lost(self, now: int, clients: Clients) -> Iterator[Event]:
+        for members in [m for m in self._states if any(member not in clients for member in m)]:
+            state = self._states[members]
+            if state.is_open:
+                state.end(now, self._timing)
+                yield self._ended(now, self._open.pop(members), Reason.CLIENT_LOST, {})
+            else:
+                state.gap()
+
+    def _subject(self, now: int, candidate: Candidate) -> Iterator[Event]:
+        state = self._states.get(candidate.members)
+        if state is None:
+            state = self._states[candidate.members] = SubjectState()
+        variables = candidate.variables
+        when = self._truth(self.rule.when, variables)
+        until = negation(when) if self.rule.until is None else self._truth(self.rule.until, variables)
+        in_scope = True if self.rule.subject.where is None else self._truth(self.rule.subject.where, variables)
+        match state.step(now, self._timing, Observation(in_scope, candidate.near, when, until)):
+            case Started(onset):
+                yield self._started(now, onset, candidate)
+            case Ended(reason):
+                yield self._ended(now, self._open.pop(candidate.members), reason, snapshot(self.rule, candidate))
+            case None:
+                episode = self._open.get(candidate.members)
+                if episode is not None and len(episode.demands) < len(self.rule.deploys):
+                    episode.variables = variables
+                    self._render(episode)
+
+    def _truth(self, expression: Expression, variables: Mapping[str, Any]) -> Truth:
+        value = expression.evaluate_or_unknown(variables, self.counters.note)
+        return value if isinstance(value, bool) else UNKNOWN
+
+    def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
+        members = candidate.members
+        subject = subject_text(members)
+        identifier = _episode_id(self._identity.holder, self.rule.name, subject, now)
+        episode = Episode(identifier, members, onset, now, snapshot(self.rule, candidate), candidate.variables)
+        self._open[members] = episode
+        self.counters.started += 1
+        self._render(episode)
+        return self._event(episode, None, None, episode.values)
+
+    def _ended(self, now: int, episode: Episode, reason: Reason, values: Mapping[str, Any]) -> Event:
+        self.counters.ended += 1
+        self.version += 1
+        return self._event(episode, now, reason, values)
+
+    def _event(self, episode: Episode, end: int | None, reason: Reason | None, values: Mapping[str, Any]) -> Event:
+        return Event(
+            holder=self._identity.holder,
+            rule=self.rule.name,
+            subject=subject_text(episode.members),
+            subjects=episode.members,
+            episode=episode.id,
+            onset_time=episode.onset,
+            start_time=episode.start,
+            end_time=end,
+            reason=reason,
+            values=values,
+            classification=self.rule.classification,
+        )
+
+    def _render(self, episode: Episode) -> None:
+        """Render the demands that the episode does not have yet; what cannot be rendered is tried at the next tick."""
+        if episode.variables is None:
+            return
+        for deploy in self.rule.deploys:
+            if deploy.action not in episode.demands:
+                try:
+                    parameters = deploy.parameters.render(episode.variables)
+                except InterpolationError as error:
+                    self.counters.errors += 1
+                    self.counters.last_error = f"action {deploy.action}: {error}"
+                    continue
+                episode.demands[deploy.action] = self._demand(episode, deploy, parameters)
+                self.version += 1
+
+    def _demand(self, episode: Episode, deploy: CompiledDeploy, parameters: Any) -> Demand:
+        return Demand(
+            rule=self.rule.name,
+            action=deploy.action,
+            template=deploy.template,
+            priority=deploy.priority,
+            parameters=parameters or {},
+            detector=self._identity.detector,
+            holder=self._identity.holder,
+            namespace=self._identity.namespace,
+            subject=subject_text(episode.members),
+            subjects=episode.members,
+            episode=episode.id,
+            onset_time=episode.onset,
+            start_time=episode.start,
+            classification=self.rule.classification,
+            values=episode.values,
+            rule_digest=self.rule.digest,
+        )
+
+
+def same_semantics(run: RuleRun, rule: CompiledRule) -> bool:
+    """Whether open episodes go on under the new rule."""
+    return run.rule.digest == rule.digest and run.rule.enabled == rule.enabled
+
+
+def _timing(rule: CompiledRule) -> Timing:
+    return Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
+
+
+def _episode_id(holder: str, rule: str, subject: str, start: int) -> str:
+    """16 letters and digits that only this episode has."""
+    text = "\0".join((holder, rule, subject, str(start)))
+    return base64.b32encode(hashlib.sha256(text.encode()).digest()[:10]).decode().lower()
