@@ -1,1 +1,22 @@
 """Codecs: from the bytes of a message to plain maps, lists, strings and doubles."""
+
+from __future__ import annotations
+
+from detector.engine.sample import Decoder
+from detector.streams.codecs.cdr import CdrDecoder
+from detector.streams.codecs.json_ import JsonDecoder
+from detector.streams.codecs.ros import UnknownTypeError
+from wayside.api.detector import Encoding, Stream
+
+
+def codec_for(stream: Stream) -> Decoder:
+    """What reads the stream's payloads. Raises UnknownTypeError, which names the stream's field and what is close."""
+    if stream.encoding is Encoding.JSON:
+        return JsonDecoder()
+    try:
+        return CdrDecoder(stream.type or "")
+    except UnknownTypeError as error:
+        raise UnknownTypeError(stream.type or "", f"streams[{stream.name}].type") from error
+
+
+__all__ = ["CdrDecoder", "JsonDecoder", "UnknownTypeError", "codec_for"]

@@ -1,0 +1,64 @@
+"""JSON: read by msgspec, then its integers made doubles.
+
+What JSON does not know (NaN, Infinity, trailing commas) is refused. Of a key that occurs twice, the last one counts.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from detector.engine.sample import DecodeError
+from detector.streams.codecs.doubles import number
+
+MAX_DEPTH = 64
+"""How deeply maps and lists may be nested: no real message comes near, and a hostile one must not exhaust the stack."""
+
+_read = msgspec.json.Decoder().decode
+
+
+class JsonDecoder:
+    """Reads JSON of any shape; it carries no stamp that could be known without asking the user."""
+
+    def decode(self, payload: bytes) -> Any:
+        """The value. Raises DecodeError for anything but one JSON value in UTF-8, nested at most MAX_DEPTH deep."""
+        try:
+            value = _read(payload)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise DecodeError(f"no JSON: {error}") from None
+        except RecursionError:
+            # msgspec counts its depth, so the stack is sound: this is its way of saying that the nesting is too deep.
+            raise _too_deep() from None
+        return _with_doubles(value, MAX_DEPTH)
+
+    def stamp(self, payload: bytes) -> int | None:
+        """None: which field is the stamp is for the stream to say."""
+        return None
+
+
+def _with_doubles(value: Any, depth: int) -> Any:
+    """The value with its integers as doubles; maps and lists are changed in place."""
+    kind = type(value)
+    if kind is int:
+        return number(value)
+    if kind is dict:
+        if depth == 0:
+            raise _too_deep()
+        for key, item in value.items():
+            if type(item) not in _DONE:
+                value[key] = _with_doubles(item, depth - 1)
+    elif kind is list:
+        if depth == 0:
+            raise _too_deep()
+        for index, item in enumerate(value):
+            if type(item) not in _DONE:
+                value[index] = _with_doubles(item, depth - 1)
+    return value
+
+
+_DONE = frozenset((float, str, bool, type(None)))
+
+
+def _too_deep() -> DecodeError:
+    return DecodeError(f"JSON nested more than {MAX_DEPTH} deep")
