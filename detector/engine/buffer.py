@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 from detector.engine.sample import Sample
 
@@ -119,6 +119,11 @@ class Buffer:
             del self._lanes[lane.client, lane.stream]
             self.bytes -= lane.bytes
         return gone
+
+    def keep(self, streams: Collection[str]) -> None:
+        """Drop the lanes of all other streams."""
+        self._lanes = {key: lane for key, lane in self._lanes.items() if lane.stream in streams}
+        self.bytes = sum(lane.bytes for lane in self._lanes.values())
 
     def clear(self) -> None:
         """Forget all samples; the lanes stay."""

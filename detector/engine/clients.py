@@ -25,6 +25,10 @@ class Clients:
         self._timeout = timeout
         self._present: dict[str, Presence] = {}
 
+    def configure(self, labels: Mapping[str, Mapping[str, str]], timeout: int) -> None:
+        """The Detector changed: other labels, another timeout."""
+        self._labels, self._timeout = labels, timeout
+
     def heard(self, client: str, time: int) -> None:
         """A sample of the client, or a restored episode about it."""
         presence = self._present.get(client)

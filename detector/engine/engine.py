@@ -53,27 +53,55 @@ class Engine:
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
         """
-        spec = detector.spec
-        self.detector = detector
         self.identity = Identity(detector.name, holder, detector.namespace)
         self.counters = Counters()
-        self.buffer = Buffer(spec.buffer.bytes.bytes)
-        self.clients = Clients({c.name: c.labels for c in spec.clients}, spec.client_timeout.ns)
+        self._number = 0
+        self._runs: dict[str, RuleRun] = {}
         self._rules_version = 0
+        self._ticks = Ticks()
+        self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
+        self.clients = Clients({}, detector.spec.client_timeout.ns)
+        self._configure(detector, decoders, read_key)
+        self._timeline = self._make_timeline(start)
+
+    def set_detector(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
+        """Go on with a changed Detector; call `set_rules` afterwards, with the rules compiled against it.
+
+        Samples of streams that are read as before stay, and so do open episodes. A change of the clock begins a new
+        time axis: the buffer is emptied, what was pending is forgotten.
+
+        Raises:
+            RuleError: an expression of one of the Detector's streams does not compile; nothing has changed then.
+        """
+        before = self.detector.spec
+        self._configure(detector, decoders, read_key)
+        kept = {stream.name for stream in detector.spec.streams if _reads_like(stream, before.stream(stream.name))}
+        self.buffer.keep(kept)
+        for lane in self.buffer:
+            stream = self._streams[lane.stream]
+            lane.duration = detector.spec.buffer_duration_ns(stream)
+            lane.maximum_bytes = None if stream.buffer.bytes is None else stream.buffer.bytes.bytes
+        times = (detector.spec.clock, detector.spec.lateness, detector.spec.max_ahead)
+        if times != (before.clock, before.lateness, before.max_ahead):
+            now = self._timeline.now
+            self._timeline = self._make_timeline(now)
+            self._gap(now, backwards=detector.spec.clock is not before.clock)
+
+    def _configure(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
+        spec = detector.spec
+        self._stamps: dict[str, CompiledStream] = {
+            stream.name: compile_stream(stream, index) for index, stream in enumerate(spec.streams)
+        }
+        self.detector = detector
+        self.buffer.maximum_bytes = spec.buffer.bytes.bytes
+        self.clients.configure({c.name: c.labels for c in spec.clients}, spec.client_timeout.ns)
         self._read_key = read_key
         self._decoders = decoders
         self._messages = Messages(decoders, self.counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
         self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after)
         self._streams = {stream.name: stream for stream in spec.streams}
-        self._stamps: dict[str, CompiledStream] = {
-            stream.name: compile_stream(stream, index) for index, stream in enumerate(spec.streams)
-        }
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in spec.streams}
-        self._number = 0
-        self._runs: dict[str, RuleRun] = {}
-        self._ticks = Ticks()
-        self._timeline = self._make_timeline(start)
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, in order, none after `until`, and run the ticks up to there."""
@@ -272,6 +300,16 @@ class Engine:
             self.counters.undecodable[stream] += 1
             self.counters.last_undecodable[stream] = str(error)
             return None
+
+
+def _reads_like(stream: Stream, before: Stream | None) -> bool:
+    """Whether samples taken in before can be read as ones of the stream."""
+    return before is not None and (stream.key, stream.client, stream.encoding, stream.type) == (
+        before.key,
+        before.client,
+        before.encoding,
+        before.type,
+    )
 
 
 def _nanoseconds(seconds: object) -> int:
