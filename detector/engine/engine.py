@@ -169,6 +169,11 @@ class Engine:
         return self._timeline.now
 
     @property
+    def on_wall_clock(self) -> bool:
+        """Whether the shell says how far time has come; else the samples do."""
+        return isinstance(self._timeline, WallTimeline)
+
+    @property
     def timeline(self) -> Timeline:
         """The time axis; with clock Data it counts what it dropped."""
         return self._timeline

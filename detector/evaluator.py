@@ -1,0 +1,218 @@
+"""The thread that drives the engine live: it reads the wall clock, empties the intake and runs the ticks that are due.
+
+All that the engine consumes passes here in one order, so this is also where it is recorded: arrivals, and between them
+the controls (start, rules, detector, restore, gap, end). The replay of such a recording makes the same calls again.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from detector.assembly import DetectorError, compile_rules, inlets
+from detector.engine.demands import Demand, to_task
+from detector.engine.engine import Engine
+from detector.engine.events import Event
+from detector.engine.intake import Intake
+from detector.engine.sample import Arrival
+from wayside.api import Detector, EventRule
+
+_log = logging.getLogger(__name__)
+
+_DRAIN_EVERY = 0.05
+"""Seconds between two looks at the intake, so that its queue stays short however rare the ticks are."""
+
+_STALL = 1_000_000_000
+"""Nanoseconds: a tick that is overdue by more is not made up for, and a clock that stepped back further is believed."""
+
+
+class Recorder(Protocol):
+    """Keeps what the engine consumes, in that order."""
+
+    def arrivals(self, arrivals: Sequence[Arrival]) -> None:
+        """Samples that the engine takes in now."""
+
+    def control(self, time: int, document: Mapping[str, Any]) -> None:
+        """Something else that the engine is told, at a time in nanoseconds since the epoch."""
+
+
+class Outlet(Protocol):
+    """Where events and demands go. Never waits."""
+
+    def events(self, events: Sequence[Event]) -> None:
+        """What started and ended, in order."""
+
+    def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
+        """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """What to evaluate: the newest one counts."""
+
+    detector: Detector
+    rules: tuple[EventRule, ...]
+
+
+class Evaluator:
+    """Runs an engine on a thread of its own until it is stopped."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        intake: Intake,
+        outlet: Outlet,
+        *,
+        now: Callable[[], int],
+        recorder: Recorder | None = None,
+        on_failure: Callable[[BaseException], None],
+    ) -> None:
+        """`now` gives nanoseconds since the epoch; `on_failure` is told if the thread dies of an error."""
+        self._engine = engine
+        self._intake = intake
+        self._outlet = outlet
+        self._now = now
+        self._recorder = recorder
+        self._on_failure = on_failure
+        self._wake = threading.Condition()
+        self._wanted: Configuration | None = None
+        self._stopping = False
+        self._version: tuple[int, int] | None = None
+        self._demands: dict[str, Demand] = {}
+        self._dropped = 0
+        self.gaps = 0
+        self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
+
+    def start(self, configuration: Configuration, restored: Sequence[Demand]) -> None:
+        """Begin with these rules and the episodes that were open before; returns at once."""
+        start = self._engine.now
+        self._record(
+            start,
+            {
+                "kind": "start",
+                "holder": self._engine.identity.holder,
+                "detector": configuration.detector.to_json(),
+                "rules": [rule.to_json() for rule in configuration.rules],
+            },
+        )
+        events = self._apply_rules(configuration)
+        if restored:
+            self._record(start, {"kind": "restore", "tasks": [to_task(demand).to_json() for demand in restored]})
+        self._demands = {demand.name: demand for demand in restored}
+        events += self._engine.restore(restored, start)
+        self._hand_over(events)
+        self._thread.start()
+
+    def configure(self, configuration: Configuration) -> None:
+        """Go on with another Detector or other rules, from the next look on; thread-safe."""
+        with self._wake:
+            self._wanted = configuration
+            self._wake.notify()
+
+    def stop(self) -> None:
+        """Take in what has arrived, run what is due and end; returns when that is done."""
+        with self._wake:
+            self._stopping = True
+            self._wake.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            stopping = False
+            while not stopping:
+                with self._wake:
+                    if self._wanted is None and not self._stopping:
+                        self._wake.wait(self._pause())
+                    wanted, self._wanted = self._wanted, None
+                    stopping = self._stopping
+                self._look(wanted)
+            self._record(self._engine.now, {"kind": "end"})
+        except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
+            self._on_failure(error)
+
+    def _pause(self) -> float:
+        """Seconds until there is something to do."""
+        return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
+
+    def _look(self, wanted: Configuration | None) -> None:
+        """Take in what has arrived and run the ticks that are due."""
+        now = self._now()
+        events: list[Event] = []
+        if now + _STALL < self._intake.last:
+            events += self._take(self._intake.step_back(now), self._intake.last)
+            events += self._gap(now, "the wall clock stepped back")
+        else:
+            if now - self._engine.next_tick() > _STALL and self._engine.on_wall_clock:
+                events += self._gap(now, "the evaluation stood still, or the wall clock stepped ahead")
+            events += self._take(self._intake.drain(now), now)
+        if wanted is not None:
+            events += self._configure(wanted)
+        self._hand_over(events)
+
+    def _take(self, arrivals: list[Arrival], now: int) -> list[Event]:
+        if self._recorder is not None and arrivals:
+            self._recorder.arrivals(arrivals)
+        if self._intake.dropped > self._dropped:
+            _log.warning(
+                "the intake was full: %d samples were dropped, more come in than are evaluated",
+                self._intake.dropped - self._dropped,
+            )
+            self._dropped = self._intake.dropped
+        return self._engine.advance(arrivals, now)
+
+    def _gap(self, now: int, why: str) -> list[Event]:
+        _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)
+        self.gaps += 1
+        self._record(now, {"kind": "gap"})
+        return self._engine.gap(now)
+
+    def _configure(self, wanted: Configuration) -> list[Event]:
+        """Take over a changed Detector or rules; one that cannot run leaves everything as it is."""
+        changed = wanted.detector.spec != self._engine.detector.spec
+        if changed:
+            try:
+                entries = inlets(wanted.detector)
+            except DetectorError as error:
+                _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.detector.name, error)
+                return []
+            self._engine.set_detector(wanted.detector, entries.decoders, entries.read_key)
+        self._record(
+            self._engine.now,
+            {
+                "kind": "rules",
+                "rules": [rule.to_json() for rule in wanted.rules],
+                **({"detector": wanted.detector.to_json()} if changed else {}),
+            },
+        )
+        return self._apply_rules(wanted)
+
+    def _apply_rules(self, configuration: Configuration) -> list[Event]:
+        entries = inlets(configuration.detector)
+        compiled, refused = compile_rules(configuration.rules, configuration.detector, entries.fields)
+        for refusal in refused:
+            for problem in refusal.problems:
+                _log.error("EventRule %s is refused: %s", refusal.rule.name, problem)
+        return self._engine.set_rules(compiled)
+
+    def _hand_over(self, events: Sequence[Event]) -> None:
+        if events:
+            self._outlet.events(events)
+        version = self._engine.demands_version
+        if version != self._version:
+            self._version = version
+            demands = self._engine.demands()
+            ends = {event.episode: event.end_time for event in events if event.end_time is not None}
+            ended = {
+                name: ends.get(demand.episode, self._engine.now)
+                for name, demand in self._demands.items()
+                if name not in demands
+            }
+            self._demands = demands
+            self._outlet.demands(demands, ended)
+
+    def _record(self, time: int, document: Mapping[str, Any]) -> None:
+        if self._recorder is not None:
+            self._recorder.control(time, document)
