@@ -17,6 +17,7 @@ from tests.cluster.api import Api, ApiError, Unreachable
 from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
+from tests.cluster.pods import Kubelet
 from tests.cluster.processes import Processes
 
 HERE = Path(__file__).parent
@@ -88,3 +89,10 @@ def processes(control_plane: ControlPlane, namespace: str, tmp_path: Path) -> It
     started = Processes(folder, {"KUBECONFIG": str(control_plane.kubeconfig)})
     yield started
     started.kill_all()
+
+
+@pytest.fixture
+def kubelet(api: Api) -> Iterator[None]:
+    """Every pod of the test's namespace becomes ready by itself, soon after it was made."""
+    with Kubelet(api):
+        yield

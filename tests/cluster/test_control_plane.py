@@ -71,8 +71,18 @@ def test_marking_pods_twice_changes_nothing(api: Api) -> None:
     api.wait_list("Pod", lambda pods: len(pods) == 2, what="two pods exist")
     mark_pods_ready(api)
     first = api.list("Pod")
-    mark_pods_ready(api)
+    assert mark_pods_ready(api) == []
     assert api.list("Pod") == first
+
+
+@pytest.mark.usefixtures("kubelet")
+def test_with_the_kubelet_fixture_deployments_become_available_by_themselves(api: Api) -> None:
+    for name in ("one", "two"):
+        api.apply(deployment(name))
+    for name in ("one", "two"):
+        api.wait_for(
+            "Deployment", name, lambda found: found["status"].get("availableReplicas") == 2, what=f"{name} is available"
+        )
 
 
 def test_what_a_deleted_object_owns_goes_too(api: Api) -> None:
@@ -104,8 +114,8 @@ def test_what_an_application_instance_owns_goes_with_it(api: Api) -> None:
     assert api.find("ConfigMap", "free") is not None
 
 
-def test_a_deleted_namespace_takes_everything_with_it(control_plane: ControlPlane, api: Api) -> None:
-    api.apply(deployment("app"))
+def test_a_deleted_namespace_takes_everything_with_it(api: Api) -> None:
+    api.create(configmap("inside"))  # no pods: the namespace controller lets them pass 5 s
     api.delete("Namespace", api.namespace)
     api.wait_gone("Namespace", api.namespace)
 
