@@ -16,8 +16,11 @@ from detector.cluster.errors import UnavailableError, error_of
 JsonObject = dict[str, Any]
 """A Kubernetes object."""
 
+JsonPatch = list[JsonObject]
+"""Operations of a JSON patch."""
+
 JSON = "application/json"
-MERGE_PATCH = "application/merge-patch+json"
+JSON_PATCH = "application/json-patch+json"
 
 FIELD_MANAGER = "wayside-detector"
 _TIMEOUT = aiohttp.ClientTimeout(total=10.0, sock_connect=5.0)
@@ -69,10 +72,10 @@ class Api:
         query = {"fieldManager": FIELD_MANAGER}
         return await self._request("PUT", resource.path(namespace, name), body, query=query)
 
-    async def patch(self, resource: Resource, namespace: str, name: str, patch: JsonObject) -> JsonObject:
-        """Apply a JSON merge patch; as stored. A `metadata.uid` in it makes sure that it is still the same object."""
+    async def patch(self, resource: Resource, namespace: str, name: str, patch: JsonPatch) -> JsonObject:
+        """Apply a JSON patch; as stored. A `test` of `/metadata/uid` makes sure that it is still the same object."""
         query = {"fieldManager": FIELD_MANAGER}
-        return await self._request("PATCH", resource.path(namespace, name), patch, MERGE_PATCH, query=query)
+        return await self._request("PATCH", resource.path(namespace, name), patch, JSON_PATCH, query=query)
 
     async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> None:
         """Delete the object if it still is the one with this uid."""
@@ -116,7 +119,7 @@ class Api:
         self,
         method: str,
         path: str,
-        body: JsonObject | None = None,
+        body: JsonObject | JsonPatch | None = None,
         content_type: str = JSON,
         query: Mapping[str, str] | None = None,
     ) -> JsonObject:
@@ -129,7 +132,7 @@ class Api:
         self,
         method: str,
         path: str,
-        body: JsonObject | None = None,
+        body: JsonObject | JsonPatch | None = None,
         content_type: str = JSON,
         *,
         query: Mapping[str, str] | None = None,

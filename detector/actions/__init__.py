@@ -1,0 +1,1 @@
+"""What episodes lead to. Actions run beside the engine, never on its thread, and keep what they count."""

@@ -1,0 +1,253 @@
+"""The deploy action: the demands of open episodes, kept equal to the ApplicationTasks in a store.
+
+The engine hands over the full set of demands whenever it changes; the reconciler makes the store match, whatever it
+missed: it creates what is missing (a task deleted by hand comes back), sets the end of what is over, and patches what
+changed. It looks at levels, not at edges, so an outage of the store delays it and loses nothing; an episode that
+starts and ends within one outage leaves no task, since nothing is demanded any more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from detector.actions.ledger import Ledger
+from detector.actions.queue import WorkQueue
+from detector.actions.steps import Step, differences
+from detector.actions.stores import (
+    Snapshot,
+    StoredTask,
+    StoreUnavailableError,
+    TaskExistsError,
+    TaskRefusedError,
+    TaskStore,
+)
+from detector.cluster.backoff import Backoff
+from detector.engine.demands import Demand, plain, to_task
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class DeployCounts:
+    """What the reconciler did since its start, in tasks."""
+
+    created: int = 0
+    recreated: int = 0
+    """Created again, since somebody deleted them while they were demanded."""
+    adopted: int = 0
+    """Found there when they were to be created: made by a request whose answer was lost."""
+    replaced: int = 0
+    """Deleted to be created anew, since what is demanded differs in what cannot be changed."""
+    patched: int = 0
+    ended: int = 0
+    retried: int = 0
+    """Attempts that found the store away or busy."""
+    refused: Counter[str] = field(default_factory=Counter)
+    """Attempts that the store refused, by its reason. Each is made again at the next resync."""
+
+
+class DemandReconciler:
+    """Keeps the tasks of one holder equal to its demands. `update` from any thread; all else in one event loop."""
+
+    def __init__(
+        self,
+        store: TaskStore,
+        *,
+        now: Callable[[], int] = time.time_ns,
+        concurrency: int = 16,
+        permitted: asyncio.Event | None = None,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            store: the holder's tasks.
+            now: nanoseconds since the epoch: when a task ends whose demand is gone and nobody says since when.
+            concurrency: how many tasks are changed at the same time; the changes of one task are always in order.
+            permitted: nothing is changed while this is not set, e.g. `HolderLease.held`. Default: always permitted.
+        """
+        self._store = store
+        self._now = now
+        self._slots = asyncio.Semaphore(concurrency)
+        self._permitted = permitted
+        self._lock = threading.Lock()
+        self._handed: tuple[Mapping[str, Demand], dict[str, int]] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ledger = Ledger()
+        self._queue = WorkQueue()
+        self._away = Backoff(0.1, 5.0)
+        self._reachable = asyncio.Event()
+        self._pause = 0.0
+        self._said: set[tuple[Step, str]] = set()
+        self._stopping = asyncio.Event()
+        self._deadline = 0.0
+        self.counts = DeployCounts()
+
+    @property
+    def pending(self) -> int:
+        """How many tasks are not yet as demanded and are being worked on."""
+        return len(self._queue)
+
+    def update(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
+        """Hand over what is demanded now. Never waits for the store; only the newest set counts.
+
+        Args:
+            demands: all that is demanded, by task name.
+            ended: the ends of episodes whose demands are gone, by task name, in nanoseconds since the epoch. They are
+                remembered until the tasks have ended.
+        """
+        with self._lock:
+            waiting = self._handed
+            self._handed = (dict(demands), {**(waiting[1] if waiting else {}), **ended})
+            loop = self._loop
+        if waiting is None and loop is not None:
+            with suppress(RuntimeError):  # the loop is closed: nobody is left to act, and the next start makes good
+                loop.call_soon_threadsafe(self._accept)
+
+    async def run(self) -> None:
+        """Reconcile until `stop`. Nothing is changed before the first `update` and the store's first snapshot."""
+        with self._lock:
+            self._loop = asyncio.get_running_loop()
+        self._accept()
+        async with asyncio.TaskGroup() as group:
+            working = [group.create_task(self._follow()), group.create_task(self._work())]
+            await self._stopping.wait()
+            self._accept()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(self._deadline if self._may_change() else 0.0):
+                    await self._queue.empty()
+            if self.pending:
+                _log.warning("%d tasks are not yet as demanded: the next start makes good", self.pending)
+            for task in working:
+                task.cancel()
+
+    def stop(self, deadline: float = 3.0) -> None:
+        """Let `run` do what is due, for at most `deadline` seconds, and return. Live tasks stay alive."""
+        self._deadline = deadline
+        self._stopping.set()
+
+    def _accept(self) -> None:
+        """Take over what `update` left."""
+        with self._lock:
+            handed, self._handed = self._handed, None
+        if handed is not None:
+            self._enqueue(self._ledger.accept(*handed))
+
+    def _may_change(self) -> bool:
+        return self._permitted is None or self._permitted.is_set()
+
+    async def _follow(self) -> None:
+        async for change in self._store.follow():
+            self._enqueue(self._ledger.see(change))
+            if isinstance(change, Snapshot):
+                self._reachable.set()
+
+    def _enqueue(self, names: Iterable[str]) -> None:
+        for name in names:
+            self._queue.add(name)
+
+    async def _work(self) -> None:
+        async with asyncio.TaskGroup() as group:
+            while True:
+                name = await self._queue.take()
+                if self._permitted is not None:
+                    await self._permitted.wait()
+                if self._away.failures:
+                    # One task alone finds out whether the store is back.
+                    with suppress(TimeoutError):
+                        await asyncio.wait_for(self._reachable.wait(), self._pause)
+                    await self._attend(name)
+                else:
+                    await self._slots.acquire()
+                    group.create_task(self._attend(name)).add_done_callback(lambda _: self._slots.release())
+
+    async def _attend(self, name: str) -> None:
+        """Take the steps that a task needs, one after the other."""
+        failures = self._away.failures
+        step = Step.NOTHING
+        try:
+            while (step := self._ledger.next(name)) is not Step.NOTHING:
+                await self._take(step, name)
+                self._away.succeed()
+        except StoreUnavailableError as error:
+            self.counts.retried += 1
+            if failures == self._away.failures:  # else another task has counted this outage's newest failure
+                self._unavailable(error)
+            self._queue.add(name)
+        except TaskRefusedError as error:
+            self._refused(step, name, error)
+        finally:
+            self._queue.done(name)
+
+    async def _take(self, step: Step, name: str) -> None:
+        demand, stored = (self._ledger.demands or {}).get(name), (self._ledger.stored or {}).get(name)
+        if step is Step.CREATE and demand is not None:
+            await self._create(name, demand)
+        elif stored is not None:
+            try:
+                await self._change(step, name, demand, stored)
+            except TaskRefusedError:
+                # Perhaps only because it is not what we thought: ended, deleted or made anew meanwhile.
+                current = await self._store.get(name)
+                self._ledger.put(name, current)
+                if self._ledger.next(name) is step and _same(current, stored):
+                    raise
+
+    async def _create(self, name: str, demand: Demand) -> None:
+        try:
+            task = to_task(demand)
+        except ValueError as error:
+            raise TaskRefusedError("Invalid", f"the demand makes no ApplicationTask: {error}") from error
+        try:
+            self._ledger.put(name, await self._store.create(task))
+        except TaskExistsError as error:
+            found = await self._store.get(name)
+            if found is None or found.leaving:
+                why = "it is being deleted" if found else "it is not this holder's"
+                raise TaskRefusedError("AlreadyExists", f"the name is taken, and {why}: {error}") from error
+            self._ledger.put(name, found)
+            self.counts.adopted += 1
+        else:
+            if name in self._ledger.held:
+                self.counts.recreated += 1
+                _log.info("created the task %s again, since somebody deleted it", name)
+            else:
+                self.counts.created += 1
+
+    async def _change(self, step: Step, name: str, demand: Demand | None, stored: StoredTask) -> None:
+        if step is Step.END:
+            end = self._ledger.end_of(name)
+            self._ledger.put(name, await self._store.end(stored, self._now() if end is None else end))
+            self.counts.ended += 1
+        elif step is Step.REPLACE and demand is not None:
+            _log.info("replacing the task %s: %s", name, ", ".join(differences(demand, stored)) or "it has ended")
+            await self._store.remove(stored)
+            self._ledger.put(name, None)
+            self.counts.replaced += 1
+        elif step is Step.SET_PARAMETERS and demand is not None:
+            self._ledger.put(name, await self._store.set_parameters(stored, plain(demand.parameters)))
+            self.counts.patched += 1
+            if self._ledger.next(name) is Step.SET_PARAMETERS:
+                raise TaskRefusedError("Altered", "the store changed the parameters that it was given")
+
+    def _unavailable(self, error: StoreUnavailableError) -> None:
+        if not self._away.failures:
+            _log.warning("tasks cannot be changed now, and are as soon as possible: %s", error)
+        self._reachable.clear()
+        self._pause = self._away.fail(error.retry_after)
+
+    def _refused(self, step: Step, name: str, error: TaskRefusedError) -> None:
+        self.counts.refused[error.reason] += 1
+        if (step, error.reason) not in self._said:
+            self._said.add((step, error.reason))
+            _log.error("cannot %s the task %s (others alike are only counted): %s", step.value, name, error)
+
+
+def _same(one: StoredTask | None, other: StoredTask) -> bool:
+    return one is not None and one.version == other.version

@@ -1,0 +1,130 @@
+"""Tasks in the API server."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import contextmanager
+
+from pydantic import ValidationError
+
+from detector.actions.stores import (
+    Snapshot,
+    StoredTask,
+    StoreUnavailableError,
+    TaskExistsError,
+    TaskRefusedError,
+    Update,
+    belongs_to,
+    manifest,
+)
+from detector.cluster.api import Api, JsonObject, Resource
+from detector.cluster.errors import AlreadyExistsError, ApiError, NotFoundError, UnavailableError
+from detector.cluster.reflector import Changed, Deleted, Listed, Reflector, version_of
+from detector.engine.demands import holder_label
+from wayside.api import API_VERSION, ApplicationTask
+from wayside.api.applicationtask import HOLDER_LABEL
+from wayside.api.base import JsonValue
+from wayside.times import format_time
+
+_log = logging.getLogger(__name__)
+
+TASKS = Resource(API_VERSION, ApplicationTask.plural)
+
+
+class KubernetesTaskStore:
+    """The tasks of one holder in one namespace. Others' tasks are neither seen nor touched."""
+
+    def __init__(self, api: Api, namespace: str, holder: str, resync: float = 30.0) -> None:
+        """Prepare; `resync`: seconds after which all is listed again, even if nothing seems to be missing."""
+        self._api = api
+        self._namespace = namespace
+        self._holder = holder
+        self._resync = resync
+        self._unreadable: set[str] = set()
+
+    async def follow(self) -> AsyncIterator[Snapshot | Update]:
+        """See `TaskStore`."""
+        selectors = {"labelSelector": f"{HOLDER_LABEL}={holder_label(self._holder)}"}
+        reflector = Reflector(self._api, TASKS, self._namespace, selectors, self._resync)
+        async for change in reflector.follow():
+            match change:
+                case Listed(objects, version):
+                    own = (self._own(obj) for obj in objects)
+                    yield Snapshot({stored.task.name: stored for stored in own if stored}, version)
+                case Changed(obj):
+                    if stored := self._own(obj):
+                        yield Update(stored.task.name, stored, stored.version)
+                case Deleted(obj):
+                    if self._own(obj):
+                        yield Update(obj["metadata"]["name"], None, version_of(obj))
+
+    async def get(self, name: str) -> StoredTask | None:
+        """See `TaskStore`."""
+        with _store_errors():
+            try:
+                return self._own(await self._api.get(TASKS, self._namespace, name))
+            except NotFoundError:
+                return None
+
+    async def create(self, task: ApplicationTask) -> StoredTask:
+        """See `TaskStore`."""
+        with _store_errors():
+            return _stored(await self._api.create(TASKS, self._namespace, manifest(task)))
+
+    async def set_parameters(self, stored: StoredTask, parameters: Mapping[str, JsonValue]) -> StoredTask:
+        """See `TaskStore`."""
+        return await self._set(stored, "parameters", dict(parameters))
+
+    async def end(self, stored: StoredTask, end_time: int) -> StoredTask:
+        """See `TaskStore`."""
+        return await self._set(stored, "endTime", format_time(end_time))
+
+    async def remove(self, stored: StoredTask) -> None:
+        """See `TaskStore`."""
+        metadata = stored.task.metadata
+        with _store_errors():
+            await self._api.delete(TASKS, self._namespace, metadata.name, metadata.uid)
+
+    async def _set(self, stored: StoredTask, field: str, value: JsonValue) -> StoredTask:
+        # A JSON patch, since a merge patch would keep what is no longer in a nested map.
+        metadata = stored.task.metadata
+        patch = [
+            {"op": "test", "path": "/metadata/uid", "value": metadata.uid},
+            {"op": "add", "path": f"/spec/{field}", "value": value},
+        ]
+        with _store_errors():
+            return _stored(await self._api.patch(TASKS, self._namespace, metadata.name, patch))
+
+    def _own(self, obj: JsonObject) -> StoredTask | None:
+        """The task if it is the holder's and can be read; one of a newer version is left alone, and it is said once."""
+        try:
+            stored = _stored(obj)
+        except ValidationError as error:
+            name = obj["metadata"]["name"]
+            if name not in self._unreadable:
+                self._unreadable.add(name)
+                _log.warning("the ApplicationTask %s is left alone, since it cannot be read: %s", name, error)
+            return None
+        return stored if belongs_to(stored.task, self._holder) else None
+
+
+def _stored(obj: JsonObject) -> StoredTask:
+    # The status is the manager's business, and a newer manager's may have fields that we do not know.
+    read = {key: value for key, value in obj.items() if key != "status"}
+    shape = {"apiVersion": API_VERSION, "kind": ApplicationTask.__name__}  # items of a list come without
+    return StoredTask(ApplicationTask.model_validate(shape | read), version_of(obj))
+
+
+@contextmanager
+def _store_errors() -> Iterator[None]:
+    try:
+        yield
+    except UnavailableError as error:
+        raise StoreUnavailableError(error.reason, str(error), error.retry_after) from error
+    except AlreadyExistsError as error:
+        raise TaskExistsError(error.reason, str(error)) from error
+    except ApiError as error:
+        raise TaskRefusedError(error.reason, str(error)) from error
+    except ValidationError as error:
+        raise TaskRefusedError("Unreadable", f"the stored ApplicationTask cannot be read: {error}") from error

@@ -1,0 +1,98 @@
+"""What is demanded beside what is stored: for each task, which step comes next. No waiting, no I/O."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+
+from detector.actions.steps import Step, next_step
+from detector.actions.stores import Snapshot, StoredTask, Update
+from detector.engine.demands import Demand
+
+_log = logging.getLogger(__name__)
+
+_REMEMBERED_ENDS = 10_000
+"""Ends of episodes whose tasks are not known to have ended. Beyond it the oldest are forgotten."""
+
+
+class Ledger:
+    """The newest knowledge of both sides, by task name.
+
+    `accept` and `see` return the names for which something is now to be done.
+    """
+
+    def __init__(self) -> None:
+        self.demands: Mapping[str, Demand] | None = None
+        """None before the first `accept`: until then nothing may be changed, least of all ended."""
+        self.stored: dict[str, StoredTask] | None = None
+        """None before the first snapshot: until then nobody knows what is there."""
+        self.held: set[str] = set()
+        """Demands whose task this process has seen live."""
+        self.surrendered: set[str] = set()
+        """Demands whose task somebody else ended; they stay without one."""
+        self._ends: dict[str, int] = {}
+
+    def accept(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> list[str]:
+        """Take over the full set of demands, and the ends of some that are gone (ns since the epoch)."""
+        before = self.demands
+        self.demands = demands
+        self._ends.update(ended)
+        while len(self._ends) > _REMEMBERED_ENDS:
+            del self._ends[next(iter(self._ends))]
+        self.held &= demands.keys()
+        self.surrendered &= demands.keys()
+        if before is None:
+            return self._due(demands.keys() | (self.stored or {}).keys())
+        changed = [name for name, demand in demands.items() if before.get(name) != demand]
+        return self._due([*(name for name in before if name not in demands), *changed])
+
+    def see(self, change: Snapshot | Update) -> list[str]:
+        """Take over what the store says."""
+        known = self.stored or {}
+        if isinstance(change, Snapshot):
+            # What we wrote after the snapshot was taken is newer than it.
+            newer = {name: stored for name, stored in known.items() if stored.version > change.version}
+            self.stored = {**change.tasks, **newer}
+            return self._due(self.stored.keys() | (self.demands or {}).keys())
+        earlier = known.get(change.name)
+        if self.stored is None or (earlier is not None and earlier.version > change.version):
+            return []
+        self.put(change.name, change.stored)
+        return self._due((change.name,))
+
+    def put(self, name: str, stored: StoredTask | None) -> None:
+        """Take over the answer to a change of our own."""
+        if self.stored is None:
+            self.stored = {}
+        if stored is None:
+            self.stored.pop(name, None)
+        else:
+            self.stored[name] = stored
+
+    def next(self, name: str) -> Step:
+        """What to do next about a task."""
+        if self.demands is None or self.stored is None:
+            return Step.NOTHING
+        demand, stored = self.demands.get(name), self.stored.get(name)
+        step = next_step(demand, stored, name in self.held)
+        if step is Step.NOTHING and stored is not None:
+            self._settled(name, demand, stored)
+        return step
+
+    def _settled(self, name: str, demand: Demand | None, stored: StoredTask) -> None:
+        if stored.leaving:
+            return
+        if demand is None:
+            self._ends.pop(name, None)
+        elif stored.live:
+            self.held.add(name)
+        elif name not in self.surrendered:
+            self.surrendered.add(name)
+            _log.warning("somebody ended the task %s, which is still demanded; it stays ended", name)
+
+    def end_of(self, name: str) -> int | None:
+        """When the demand ended, in nanoseconds since the epoch; None where nobody said."""
+        return self._ends.get(name)
+
+    def _due(self, names: Iterable[str]) -> list[str]:
+        return [name for name in names if self.next(name) is not Step.NOTHING]

@@ -1,0 +1,63 @@
+"""What to do next about one task, from what is demanded and what is stored. Pure: the same answer whenever asked."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any
+
+from detector.actions.stores import StoredTask
+from detector.engine.demands import Demand, plain
+from wayside.times import format_time
+
+
+class Step(Enum):
+    """One change of the store."""
+
+    NOTHING = "nothing"
+    CREATE = "create"
+    REPLACE = "replace"
+    """Delete the task, then create it anew: what is demanded differs in what cannot be changed."""
+    SET_PARAMETERS = "set parameters"
+    END = "end"
+
+
+def next_step(demand: Demand | None, stored: StoredTask | None, held: bool) -> Step:
+    """The next change that brings the store closer to the demand.
+
+    Args:
+        demand: what is demanded under the task's name; None: nothing (any more).
+        stored: the task, if there is one and it is the holder's own.
+        held: whether this process has seen the task live for this demand. If it has, and the task has ended, then
+            somebody ended it on purpose and it stays ended. If not, it is left from an earlier run over the same data.
+    """
+    if demand is None:
+        return Step.END if stored is not None and stored.live else Step.NOTHING
+    if stored is None:
+        return Step.CREATE
+    if stored.leaving:
+        return Step.NOTHING  # until it is gone
+    if not stored.live:
+        return Step.NOTHING if held else Step.REPLACE
+    if differences(demand, stored):
+        return Step.REPLACE
+    if plain(demand.parameters) != stored.task.spec.parameters:
+        return Step.SET_PARAMETERS
+    return Step.NOTHING
+
+
+def differences(demand: Demand, stored: StoredTask) -> list[str]:
+    """The fields, among those that cannot be changed, in which the task is not what is demanded."""
+    spec = stored.task.spec
+    event = spec.event
+    pairs: dict[str, tuple[Any, Any]] = {
+        "template": (demand.template, spec.template),
+        "priority": (demand.priority, spec.priority),
+        "requester.detector": (demand.detector, spec.requester.detector),
+        "requester.subjects": (list(demand.subjects), spec.requester.subjects),
+    }
+    if event is not None:
+        pairs |= {
+            "event.id": (demand.episode, event.id),
+            "event.onsetTime": (format_time(demand.onset_time), event.onset_time),
+        }
+    return [field for field, (wanted, found) in pairs.items() if wanted != found]

@@ -1,0 +1,123 @@
+"""What a store of tasks offers to the reconciler, be it the API server or a folder of files."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from detector.engine.demands import Demand, from_task
+from wayside.api import ApplicationTask
+from wayside.api.base import JsonValue
+
+
+@dataclass(frozen=True)
+class StoredTask:
+    """A task as the store has it."""
+
+    task: ApplicationTask
+    version: int
+    """Grows with each change of anything in the store, so that of two states the newer one can be told."""
+
+    @property
+    def live(self) -> bool:
+        """Whether its demand has not ended."""
+        return self.task.spec.end_time is None
+
+    @property
+    def leaving(self) -> bool:
+        """Whether somebody deleted it and the store has not yet removed it."""
+        return self.task.metadata.deletion_timestamp is not None
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All tasks of the holder that there are, by name."""
+
+    tasks: Mapping[str, StoredTask]
+    version: int
+
+
+@dataclass(frozen=True)
+class Update:
+    """One task changed, or is gone (`stored` is None)."""
+
+    name: str
+    stored: StoredTask | None
+    version: int
+
+
+class StoreError(Exception):
+    """The store did not do what was asked."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+        """One word, for counting."""
+
+
+class StoreUnavailableError(StoreError):
+    """The store is away or busy: the same may succeed soon."""
+
+    def __init__(self, reason: str, message: str, retry_after: float = 0.0) -> None:
+        super().__init__(reason, message)
+        self.retry_after = retry_after
+        """Seconds that it asks to wait; 0 where it does not say."""
+
+
+class TaskRefusedError(StoreError):
+    """The store will not have it, until somebody changes something."""
+
+
+class TaskExistsError(StoreError):
+    """A task of this name exists, perhaps somebody else's."""
+
+
+class TaskStore(Protocol):
+    """The tasks of one holder. Every method but `follow` raises a `StoreError`."""
+
+    def follow(self) -> AsyncIterator[Snapshot | Update]:
+        """What is, then what changes, with a fresh snapshot at least every half minute. Never ends, raises nothing."""
+
+    async def get(self, name: str) -> StoredTask | None:
+        """The holder's task of this name; None if there is none, or it is somebody else's."""
+
+    async def create(self, task: ApplicationTask) -> StoredTask:
+        """Store a new task. `TaskExistsError` if the name is taken."""
+
+    async def set_parameters(self, stored: StoredTask, parameters: Mapping[str, JsonValue]) -> StoredTask:
+        """Replace a task's parameters, if it still is the same task."""
+
+    async def end(self, stored: StoredTask, end_time: int) -> StoredTask:
+        """Set a task's end (nanoseconds since the epoch), if it still is the same task."""
+
+    async def remove(self, stored: StoredTask) -> None:
+        """Delete a task, if it still is the same one."""
+
+
+async def restore(store: TaskStore) -> list[Demand]:
+    """The demands of the holder's live tasks, oldest first: the episodes that were open when the detector stopped.
+
+    Waits for as long as the store is away; cancel it to give up.
+    """
+    async for change in store.follow():
+        if isinstance(change, Snapshot):
+            live = (from_task(stored.task) for stored in change.tasks.values() if stored.live and not stored.leaving)
+            return sorted((demand for demand in live if demand), key=lambda demand: (demand.start_time, demand.name))
+    raise AssertionError("a store's changes never end")
+
+
+def belongs_to(task: ApplicationTask, holder: str) -> bool:
+    """Whether the holder emitted this task, and so may change it."""
+    return task.spec.requester.holder == holder and from_task(task) is not None
+
+
+def manifest(task: ApplicationTask) -> dict[str, Any]:
+    """The task as it is sent or written: without the fields that say nothing."""
+    document = task.to_json()
+    document["metadata"] = {key: value for key, value in document["metadata"].items() if value}
+    event = task.spec.event
+    if event is not None and event.classification is not None:
+        document["spec"]["event"]["classification"] = event.classification.to_json()
+    document.pop("status", None)
+    return document
