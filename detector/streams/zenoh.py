@@ -1,0 +1,182 @@
+"""The detector's place in the Zenoh network: samples come in, events go out.
+
+A subscriber's callback does nothing but hand key and bytes to the intake, so that the vehicle is never slowed. Events
+wait in a bounded queue for a thread of their own, so that the network never slows the evaluation.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+
+import zenoh
+
+from detector.streams.keys import KeyPattern
+from wayside.api.detector import Stream, Zenoh, ZenohMode
+
+log = logging.getLogger(__name__)
+
+Put = Callable[[str, bytes], None]
+"""Takes a message: its key and payload. Thread-safe, and never waits."""
+
+EVENT_ENCODING = "application/cloudevents+json"
+_RETRY_SECONDS = (0.2, 0.5, 1.0, 2.0)
+"""Waits between attempts to reach a router at the start; the last one repeats."""
+
+
+class NetworkError(ValueError):
+    """The Zenoh session cannot be had as configured; the text names the field and the reason."""
+
+
+class Network:
+    """One session: subscribed to all streams, and the way out for events."""
+
+    def __init__(
+        self, config: Zenoh, streams: Iterable[Stream], putter: Callable[[str], Put], *, capacity: int = 4096
+    ) -> None:
+        """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
+
+        Raises KeyPatternError.
+        """
+        self._config = config
+        self._subscriptions = [
+            (zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression), _receiver(putter(stream.name)))
+            for stream in streams
+        ]
+        self._capacity = capacity
+        self._events: deque[tuple[str, bytes]] = deque()
+        self._changed = threading.Condition()
+        self._stop = threading.Event()
+        self._session: zenoh.Session | None = None
+        self._thread = threading.Thread(target=self._run, name="network", daemon=True)
+        self.dropped_events = 0
+        """Events that found the queue full, or that Zenoh refused."""
+
+    def start(self) -> None:
+        """Opens the session: a peer's at once (raises NetworkError), a client's in the background until it succeeds."""
+        if self._config.mode is ZenohMode.PEER:
+            self._join(open_session(self._config))
+        self._thread.start()
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Queues an event, given as CloudEvents JSON; never waits. With the queue full it is dropped and counted."""
+        with self._changed:
+            if len(self._events) >= self._capacity or self._stop.is_set():
+                self.dropped_events += 1
+                return
+            self._events.append((key, payload))
+            self._changed.notify()
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router or another peer is connected right now."""
+        session = self._session
+        return session is not None and bool(session.info.routers_zid() or session.info.peers_zid())
+
+    def close(self, timeout: float = 2.0) -> None:
+        """Publishes what still waits, for at most `timeout` seconds, and leaves the network."""
+        with self._changed:
+            self._stop.set()
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join(timeout)
+        if (session := self._session) is not None:
+            self._session = None
+            session.close()  # type: ignore[no-untyped-call]  # also frees the thread from a put that waits
+        if (left := len(self._events)) > 0:
+            self.dropped_events += left
+            log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
+
+    def _join(self, session: zenoh.Session) -> None:
+        for expression, receive in self._subscriptions:
+            session.declare_subscriber(expression, receive)  # lives as long as the session
+        self._session = session
+
+    def _run(self) -> None:
+        if self._session is None:
+            session = await_session(self._config, self._stop)
+            if session is None:
+                return
+            self._join(session)
+        while (event := self._next()) is not None:
+            self._send(*event)
+
+    def _next(self) -> tuple[str, bytes] | None:
+        """The next event; None once closing and nothing waits."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._events or self._stop.is_set())
+            return self._events.popleft() if self._events else None
+
+    def _send(self, key: str, payload: bytes) -> None:
+        if (session := self._session) is None:  # closed meanwhile, the time for what still waited being over
+            self.dropped_events += 1
+            return
+        try:
+            # BLOCK: events are few and should survive a short congestion; only this thread waits for it.
+            session.put(
+                key,
+                payload,
+                encoding=EVENT_ENCODING,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                express=True,
+            )
+        except zenoh.ZError as error:
+            self.dropped_events += 1
+            log.warning("event on %s was not published: %s", key, error)
+
+
+def open_session(config: Zenoh) -> zenoh.Session:
+    """Opens a session. A peer connects in the background; a client must reach a router now. Raises NetworkError."""
+    try:
+        return zenoh.open(_settings(config))
+    except zenoh.ZError as error:
+        raise NetworkError(
+            f"zenoh: no session as {config.mode} with connect {[*config.connect]}, listen {[*config.listen]}: {error}"
+        ) from error
+
+
+def await_session(config: Zenoh, stop: threading.Event) -> zenoh.Session | None:
+    """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
+    attempt = 0
+    while not stop.is_set():
+        try:
+            return open_session(config)
+        except NetworkError as error:
+            if attempt == 0:
+                log.warning("%s; trying on", error)
+        stop.wait(_RETRY_SECONDS[min(attempt, len(_RETRY_SECONDS) - 1)])
+        attempt += 1
+    return None
+
+
+def _receiver(put: Put) -> Callable[[zenoh.Sample], None]:
+    put_kind = zenoh.SampleKind.PUT
+
+    def receive(sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        if payload or sample.kind == put_kind:  # a deletion is no message; asking for the kind of each would cost more
+            put(str(sample.key_expr), payload)
+
+    return receive
+
+
+def _settings(config: Zenoh) -> zenoh.Config:
+    settings = zenoh.Config()
+    values: dict[str, object] = {
+        "mode": config.mode.value,
+        "connect/endpoints": [*config.connect],
+        # A peer goes on trying in the background. A client's open() would not return: `await_session` tries for it.
+        "connect/timeout_ms": -1 if config.mode is ZenohMode.PEER else 0,
+        "connect/exit_on_failure": config.mode is not ZenohMode.PEER,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
+        "scouting/multicast/enabled": config.scouting,
+    }
+    if config.listen:
+        values["listen/endpoints"] = [*config.listen]
+        values["listen/exit_on_failure"] = True
+    for path, value in values.items():
+        settings.insert_json5(path, json.dumps(value))
+    return settings
