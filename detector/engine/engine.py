@@ -28,6 +28,8 @@ from wayside.rules import CompiledRule, CompiledStream, compile_stream
 _new_sample = tuple.__new__
 """Makes a Sample from a plain tuple at a third of the cost of calling the class: it is made for every message."""
 
+_NO_LANES: Mapping[str, Lane] = {}
+
 
 class KeyReader(Protocol):
     """Tells whose a sample is."""
@@ -202,7 +204,7 @@ class Engine:
             received, stream, key, payload = arrival
             if times is not None:
                 received = times[index]  # with clock Data, there is no other time
-            lane = lanes[stream].get(key)
+            lane = lanes.get(stream, _NO_LANES).get(key)
             if lane is None:
                 lane = self._route(stream, key, received)
                 if lane is None:
@@ -220,12 +222,12 @@ class Engine:
 
     def _route(self, stream: str, key: str, time: int) -> Lane | None:
         """The lane for a key that has none at hand: a new key, or one of a client that was lost."""
-        whose = self._read_key(stream, key)
-        if whose is None:
-            self.counters.unnamed[stream] += 1
+        spec = self._streams.get(stream)
+        whose = None if spec is None else self._read_key(stream, key)
+        if spec is None or whose is None:
+            self.counters.unnamed[stream] += 1  # also what still came in on a stream that the Detector no longer has
             return None
         client, captures = whose
-        spec = self._streams[stream]
         limit = spec.buffer.bytes
         lane = self.buffer.add(
             Lane(
@@ -283,10 +285,10 @@ class Engine:
         )
 
     def _client_of(self, arrival: Arrival) -> str | None:
-        lane = self._lanes[arrival.stream].get(arrival.key)
+        lane = self._lanes.get(arrival.stream, _NO_LANES).get(arrival.key)
         if lane is not None:
             return lane.client
-        whose = self._read_key(arrival.stream, arrival.key)
+        whose = self._read_key(arrival.stream, arrival.key) if arrival.stream in self._streams else None
         if whose is None:
             self.counters.unnamed[arrival.stream] += 1
             return None
