@@ -1,0 +1,98 @@
+"""A Detector and its EventRules from YAML files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from detector.rules.selection import RuleSet, select
+from wayside.api import Detector, EventRule
+from wayside.api.documents import Document, DocumentError, Problem, load_documents
+
+
+@dataclass(frozen=True)
+class FileRules:
+    """What the files say."""
+
+    rule_set: RuleSet
+    detector: Document
+    rules: dict[str, Document]
+    """The selected rules by name, for errors to tell where."""
+    warnings: tuple[str, ...]
+    """Rules that are given but not evaluated, and why."""
+
+
+def load_rules(detector: str | Path, rules: Iterable[str | Path]) -> FileRules:
+    """Read exactly one Detector, and the rules that it selects.
+
+    Args:
+        detector: a file or folder. It may hold other kinds too; they are not looked at.
+        rules: files or folders, likewise. EventRules beside the detector count only if they are given here.
+
+    Raises:
+        DocumentError: with every problem of every file; also where there is no Detector, or more than one, or two
+            rules of one name.
+    """
+    problems: list[Problem] = []
+    beside_detector = _load([detector], problems)
+    given = _load(rules, problems)
+    detectors = [document for document in beside_detector if isinstance(document.object, Detector)]
+    if not problems and len(detectors) != 1:
+        problems.extend(_not_one(str(detector), detectors))
+    documents: dict[str, Document] = {}
+    for document in given:
+        if not isinstance(document.object, EventRule):
+            continue
+        first = documents.setdefault(document.object.name, document)
+        if first is not document:
+            where = f"{first.file}:{first.line}"
+            problems.append(
+                document.problem(
+                    ("metadata", "name"),
+                    f"the EventRule {first.object.name!r} is also in {where}: rename or remove one",
+                )
+            )
+    if problems:
+        raise DocumentError(problems)
+    return _selected(detectors[0], documents)
+
+
+def _selected(detector: Document, documents: dict[str, Document]) -> FileRules:
+    assert isinstance(detector.object, Detector)  # noqa: S101  the caller picked it
+    candidates = [document.object for document in documents.values() if isinstance(document.object, EventRule)]
+    rule_set = select(detector.object, candidates)
+    chosen = {rule.name: documents[rule.name] for rule in rule_set.rules}
+    return FileRules(rule_set, detector, chosen, tuple(_left_out(documents, chosen, detector.object)))
+
+
+def _left_out(documents: dict[str, Document], chosen: dict[str, Document], detector: Detector) -> Iterable[str]:
+    for name, document in documents.items():
+        if name in chosen:
+            continue
+        rule = document.object
+        if rule.namespace != detector.namespace:
+            why = (
+                f"it is in namespace {rule.namespace!r}, the Detector {detector.name!r} in {detector.namespace!r}: "
+                "a detector evaluates rules of its own namespace only"
+            )
+            yield str(document.problem(("metadata", "namespace"), f"the EventRule {name!r} is not evaluated: {why}"))
+        else:
+            labels = ", ".join(f"{key}: {value}" for key, value in detector.spec.rules.match_labels.items())
+            why = f"the Detector {detector.name!r} selects by the labels {{{labels}}}: add them to metadata.labels"
+            yield str(document.problem(("metadata", "labels"), f"the EventRule {name!r} is not evaluated: {why}"))
+
+
+def _load(paths: Iterable[str | Path], problems: list[Problem]) -> list[Document]:
+    try:
+        return load_documents(paths)
+    except DocumentError as error:
+        problems.extend(problem for problem in error.problems if problem not in problems)
+        return []
+
+
+def _not_one(given: str, detectors: list[Document]) -> Iterable[Problem]:
+    if not detectors:
+        yield Problem(given, 0, 0, "", "holds no Detector: give one object of kind: Detector")
+    for document in detectors[1:]:
+        yield document.problem(("metadata", "name"), "is a second Detector: give one, in a file of its own")

@@ -1,0 +1,145 @@
+"""A Detector and its EventRules from the API server, followed as they change."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from typing import Generic, TypeVar
+
+from detector.cluster.api import Api, JsonObject, Resource
+from detector.cluster.reflector import Change, Changed, Deleted, Listed, Reflector
+from detector.rules.selection import RuleSet, select
+from wayside.api import API_VERSION, Detector, EventRule, Kind
+from wayside.api.documents import parse_object
+
+_log = logging.getLogger(__name__)
+
+DETECTORS = Resource(API_VERSION, Detector.plural)
+EVENT_RULES = Resource(API_VERSION, EventRule.plural)
+
+_COALESCING = 0.05
+"""Seconds: what `kubectl apply` sends in one go is taken over in one go."""
+
+Object = TypeVar("Object", bound=Kind)
+
+
+class ClusterRules:
+    """The Detector of a name and the rules that it selects, kept current.
+
+    While the API server is away, and while the Detector is missing or cannot be read, the last known set holds. A rule
+    that cannot be read (e.g. one of a newer version) is reported and left out; the others are not affected.
+    """
+
+    def __init__(self, api: Api, namespace: str, detector_name: str, resync: float = 30.0) -> None:
+        """Prepare; `resync`: seconds after which all is listed again, even if nothing seems to be missing."""
+        self._name = detector_name
+        self._where = f"namespace {namespace}"
+        self._detectors = _Known(Detector)
+        self._rules = _Known(EventRule)
+        only = {"fieldSelector": f"metadata.name={detector_name}"}
+        self._detector_source = Reflector(api, DETECTORS, namespace, only, resync)
+        self._rule_source = Reflector(api, EVENT_RULES, namespace, None, resync)
+        self._changed = asyncio.Event()
+        self._missing = False
+
+    @property
+    def problems(self) -> dict[str, str]:
+        """What cannot be read, and why, by kind and name."""
+        return {
+            f"{kind.__name__} {name}": why
+            for kind, known in ((Detector, self._detectors), (EventRule, self._rules))
+            for name, why in known.unreadable.items()
+        }
+
+    async def follow(self) -> AsyncIterator[RuleSet]:
+        """The set as soon as it is known, then each time that it has changed. Never ends and raises nothing."""
+        last: RuleSet | None = None
+        tasks = [
+            asyncio.create_task(self._take(self._detector_source, self._detectors)),
+            asyncio.create_task(self._take(self._rule_source, self._rules)),
+        ]
+        try:
+            while True:
+                await self._changed.wait()
+                await asyncio.sleep(_COALESCING)
+                self._changed.clear()
+                for task in tasks:
+                    if task.done():
+                        task.result()  # it never ends but by an error, which must not be swallowed
+                current = self._current()
+                if current is not None and not current.same_as(last):
+                    last = current
+                    yield current
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _take(self, reflector: Reflector, known: _Known[Object]) -> None:
+        try:
+            async for change in reflector.follow():
+                known.take(change)
+                self._changed.set()
+        finally:
+            self._changed.set()
+
+    def _current(self) -> RuleSet | None:
+        if not (self._detectors.listed and self._rules.listed):
+            return None
+        detector = self._detectors.objects.get(self._name)
+        if detector is None:
+            if not self._missing and not self._detectors.unreadable:
+                _log.warning(
+                    "there is no Detector %r in %s: create it, or check --name and --namespace", self._name, self._where
+                )
+            self._missing = True
+            return None
+        self._missing = False
+        return select(detector, self._rules.objects.values())
+
+
+class _Known(Generic[Object]):
+    """The objects of one kind, by name."""
+
+    def __init__(self, kind: type[Object]) -> None:
+        self._kind = kind
+        self.objects: dict[str, Object] = {}
+        self.unreadable: dict[str, str] = {}
+        self.listed = False
+
+    def take(self, change: Change) -> None:
+        match change:
+            case Listed(objects, _):
+                self.listed = True
+                for name in (self.objects.keys() | self.unreadable.keys()) - {
+                    obj["metadata"]["name"] for obj in objects
+                }:
+                    self._remove(name)
+                for obj in objects:
+                    self._put(obj)
+            case Changed(obj):
+                self._put(obj)
+            case Deleted(obj):
+                self._remove(obj["metadata"]["name"])
+
+    def _put(self, obj: JsonObject) -> None:
+        name = obj["metadata"]["name"]
+        # The status is the manager's business, and a newer manager's may have fields that we do not know.
+        read = {key: value for key, value in obj.items() if key != "status"}
+        shape = {"apiVersion": API_VERSION, "kind": self._kind.__name__}  # items of a list come without
+        try:
+            parsed = parse_object(shape | read)
+        except ValueError as error:
+            self.objects.pop(name, None)
+            if self.unreadable.get(name) != str(error):
+                _log.warning("the %s %s cannot be read and is left out: %s", self._kind.__name__, name, error)
+            self.unreadable[name] = str(error)
+            return
+        assert isinstance(parsed, self._kind)  # noqa: S101  the shape says so
+        self.unreadable.pop(name, None)
+        self.objects[name] = parsed
+
+    def _remove(self, name: str) -> None:
+        self.objects.pop(name, None)
+        self.unreadable.pop(name, None)
