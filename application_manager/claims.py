@@ -50,8 +50,19 @@ class Claim:
     parameters: Mapping[str, Any]
 
 
-def claim(template: ApplicationTemplate | None, task: ApplicationTask) -> Claim | Refusal:
+@dataclass(frozen=True, slots=True)
+class InvalidTemplate:
+    """A template that is there but cannot be used: it passed the API server, and yet does not make sense."""
+
+    name: str
+    problem: str
+
+
+def claim(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Refusal:
     """What the task asks for of its template, None where there is no such template."""
+    if isinstance(template, InvalidTemplate):
+        message = f"spec.template: ApplicationTemplate {template.name} is not valid: {template.problem}"
+        return Refusal(Refused.TEMPLATE_INVALID, f"{message}; correct the template")
     if template is None:
         return Refusal(
             Refused.TEMPLATE_NOT_FOUND,

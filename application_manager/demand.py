@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from application_manager import parameters
-from application_manager.claims import Claim, Refusal, Refused, claim
+from application_manager.claims import Claim, InvalidTemplate, Refusal, Refused, claim
 from application_manager.leases import LeaseView
 from application_manager.times import parse_time
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
@@ -83,7 +83,7 @@ class Outcome:
 
 
 def demand(
-    templates: Iterable[ApplicationTemplate],
+    templates: Iterable[ApplicationTemplate | InvalidTemplate],
     tasks: Iterable[ApplicationTask],
     instances: Iterable[ApplicationInstance],
     leases: Mapping[str, LeaseView],
@@ -98,7 +98,7 @@ def demand(
         leases: by holder; a holder that is missing is not lost.
         now: seconds since 1970.
     """
-    by_name = {each.name: each for each in templates}
+    by_name: dict[str, ApplicationTemplate | InvalidTemplate] = {each.name: each for each in templates}
     existing = {each.name: each for each in instances}
     claimed: dict[str, list[Claim]] = {}
     verdicts: dict[str, Verdict] = {}
@@ -128,7 +128,7 @@ def demand(
     return Outcome(decisions, verdicts, min(changes, default=None))
 
 
-def claim_or_verdict(template: ApplicationTemplate | None, task: ApplicationTask) -> Claim | Verdict:
+def claim_or_verdict(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Verdict:
     """What the task claims, or its verdict where it claims nothing, because it has ended or is refused."""
     if task.spec.end_time is not None:
         return Verdict(Standing.FINISHED, "Ended", f"the demand ended at {task.spec.end_time}")
@@ -144,7 +144,7 @@ def decide(
     name: str,
     template_name: str,
     *,
-    template: ApplicationTemplate | None,
+    template: ApplicationTemplate | InvalidTemplate | None,
     claims: Iterable[Claim],
     instance: ApplicationInstance | None,
     leases: Mapping[str, LeaseView],
@@ -154,6 +154,9 @@ def decide(
     ordered = sorted(claims, key=lambda each: precedence(each.task))
     if instance is not None and not is_managed(instance):
         return _left_alone(instance, ordered)
+    if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
+        key = instance.spec.key if instance else None
+        return Decision(name, template_name, key, None, (), {}, None, None)
     verdicts: dict[str, Verdict] = {}
     changes: list[float] = []
     live: list[Claim] = []

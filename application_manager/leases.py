@@ -24,7 +24,7 @@ class LeaseView:
     """A holder's Lease as of now.
 
     Attributes:
-        unchanged: for how many seconds it has been observed unchanged.
+        unchanged: for how many seconds it was observed unchanged, up to the last look at it.
         duration: the Lease's own duration in seconds.
         renewed: whether it was seen to change since we began to look.
     """
@@ -59,7 +59,8 @@ class HealthyTime:
 @dataclass(slots=True)
 class _Observation:
     identity: str
-    since: float  # healthy seconds
+    since: float  # healthy seconds at which it was new
+    looked: float  # healthy seconds at which it was seen last
     duration: float = DEFAULT_DURATION
     renewed: bool = False
 
@@ -75,8 +76,9 @@ class LeaseBook:
         identity = _identity(lease)
         known = self._observed.get(key)
         if known is None:
-            self._observed[key] = _Observation(identity, at, _duration(lease))
+            self._observed[key] = _Observation(identity, at, at, _duration(lease))
             return False
+        known.looked = at
         if identity == known.identity:
             return False
         # A Lease that disappears is no sign of life; one that appears or changes is.
@@ -87,9 +89,20 @@ class LeaseBook:
         return lease is not None
 
     def view(self, key: HolderKey, at: float) -> LeaseView:
-        """The holder's Lease at `at`. A holder never heard of counts as observed, without a Lease, from now on."""
-        known = self._observed.setdefault(key, _Observation(_identity(None), at))
-        return LeaseView(max(0.0, at - known.since), known.duration, known.renewed)
+        """The holder's Lease, as it was when it was looked at last.
+
+        A holder never heard of counts as observed, without a Lease, from `at` on.
+        """
+        known = self._observed.setdefault(key, _Observation(_identity(None), at, at))
+        return LeaseView(known.looked - known.since, known.duration, known.renewed)
+
+    def due(self, key: HolderKey, at: float) -> bool:
+        """Whether the Lease should be read: it is unchanged for longer than its duration, as far as we know.
+
+        A watch that broke unnoticed looks just like a holder that is lost, so only a look can tell.
+        """
+        known = self._observed.get(key)
+        return known is None or at - known.since >= known.duration
 
     def forget_except(self, keys: Iterable[HolderKey]) -> None:
         """Drop what concerns no holder of interest any more."""

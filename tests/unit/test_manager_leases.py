@@ -19,15 +19,25 @@ def lease(renewed: str, duration: int = 3, **metadata: Any) -> dict[str, Any]:
 def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
     book = LeaseBook()
     assert book.observe(KEY, lease("2020-01-01T00:00:00Z"), 10.0) is False
+    book.observe(KEY, lease("2020-01-01T00:00:00Z"), 12.0)
     assert book.view(KEY, 12.0) == LeaseView(2.0, 3.0, renewed=False)
     assert book.observe(KEY, lease("2020-01-01T00:00:01Z"), 13.0) is True
+    book.observe(KEY, lease("2020-01-01T00:00:01Z"), 14.5)
     assert book.view(KEY, 14.5) == LeaseView(1.5, 3.0, renewed=True)
+
+
+def test_time_in_which_nobody_looked_says_nothing() -> None:
+    book = LeaseBook()
+    book.observe(KEY, lease("a"), 0.0)
+    assert book.view(KEY, 100.0).unchanged == 0.0
+    assert not book.due(KEY, 2.9)
+    assert book.due(KEY, 3.0)
 
 
 def test_seeing_the_same_again_is_no_renewal() -> None:
     book = LeaseBook()
     book.observe(KEY, lease("a"), 0.0)
-    assert book.observe(KEY, lease("a", resourceVersion="9", labels={"x": "y"}), 5.0) is False
+    assert book.observe(KEY, lease("a", resourceVersion="9", labels={"x": "y"}), 6.0) is False
     assert book.view(KEY, 6.0).unchanged == 6.0
 
 
@@ -35,6 +45,7 @@ def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
     book = LeaseBook()
     book.observe(KEY, lease("a"), 0.0)
     assert book.observe(KEY, None, 4.0) is False
+    book.observe(KEY, None, 5.0)
     assert book.view(KEY, 5.0).unchanged == 5.0
     assert book.observe(KEY, lease("a"), 6.0) is True
     assert book.view(KEY, 6.0).unchanged == 0.0
@@ -43,6 +54,7 @@ def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
 def test_a_holder_without_a_lease_counts_from_when_we_first_heard_of_it() -> None:
     book = LeaseBook()
     assert book.view(KEY, 7.0) == LeaseView(0.0, DEFAULT_DURATION, renewed=False)
+    book.observe(KEY, None, 9.0)
     assert book.view(KEY, 9.0).unchanged == 2.0
 
 

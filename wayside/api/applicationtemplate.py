@@ -53,6 +53,7 @@ class Merge(StrEnum):
 class Parameter(Model):
     """One input of the template."""
 
+    # That a required parameter has no default is said by the manager: to the CRD's CEL, `default` has no type.
     model_config = validations(
         ("!has(self.merge) || self.merge != 'Union' || self.type == 'array'", "merge Union needs type array"),
         (
@@ -64,10 +65,6 @@ class Parameter(Model):
             "minimum and maximum need type number or integer",
         ),
         ("!has(self.items) || self.type == 'array'", "items needs type array"),
-        (
-            "!has(self.required) || !self.required || !has(self.default)",
-            "a required parameter has no default: remove one of required and default",
-        ),
     )
 
     type: ParameterType = Field(description="The JSON type.")

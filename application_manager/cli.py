@@ -1,0 +1,130 @@
+"""The command line: `application-manager run` and `application-manager render`.
+
+Errors are one clear line on stderr, with exit code 2 for bad usage or input; `--debug` shows the trace.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from application_manager.client import ApiError, ConfigurationError
+from application_manager.offline import render_files
+from application_manager.policy import Policy
+from application_manager.service import Options, serve
+from wayside.api.base import Duration
+from wayside.api.documents import DocumentError
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Makes a cluster run what the live ApplicationTasks demand.",
+)
+
+BAD_INPUT = 2
+RESYNC = Duration("60s")
+TTL_AFTER_FINISHED = Duration("1h")
+
+AllowedKinds = Annotated[
+    list[str] | None,
+    typer.Option(help="A kind that templates may create, e.g. apps/v1/Deployment; repeatable. Replaces the default."),
+]
+ServiceAccounts = Annotated[
+    list[str] | None,
+    typer.Option(help="A service account that templates may use; repeatable. Default: only `default`, without token."),
+]
+Debug = Annotated[bool, typer.Option("--debug", help="Show traces of errors, and more in the log.")]
+
+
+def _duration(text: str) -> Duration:
+    try:
+        return Duration.parse(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
+    try:
+        return Policy.parse(kinds, accounts)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
+
+
+@app.command()
+def run(
+    namespace: Annotated[
+        list[str] | None, typer.Option(help="A namespace to look after; repeatable. Default: all.")
+    ] = None,
+    resync: Annotated[
+        Duration, typer.Option(parser=_duration, metavar="DURATION", help="How often everything is listed anew.")
+    ] = RESYNC,
+    ttl_after_finished: Annotated[
+        Duration, typer.Option(parser=_duration, metavar="DURATION", help="How long finished tasks are kept.")
+    ] = TTL_AFTER_FINISHED,
+    allowed_kinds: AllowedKinds = None,
+    service_accounts: ServiceAccounts = None,
+    debug: Debug = False,
+) -> None:
+    """Run the operator, in the cluster of the current kubeconfig or of the pod."""
+    level = logging.DEBUG if debug else logging.INFO
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s", stream=sys.stderr)
+    for noisy in ("asyncio", "aiohttp", "kopf"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    options = Options(
+        policy=_policy(allowed_kinds, service_accounts),
+        namespaces=tuple(namespace or ()),
+        resync=resync.seconds,
+        ttl_after_finished=ttl_after_finished.seconds,
+    )
+    try:
+        asyncio.run(serve(options))
+    except ConfigurationError as error:
+        _fail(str(error), BAD_INPUT, error, debug=debug)
+    except ApiError as error:
+        _fail(f"the API server refuses: {error}", 1, error, debug=debug)
+
+
+@app.command()
+def render(
+    templates: Annotated[list[Path], typer.Option(help="A file or folder of ApplicationTemplates; repeatable.")],
+    tasks: Annotated[list[Path], typer.Option(help="A file or folder of ApplicationTasks; repeatable.")],
+    allowed_kinds: AllowedKinds = None,
+    service_accounts: ServiceAccounts = None,
+    debug: Debug = False,
+) -> None:
+    """Print what would run, as YAML: merged instances and their manifests, without a cluster.
+
+    What is refused is said on stderr; then the exit code is 1.
+    """
+    policy = _policy(allowed_kinds, service_accounts)
+    try:
+        result = render_files([*templates, *tasks], policy)
+    except DocumentError as error:
+        _fail(str(error), BAD_INPUT, error, debug=debug)
+    sys.stdout.write(result.text)
+    for refusal in result.refusals:
+        typer.echo(refusal, err=True)
+    if result.refusals:
+        raise typer.Exit(1)
+
+
+def _fail(message: str, code: int, error: Exception, *, debug: bool) -> None:
+    if debug:
+        raise error
+    typer.echo(message, err=True)
+    raise typer.Exit(code) from None
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

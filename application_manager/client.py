@@ -1,0 +1,235 @@
+"""The API server, as the manager needs it: JSON objects in and out, over one shared client of kubernetes.aio.
+
+The generated model classes are left aside: they cost more time than the requests, and a manifest is JSON anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+from urllib.parse import urlencode
+
+import aiohttp
+import msgspec
+from kubernetes.aio.client import ApiClient, Configuration
+from kubernetes.aio.config import ConfigException, load_incluster_config, load_kube_config
+
+from application_manager.policy import KindKey
+
+Object = dict[str, Any]
+"""A Kubernetes object, as JSON."""
+
+FIELD_MANAGER = "wayside"
+_APPLY = "application/apply-patch+yaml"
+_MERGE = "application/merge-patch+json"
+_JSON = "application/json"
+# The package says that it is typed, yet these functions are not.
+_load_kube_config: Any = load_kube_config
+_load_incluster_config: Any = load_incluster_config
+_TIMEOUT = aiohttp.ClientTimeout(total=15)
+_BAD_MANIFEST = "failed to create typed patch object"
+
+
+class Unreachable(Exception):  # noqa: N818  a state of the world
+    """The API server gave no answer."""
+
+
+class ConfigurationError(Exception):
+    """There is no usable kubeconfig, or the cluster lacks what the manager needs."""
+
+
+class ApiError(Exception):
+    """The API server refused.
+
+    Attributes:
+        code: the HTTP status.
+        message: what the API server said.
+        retry_after: seconds that it asked us to wait; None where it did not say.
+        causes: the reasons of the causes, such as NamespaceTerminating.
+    """
+
+    def __init__(self, code: int, message: str, retry_after: float | None = None, causes: tuple[str, ...] = ()) -> None:
+        super().__init__(f"{message} (HTTP {code})")
+        self.code = code
+        self.message = message
+        self.retry_after = retry_after
+        self.causes = causes
+
+    @property
+    def permanent(self) -> bool:
+        """Whether asking the same again is in vain: a bad request, or a manifest of the wrong types (HTTP 500)."""
+        if self.code >= 500:
+            return _BAD_MANIFEST in self.message
+        return self.code not in (401, 408, 409, 429)
+
+    @property
+    def terminating(self) -> bool:
+        """Whether the namespace is going or gone."""
+        gone = self.code == 404 and self.message.startswith("namespaces ")
+        return gone or "NamespaceTerminating" in self.causes
+
+
+@dataclass(frozen=True, slots=True)
+class Resource:
+    """Where a kind lives."""
+
+    api_version: str
+    kind: str
+    plural: str
+    namespaced: bool = True
+
+    @property
+    def group(self) -> str:
+        """The API group, empty for the core group."""
+        return self.api_version.rpartition("/")[0]
+
+    @property
+    def version(self) -> str:
+        """The version within the group."""
+        return self.api_version.rpartition("/")[2]
+
+    def path(self, namespace: str | None, name: str = "", subresource: str = "") -> str:
+        """The path of the collection (over all namespaces for None), or of the object named."""
+        root = f"/apis/{self.api_version}" if self.group else f"/api/{self.api_version}"
+        scope = f"/namespaces/{namespace}" if self.namespaced and namespace else ""
+        return "/".join(part for part in (f"{root}{scope}/{self.plural}", name, subresource) if part)
+
+
+LEASES = Resource("coordination.k8s.io/v1", "Lease", "leases")
+EVENTS = Resource("events.k8s.io/v1", "Event", "events")
+
+
+async def load_configuration() -> Configuration:
+    """The kubeconfig (KUBECONFIG or the default file), or in a pod its service account.
+
+    Raises ConfigurationError where there is neither.
+    """
+    configuration = Configuration()
+    configuration.connection_pool_maxsize = 32
+    try:
+        await _load_kube_config(client_configuration=configuration)
+    except ConfigException as no_file:
+        try:
+            _load_incluster_config(client_configuration=configuration)
+        except ConfigException:
+            raise ConfigurationError(
+                f"no cluster: {no_file}; set KUBECONFIG to a kubeconfig file, or run in a pod"
+            ) from None
+    return configuration
+
+
+class Client:
+    """The verbs. Each raises ApiError where the API server refuses, and Unreachable where it does not answer."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self.configuration = configuration
+        self._api: Any = ApiClient(configuration)
+        self._decode = msgspec.json.Decoder().decode
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._api.close()
+
+    async def get(self, resource: Resource, namespace: str, name: str) -> Object | None:
+        """The object, or None."""
+        try:
+            return await self._request("GET", resource.path(namespace, name))
+        except ApiError as error:
+            if error.code == 404:
+                return None
+            raise
+
+    async def list(
+        self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", limit: int = 0
+    ) -> tuple[list[Object], str]:
+        """The objects, with apiVersion and kind, and the resourceVersion of the list; read from the storage itself."""
+        query = {"labelSelector": labels, "fieldSelector": fields, "limit": str(limit) if limit else ""}
+        answer = await self._request(
+            "GET", resource.path(namespace), {key: value for key, value in query.items() if value}
+        )
+        kind = {"apiVersion": resource.api_version, "kind": resource.kind}
+        return [{**kind, **item} for item in answer["items"]], answer["metadata"]["resourceVersion"]
+
+    async def apply(self, resource: Resource, manifest: Object) -> Object:
+        """Server-side apply, as the one field manager that we are."""
+        metadata = manifest["metadata"]
+        query = {"fieldManager": FIELD_MANAGER, "force": "true", "fieldValidation": "Strict"}
+        return await self._request(
+            "PATCH", resource.path(metadata["namespace"], metadata["name"]), query, manifest, _APPLY
+        )
+
+    async def patch_status(self, resource: Resource, namespace: str, name: str, uid: str, status: Object) -> Object:
+        """Merge into the status of the object with this uid; null removes a field."""
+        body = {"metadata": {"uid": uid}, "status": status}
+        query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
+        return await self._request("PATCH", resource.path(namespace, name, "status"), query, body, _MERGE)
+
+    async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> bool:
+        """Delete the object with this uid, and in the background what it owns. Returns whether it was there."""
+        options = {
+            "apiVersion": "v1",
+            "kind": "DeleteOptions",
+            "propagationPolicy": "Background",
+            "preconditions": {"uid": uid},
+        }
+        try:
+            await self._request("DELETE", resource.path(namespace, name), body=options)
+        except ApiError as error:
+            if error.code in (404, 409):  # gone, or another object of the same name
+                return False
+            raise
+        return True
+
+    async def create(self, resource: Resource, manifest: Object) -> Object:
+        """Create the object."""
+        return await self._request("POST", resource.path(manifest["metadata"]["namespace"]), body=manifest)
+
+    async def discover(self, api_version: str) -> dict[KindKey, Resource]:
+        """The kinds of a group and version; none where the cluster does not have it."""
+        root = f"/apis/{api_version}" if "/" in api_version else f"/api/{api_version}"
+        try:
+            answer = await self._request("GET", root)
+        except ApiError as error:
+            if error.code == 404:
+                return {}
+            raise
+        return {
+            (api_version, each["kind"]): Resource(api_version, each["kind"], each["name"], each["namespaced"])
+            for each in answer["resources"]
+            if "/" not in each["name"]
+        }
+
+    async def _request(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None = None,
+        body: Object | None = None,
+        content_type: str = _JSON,
+    ) -> Object:
+        headers = {"Accept": _JSON, "Content-Type": content_type, "User-Agent": "wayside-application-manager"}
+        token = await self.configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
+        if token:
+            headers["Authorization"] = token
+        url = self.configuration.host + path + (f"?{urlencode(query)}" if query else "")
+        try:
+            response = await self._api.rest_client.request(
+                method, url, headers=headers, body=body, _request_timeout=_TIMEOUT
+            )
+            raw = await response.read()
+        except (TimeoutError, aiohttp.ClientError, OSError) as error:
+            raise Unreachable(f"{method} {path}: {type(error).__name__} {error}".rstrip()) from error
+        if response.status >= 400:
+            raise self._error(response.status, raw, response.headers.get("Retry-After"))
+        return cast("Object", self._decode(raw))
+
+    def _error(self, code: int, raw: bytes, retry_after: str | None) -> ApiError:
+        seconds = float(retry_after) if retry_after and retry_after.isdigit() else None
+        try:
+            status = self._decode(raw)
+        except msgspec.DecodeError:
+            return ApiError(code, raw[:500].decode(errors="replace"), seconds)
+        details = status.get("details") or {}
+        causes = tuple(cause.get("reason", "") for cause in details.get("causes") or ())
+        return ApiError(code, str(status.get("message", "")), seconds, causes)

@@ -1,0 +1,69 @@
+"""Conditions that keep their time of transition, and the Kubernetes Events that follow from their changes. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from application_manager.times import format_time
+from wayside.api.base import Condition
+
+MAXIMUM_MESSAGE = 4096  # characters, as the CRDs allow
+
+
+@dataclass(frozen=True, slots=True)
+class Aspect:
+    """What a condition should say now."""
+
+    type: str
+    holds: bool
+    reason: str
+    message: str = ""
+
+    @property
+    def status(self) -> str:
+        """The condition's status."""
+        return "True" if self.holds else "False"
+
+
+def updated(
+    known: Iterable[Condition], aspects: Iterable[Aspect], generation: int, now: float
+) -> tuple[Condition, ...]:
+    """The conditions that say what the aspects say; one keeps its time of transition while its status stays.
+
+    Conditions of other types are kept. `now` is in seconds since 1970.
+    """
+    by_type = {each.type: each for each in known}
+    for aspect in aspects:
+        old = by_type.get(aspect.type)
+        kept = old is not None and old.status == aspect.status
+        by_type[aspect.type] = Condition(
+            type=aspect.type,
+            status=aspect.status,
+            reason=aspect.reason,
+            message=_cut(aspect.message),
+            observed_generation=generation,
+            last_transition_time=old.last_transition_time if old is not None and kept else format_time(now),
+        )
+    return tuple(by_type.values())
+
+
+def find(conditions: Iterable[Condition], type_: str) -> Condition | None:
+    """The condition of the type, or None."""
+    return next((each for each in conditions if each.type == type_), None)
+
+
+def holds(conditions: Iterable[Condition], type_: str) -> bool:
+    """Whether there is a condition of the type and it is True."""
+    condition = find(conditions, type_)
+    return condition is not None and condition.status == "True"
+
+
+def changed(old: Iterable[Condition], new: Iterable[Condition]) -> list[Condition]:
+    """The conditions whose status or reason changed: what is worth a Kubernetes Event."""
+    before = {each.type: (each.status, each.reason) for each in old}
+    return [each for each in new if before.get(each.type) != (each.status, each.reason)]
+
+
+def _cut(message: str) -> str:
+    return message if len(message) <= MAXIMUM_MESSAGE else message[: MAXIMUM_MESSAGE - 1] + "…"

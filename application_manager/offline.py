@@ -1,0 +1,90 @@
+"""What would run, from files alone: the same pure functions as in the cluster."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from application_manager.demand import Decision, Standing, demand
+from application_manager.policy import Policy
+from application_manager.rendering import Renderer, RenderError
+from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
+from wayside.api.applicationinstance import ApplicationInstanceSpec
+from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
+from wayside.api.documents import load_documents
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """What would run.
+
+    Attributes:
+        objects: the instances, each followed by its manifests.
+        refusals: what cannot be, one line each.
+    """
+
+    objects: list[dict[str, Any]] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """The objects as YAML documents."""
+        if not self.objects:
+            return ""
+        return yaml.safe_dump_all(self.objects, sort_keys=False, width=120, allow_unicode=True)
+
+
+def render_files(paths: Iterable[Path], policy: Policy) -> Rendered:
+    """What the templates and tasks in the files make run; other kinds are passed over.
+
+    Raises DocumentError for files that cannot be read as our kinds.
+    """
+    return render_objects([document.object for document in load_documents(paths)], policy, time.time())
+
+
+def render_objects(objects: Sequence[Kind], policy: Policy, now: float) -> Rendered:
+    """What the templates and tasks make run, namespace by namespace; `now` in seconds since 1970."""
+    result = Rendered()
+    for namespace in sorted({each.namespace for each in objects}):
+        here = [each for each in objects if each.namespace == namespace]
+        templates = {each.name: each for each in here if isinstance(each, ApplicationTemplate)}
+        tasks = [each for each in here if isinstance(each, ApplicationTask)]
+        outcome = demand(templates.values(), tasks, [], {}, now)
+        for name, verdict in sorted(outcome.verdicts.items()):
+            if verdict.standing is Standing.REFUSED:
+                result.refusals.append(f"ApplicationTask {namespace}/{name}: {verdict.reason}: {verdict.message}")
+        for decision in outcome.instances.values():
+            _render(decision, templates[decision.template], policy, result)
+    return result
+
+
+def instance_of(decision: Decision, namespace: str) -> ApplicationInstance:
+    """The instance that a decision wants, as it would be created."""
+    return ApplicationInstance(
+        metadata=Metadata(name=decision.name, namespace=namespace, labels={MANAGED_BY_LABEL: MANAGED_BY}),
+        spec=ApplicationInstanceSpec(
+            template=decision.template, key=decision.key, parameters=dict(decision.parameters or {})
+        ),
+    )
+
+
+def _render(decision: Decision, template: ApplicationTemplate, policy: Policy, result: Rendered) -> None:
+    instance = instance_of(decision, template.namespace)
+    result.objects.append(
+        {
+            "apiVersion": instance.api_version,
+            "kind": instance.kind,
+            "metadata": {"name": instance.name, "namespace": instance.namespace, "labels": instance.metadata.labels},
+            "spec": instance.spec.to_json(),
+        }
+    )
+    try:
+        result.objects.extend(Renderer(template, policy).render(instance).manifests)
+    except RenderError as error:
+        what = f"ApplicationTemplate {template.namespace}/{template.name}"
+        result.refusals.extend(f"{what}: {problem}" for problem in error.problems)

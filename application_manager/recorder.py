@@ -1,0 +1,129 @@
+"""Kubernetes Events: what happened to a task or an instance, for `kubectl describe` and `kubectl get events`.
+
+The reasons are a fixed list. An Event follows from a change of a condition, which is stored in the cluster, so neither
+a restart nor a resync tells the same again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import socket
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from application_manager.client import EVENTS, ApiError, Client, Unreachable
+from application_manager.times import format_time
+from wayside.api.base import Condition, Kind
+
+COMPONENT = "wayside.dev/application-manager"
+_WAITING = 1000  # Events that may wait; further ones are dropped and counted, since work goes before words
+_NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
+
+log = logging.getLogger(__name__)
+
+
+class Reason(StrEnum):
+    """All reasons that Events can have."""
+
+    ACCEPTED = "Accepted"
+    REFUSED = "Refused"
+    HOLDER_LOST = "HolderLost"
+    FINISHED = "Finished"
+    APPLIED = "Applied"
+    NOT_APPLIED = "NotApplied"
+    READY = "Ready"
+    NOT_READY = "NotReady"
+    LINGERING = "Lingering"
+    RELEASED = "Released"
+    TEMPLATE_INVALID = "TemplateInvalid"
+
+
+_OF_CONDITION = {
+    ("Accepted", "True"): Reason.ACCEPTED,
+    ("Accepted", "False"): Reason.REFUSED,
+    ("Applied", "True"): Reason.APPLIED,
+    ("Applied", "False"): Reason.NOT_APPLIED,
+    ("Ready", "True"): Reason.READY,
+    ("Ready", "False"): Reason.NOT_READY,
+    ("Finished", "True"): Reason.FINISHED,
+}
+_WARNINGS = frozenset({Reason.REFUSED, Reason.HOLDER_LOST, Reason.NOT_APPLIED, Reason.TEMPLATE_INVALID})
+_EXPECTED = frozenset({"Waiting", "NotApplied"})  # reasons of conditions that come with every start
+
+
+@dataclass(frozen=True, slots=True)
+class _Said:
+    regarding: Kind
+    reason: Reason
+    note: str
+    when: str
+
+
+class Recorder:
+    """Takes Events at once and posts them in the background."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._waiting: asyncio.Queue[_Said] = asyncio.Queue(_WAITING)
+        self._instance = f"{socket.gethostname()}-{os.getpid()}"[:128]
+        self.dropped = 0
+
+    def say(self, regarding: Kind, reason: Reason, note: str, now: float) -> None:
+        """Post an Event about the object; `now` in seconds since 1970."""
+        try:
+            self._waiting.put_nowait(_Said(regarding, reason, note, format_time(now)))
+        except asyncio.QueueFull:
+            self.dropped += 1
+
+    def transitions(self, regarding: Kind, changed: list[Condition], now: float) -> None:
+        """Post an Event for each condition that changed, if it is worth one."""
+        for each in changed:
+            reason = _OF_CONDITION.get((each.type, each.status))
+            if each.reason in (Reason.HOLDER_LOST, Reason.TEMPLATE_INVALID):
+                reason = Reason(each.reason)
+            if reason is None or (each.status == "False" and each.reason in _EXPECTED):
+                continue
+            if reason is Reason.NOT_READY and not each.message:
+                continue
+            self.say(regarding, reason, each.message, now)
+
+    async def run(self) -> None:
+        """Post until cancelled. An Event that cannot be posted is dropped."""
+        told = 0
+        while True:
+            said = await self._waiting.get()
+            try:
+                await self._client.create(EVENTS, self._manifest(said))
+            except ApiError as error:
+                if not error.terminating:
+                    log.warning("the Event %s about %s is lost: %s", said.reason, said.regarding.name, error)
+            except Unreachable:
+                self.dropped += 1
+            if self.dropped > told:
+                log.warning("%d Events were dropped so far: more than could be posted", self.dropped)
+                told = self.dropped
+
+    def _manifest(self, said: _Said) -> dict[str, Any]:
+        regarding = said.regarding
+        return {
+            "apiVersion": "events.k8s.io/v1",
+            "kind": "Event",
+            "metadata": {"generateName": f"{regarding.name}.", "namespace": regarding.namespace},
+            "eventTime": said.when.replace("Z", "000Z"),  # the API wants microseconds
+            "reportingController": COMPONENT,
+            "reportingInstance": self._instance,
+            "action": "Reconcile",
+            "reason": said.reason.value,
+            "type": "Warning" if said.reason in _WARNINGS else "Normal",
+            "note": said.note[:_NOTE_LENGTH],
+            "regarding": {
+                "apiVersion": regarding.api_version,
+                "kind": regarding.kind,
+                "namespace": regarding.namespace,
+                "name": regarding.name,
+                "uid": regarding.metadata.uid,
+            },
+        }

@@ -1,0 +1,159 @@
+"""What a piece of news means: it enters the world, and whatever depends on it is asked to be looked at again.
+
+News are watch events, answers to our own writes, and lists; all take the same way, and what is no news ends here.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from application_manager.apply import Applier
+from application_manager.client import Object
+from application_manager.leases import LEASE_PREFIX
+from application_manager.policy import KindKey
+from application_manager.readiness import not_ready
+from application_manager.rendering import INSTANCE_LABEL
+from application_manager.store import Entry, Name
+from application_manager.world import INSTANCE, LEASE, TASK, TEMPLATE, World
+from wayside.api import ApplicationInstance
+
+Ask = Callable[[Name], None]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Router:
+    """Takes news.
+
+    Attributes:
+        instance, task, template: ask for one of these to be reconciled.
+    """
+
+    world: World
+    applier: Applier
+    instance: Ask
+    task: Ask
+    template: Ask
+
+    def observe(self, raw: Object) -> None:
+        """Take an object as it was read."""
+        kind, name = _kind(raw), _name(raw)
+        if kind == LEASE:
+            self._lease(name, raw)
+            return
+        old = self.world.store.get(kind, name)
+        entry = self.world.store.put(raw)
+        if entry is None:
+            return
+        if old is not None and old.uid != entry.uid:
+            self.applier.forget(old.raw)
+        if kind == TASK:
+            self._task(name, entry)
+        elif kind == TEMPLATE:
+            self._template(name, old, entry)
+        elif kind == INSTANCE:
+            self._instance(name, old, entry)
+        else:
+            self._child(old, entry)
+
+    def vanished(self, raw: Object) -> None:
+        """Take the news that an object is gone."""
+        kind, name = _kind(raw), _name(raw)
+        if kind == LEASE:
+            self._lease(name, None)
+            return
+        entry = self.world.store.remove(raw)
+        if entry is None:
+            return
+        if kind == TASK:
+            self._ask_all(self.world.claims.forget(name))
+        elif kind == TEMPLATE:
+            self.world.forget_template(name)
+            self._claim_again(name)
+        elif kind == INSTANCE:
+            self.instance(name)
+            if isinstance(entry.model, ApplicationInstance):
+                self.template((name[0], entry.model.spec.template))
+        else:
+            self.applier.forget(raw)
+            self._ask_for_owner(raw)
+
+    def everything(self) -> None:
+        """Ask for all that there is."""
+        for name, _ in self.world.store.all(TEMPLATE):
+            self.template(name)
+        instances = {name for name, _ in self.world.store.all(INSTANCE)}
+        self._ask_all(instances | set(self.world.claims.instances()))
+        for name, _ in self.world.store.all(TASK):
+            self.task(name)
+
+    def _task(self, name: Name, entry: Entry) -> None:
+        of = entry.raw["spec"].get("template", "")
+        before = self.world.claims.claim(name)
+        touched = self.world.claims.note(name, entry, self.world.template((name[0], of)))
+        after = self.world.claims.claim(name)
+        # A task whose status alone changed, which is mostly our own doing, concerns no instance.
+        same = before is not None and after is not None and before.task.spec == after.task.spec
+        if not same or before is None or before.task.metadata.uid != entry.uid:
+            self._ask_all(touched)
+        self.task(name)
+
+    def _template(self, name: Name, old: Entry | None, entry: Entry) -> None:
+        self.template(name)
+        if old is None or old.uid != entry.uid or old.raw["spec"] != entry.raw["spec"]:
+            self._claim_again(name)
+
+    def _claim_again(self, template: Name) -> None:
+        """Ask all tasks of the template anew what they claim, and look at all its instances."""
+        touched = set(self.world.instances_of(template))
+        for name in self.world.claims.tasks_of(template):
+            entry = self.world.store.get(TASK, name)
+            if entry is not None:
+                touched |= self.world.claims.note(name, entry, self.world.template(template))
+                self.task(name)
+        self._ask_all(touched)
+
+    def _instance(self, name: Name, old: Entry | None, entry: Entry) -> None:
+        self.instance(name)
+        if (old is None or old.uid != entry.uid) and isinstance(entry.model, ApplicationInstance):
+            self.template((name[0], entry.model.spec.template))
+
+    def _child(self, old: Entry | None, entry: Entry) -> None:
+        self.applier.note(entry.raw)
+        if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
+            self._ask_for_owner(entry.raw)
+
+    def _significance(self, entry: Entry) -> tuple[str, bool, str | None]:
+        """What of an object matters to its instance; workloads change their status far more often."""
+        return entry.uid, "deletionTimestamp" in entry.raw["metadata"], not_ready(entry.raw)
+
+    def _ask_for_owner(self, raw: Object) -> None:
+        owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
+        if owner:
+            self.instance((raw["metadata"]["namespace"], owner))
+
+    def _lease(self, name: Name, raw: Object | None) -> None:
+        if not name[1].startswith(LEASE_PREFIX):
+            return
+        key = (name[0], name[1].removeprefix(LEASE_PREFIX))
+        at = self.world.healthy.elapsed
+        before = self.world.leases.view(key, at)
+        renewed = self.world.leases.observe(key, raw, at)
+        if renewed and (not before.renewed or before.unchanged >= before.duration):
+            log.info("holder %s/%s renews its Lease", *key)
+            self._ask_all(self.world.claims.holders().get(key, ()))
+
+    def _ask_all(self, instances: Iterable[Name]) -> None:
+        for name in instances:
+            self.instance(name)
+
+
+def _kind(raw: Object) -> KindKey:
+    return raw["apiVersion"], raw["kind"]
+
+
+def _name(raw: Object) -> Name:
+    return raw["metadata"]["namespace"], raw["metadata"]["name"]

@@ -1,0 +1,295 @@
+"""The running manager: everything wired together, started in order and stopped at once.
+
+The order matters: all objects are listed before anything is decided, so that nothing is stopped for want of knowing
+what demands it. Then the watches, the queues and the periodic looks run side by side; if one of them ends, all do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import time
+from collections.abc import Coroutine
+from dataclasses import dataclass, field
+
+import kopf
+
+from application_manager.apply import Applier
+from application_manager.client import LEASES, ApiError, Client, ConfigurationError, Resource, Unreachable
+from application_manager.client import load_configuration as load
+from application_manager.instances import InstanceWork
+from application_manager.leases import lease_name
+from application_manager.operator import watch
+from application_manager.policy import KindKey, Policy, kind_text
+from application_manager.recorder import Recorder
+from application_manager.rendering import INSTANCE_LABEL
+from application_manager.router import Router
+from application_manager.store import Name
+from application_manager.tasks import TaskWork
+from application_manager.templates import TemplateWork
+from application_manager.workqueue import WorkQueue
+from application_manager.world import INSTANCE, OWN_KINDS, TASK, TEMPLATE, World
+
+LOOK_EVERY = 1.0  # s between two looks at the API server's health and at Leases that seem to have lapsed
+FIRST_RESYNC = 3.0  # s after the watches began: what vanished between our first list and theirs
+_INSTANCE_WORKERS = 16
+_STATUS_WORKERS = 4
+_START_PAUSE = 1.0  # s between attempts to reach the API server at the start
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What the command line says.
+
+    Attributes:
+        policy: what templates may create.
+        namespaces: those to look at; empty: all.
+        resync: seconds between two full resyncs.
+        ttl_after_finished: seconds that finished tasks are kept.
+    """
+
+    policy: Policy = field(default_factory=Policy)
+    namespaces: tuple[str, ...] = ()
+    resync: float = 60.0
+    ttl_after_finished: float = 3600.0
+
+
+async def serve(options: Options) -> None:
+    """Run the manager until SIGTERM or SIGINT.
+
+    Raises:
+        ConfigurationError: there is no cluster, or it lacks our CRDs.
+        ApiError: the API server refuses what the manager needs, such as listing.
+    """
+    client = Client(await load())
+    try:
+        await Manager(client, options, await _discovered(client, options.policy)).run()
+    finally:
+        await client.close()
+
+
+class Manager:
+    """All parts of one manager."""
+
+    def __init__(self, client: Client, options: Options, resources: dict[KindKey, Resource]) -> None:
+        self._client = client
+        self._options = options
+        self._own = [resources[kind] for kind in OWN_KINDS]
+        self._children = [resources[kind] for kind in sorted(options.policy.kinds) if kind in resources]
+        self._world = World(options.policy)
+        self._recorder = Recorder(client)
+        applier = Applier(client, self._world.store, resources)
+        self._instances: WorkQueue[Name] = WorkQueue("instance", self._reconcile_instance, _INSTANCE_WORKERS)
+        self._tasks: WorkQueue[Name] = WorkQueue("task", self._reconcile_task, _STATUS_WORKERS)
+        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1)
+        self._router = Router(self._world, applier, self._instances.add, self._tasks.add, self._templates.add)
+        self._instance_work = InstanceWork(
+            world=self._world,
+            client=client,
+            applier=applier,
+            recorder=self._recorder,
+            instances=resources[INSTANCE],
+            tasks=resources[TASK],
+            again=self._instances.add_at,
+            task_changed=self._tasks.add,
+            observe=self._router.observe,
+        )
+        self._task_work = TaskWork(
+            world=self._world,
+            client=client,
+            recorder=self._recorder,
+            tasks=resources[TASK],
+            ttl=options.ttl_after_finished,
+            again=self._tasks.add_at,
+            observe=self._router.observe,
+        )
+        self._template_work = TemplateWork(
+            world=self._world,
+            client=client,
+            recorder=self._recorder,
+            templates=resources[TEMPLATE],
+            observe=self._router.observe,
+        )
+
+    async def run(self) -> None:
+        """Run until SIGTERM or SIGINT."""
+        stop = asyncio.Event()
+        watching = asyncio.Event()
+        _on_signals(stop)
+        if not await _until(stop, self._first_list()):
+            return
+        tasks = [
+            asyncio.create_task(self._watch(watching), name="watches"),
+            asyncio.create_task(self._instances.run(), name="instances"),
+            asyncio.create_task(self._tasks.run(), name="tasks"),
+            asyncio.create_task(self._templates.run(), name="templates"),
+            asyncio.create_task(self._recorder.run(), name="events"),
+            asyncio.create_task(self._look_at_leases(), name="leases"),
+            asyncio.create_task(self._resync(watching), name="resync"),
+            asyncio.create_task(self._announce(watching, stop), name="signals"),
+        ]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        for task in done:
+            task.result()
+        log.info("stopped")
+
+    async def _reconcile_instance(self, name: Name) -> None:
+        await self._instance_work.reconcile(name)
+
+    async def _reconcile_task(self, name: Name) -> None:
+        await self._task_work.reconcile(name)
+
+    async def _reconcile_template(self, name: Name) -> None:
+        await self._template_work.reconcile(name)
+
+    async def _announce(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
+        await watching.wait()
+        _on_signals(stop)  # kopf has put its own handlers in their place, which wait for tasks of ours
+        where = f"namespaces {', '.join(self._options.namespaces)}" if self._options.namespaces else "all namespaces"
+        log.info("watching %s", where)
+        await stop.wait()
+
+    async def _watch(self, watching: asyncio.Event) -> None:
+        await watch(
+            self._own,
+            self._children,
+            observe=self._router.observe,
+            vanished=self._router.vanished,
+            connect=self._connection,
+            namespaces=self._options.namespaces,
+            ready=watching,
+        )
+
+    async def _connection(self) -> kopf.ConnectionInfo:
+        configuration = self._client.configuration
+        token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
+        scheme, _, credentials = (token or "").partition(" ")
+        return kopf.ConnectionInfo(
+            server=configuration.host,
+            ca_path=configuration.ssl_ca_cert,
+            ca_data=None if configuration.ssl_ca_cert else configuration.ca_cert_data,
+            insecure=not configuration.verify_ssl,
+            scheme=scheme if credentials else None,
+            token=credentials or scheme or None,
+            certificate_path=configuration.cert_file,
+            private_key_path=configuration.key_file,
+        )
+
+    async def _first_list(self) -> None:
+        while True:
+            try:
+                await self._list_all()
+            except Unreachable as error:
+                log.warning("%s; again in %g s", error, _START_PAUSE)
+                await asyncio.sleep(_START_PAUSE)
+            else:
+                return
+
+    async def _list_all(self) -> None:
+        """List everything and take what is news; templates first, so that tasks find theirs."""
+        for resource in self._own:
+            await self._list(resource, "")
+        await asyncio.gather(*(self._list(resource, INSTANCE_LABEL) for resource in self._children))
+        self._router.everything()
+
+    async def _list(self, resource: Resource, labels: str) -> None:
+        for namespace in self._options.namespaces or (None,):
+            listed, version = await self._client.list(resource, namespace, labels=labels)
+            for raw in listed:
+                self._router.observe(raw)
+            kind = (resource.api_version, resource.kind)
+            for entry in self._world.store.missing(kind, listed, version, namespace):
+                self._router.vanished(entry.raw)
+
+    async def _resync(self, watching: asyncio.Event) -> None:
+        await watching.wait()
+        await asyncio.sleep(min(FIRST_RESYNC, self._options.resync))
+        while True:
+            began = time.monotonic()
+            try:
+                await self._list_all()
+            except (ApiError, Unreachable) as error:
+                log.warning("resync: %s", error)
+            self._world.leases.forget_except(self._world.claims.holders())
+            await asyncio.sleep(max(0.0, self._options.resync - (time.monotonic() - began)))
+
+    async def _look_at_leases(self) -> None:
+        """Measure the time in which we reach the API server, and read the Leases that seem to have lapsed."""
+        while True:
+            reached = await self._reached()
+            self._world.healthy.look(time.monotonic(), succeeded=reached)
+            if reached:
+                try:
+                    await self._read_due_leases()
+                except (ApiError, Unreachable) as error:
+                    log.warning("leases: %s", error)
+            await asyncio.sleep(LOOK_EVERY)
+
+    async def _reached(self) -> bool:
+        try:
+            await self._client.list(self._own[-1], next(iter(self._options.namespaces), None), limit=1)
+        except Unreachable:
+            return False
+        except ApiError as error:
+            return error.code < 500
+        return True
+
+    async def _read_due_leases(self) -> None:
+        at = self._world.healthy.elapsed
+        for (namespace, holder), instances in self._world.claims.holders().items():
+            if not self._world.leases.due((namespace, holder), at):
+                continue
+            raw = await self._client.get(LEASES, namespace, lease_name(holder))
+            self._world.leases.observe((namespace, holder), raw, self._world.healthy.elapsed)
+            for instance in instances:
+                self._instances.add(instance)
+
+
+async def _discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
+    """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and said."""
+    while True:
+        try:
+            found: dict[KindKey, Resource] = {}
+            for version in sorted({each[0] for each in (*OWN_KINDS, *policy.kinds)}):
+                found |= await client.discover(version)
+            break
+        except Unreachable as error:
+            log.warning("%s; again in %g s", error, _START_PAUSE)
+            await asyncio.sleep(_START_PAUSE)
+    lacking = [kind_text(kind) for kind in OWN_KINDS if kind not in found]
+    if lacking:
+        raise ConfigurationError(f"the cluster has no kind {', '.join(lacking)}: run kubectl apply -f crds/")
+    for kind in sorted(policy.kinds):
+        if kind not in found:
+            log.warning("the cluster has no kind %s: templates that use it fail", kind_text(kind))
+        elif not found[kind].namespaced:
+            raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
+    return found
+
+
+def _on_signals(stop: asyncio.Event) -> None:
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+
+
+async def _until(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
+    """Do the work unless told to stop; whether it was done."""
+    working = asyncio.create_task(work)
+    stopping = asyncio.create_task(stop.wait())
+    await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
+    stopping.cancel()
+    if not working.done():
+        working.cancel()
+        await asyncio.gather(working, return_exceptions=True)
+        return False
+    working.result()
+    return True

@@ -1,0 +1,145 @@
+"""Statuses: what the manager says of tasks, instances and templates. Pure.
+
+They are honest (Ready means that the workload is ready) and quiet: the same state gives the same status, so nothing is
+written that is not news.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from application_manager.conditions import Aspect, find, holds, updated
+from application_manager.demand import Decision, Standing, Verdict
+from application_manager.times import format_time, parse_time
+from wayside.api import ApplicationInstance, ApplicationTask
+from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
+from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase
+from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.api.base import Condition
+
+Json = dict[str, Any]
+
+_NAMES_SHOWN = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """What an instance has given to its tasks so far."""
+
+    instance: str
+    applied: bool
+    ready: bool
+    problem: str = ""
+
+
+def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None, now: float) -> ApplicationTaskStatus:
+    """The task's status; Applied and Ready stay True once they were. `service` is that of the verdict's instance."""
+    old = task.status or ApplicationTaskStatus()
+    finished = verdict.standing is Standing.FINISHED
+    aspects: list[Aspect] = []
+    if not finished:
+        accepted = verdict.standing is Standing.COUNTS
+        aspects.append(Aspect("Accepted", accepted, verdict.reason, verdict.message))
+        if find(old.conditions, "Finished") is not None:
+            aspects.append(Aspect("Finished", False, "HolderReturned", "the holder is back"))
+    else:
+        aspects.append(Aspect("Finished", True, verdict.reason, verdict.message))
+    if verdict.standing is Standing.COUNTS and service is not None:
+        aspects += [
+            _latched(old.conditions, "Applied", service.applied, "Applied", "NotApplied", service),
+            _latched(old.conditions, "Ready", service.ready, "Ready", "NotReady", service),
+        ]
+    conditions = updated(old.conditions, aspects, task.metadata.generation, now)
+    instance = old.instance if finished else verdict.instance
+    return ApplicationTaskStatus(
+        phase=_task_phase(verdict, service),
+        instance=instance,
+        observed_generation=task.metadata.generation,
+        conditions=list(conditions),
+    )
+
+
+def finished_since(task: ApplicationTask) -> float | None:
+    """When the task's status began to say that it is finished, in seconds since 1970; None where it does not."""
+    condition = find(task.status.conditions, "Finished") if task.status else None
+    return parse_time(condition.last_transition_time) if condition and condition.status == "True" else None
+
+
+def _latched(
+    known: Sequence[Condition], type_: str, now_holds: bool, reason: str, otherwise: str, service: Service
+) -> Aspect:
+    if now_holds or holds(known, type_):
+        return Aspect(type_, True, reason, f"instance {service.instance} was {type_.lower()}")
+    return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {type_.lower()} yet")
+
+
+def _task_phase(verdict: Verdict, service: Service | None) -> TaskPhase:
+    match verdict.standing:
+        case Standing.FINISHED:
+            return TaskPhase.FINISHED
+        case Standing.REFUSED:
+            return TaskPhase.REFUSED
+        case Standing.LAPSED:
+            return TaskPhase.LAPSED
+    if service is None or not service.applied:
+        return TaskPhase.PENDING
+    return TaskPhase.READY if service.ready else TaskPhase.ACTIVE
+
+
+def instance_status(
+    instance: ApplicationInstance,
+    decision: Decision,
+    applied: Aspect,
+    ready: Aspect,
+    objects: Iterable[ObjectReference],
+    spec_hash: str | None,
+    now: float,
+) -> ApplicationInstanceStatus:
+    """The instance's status. `applied` and `ready` are its conditions, `spec_hash` that of what was last applied."""
+    old = instance.status or ApplicationInstanceStatus()
+    lingering = decision.release_time is not None
+    if lingering:
+        phase = InstancePhase.LINGERING
+    elif not applied.holds:
+        phase = InstancePhase.FAILED if applied.reason != "Waiting" else InstancePhase.PENDING
+    else:
+        phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
+    generation = instance.metadata.generation
+    return ApplicationInstanceStatus(
+        phase=phase,
+        observed_generation=generation,
+        spec_hash=spec_hash,
+        release_time=None if decision.release_time is None else format_time(decision.release_time),
+        objects=list(objects),
+        demands=demands(decision),
+        conditions=list(updated(old.conditions, (applied, ready), generation, now)),
+    )
+
+
+def demands(decision: Decision) -> Demands:
+    """How many tasks the instance serves, and the first of them."""
+    return Demands(count=len(decision.tasks), names=list(decision.tasks[:_NAMES_SHOWN]))
+
+
+def template_status(
+    old: ApplicationTemplateStatus, generation: int, problems: Sequence[str], instances: int, now: float
+) -> ApplicationTemplateStatus:
+    """The template's status, with why it cannot be rendered, if it cannot."""
+    if problems:
+        accepted = Aspect("Accepted", False, "TemplateInvalid", "; ".join(problems))
+    else:
+        accepted = Aspect("Accepted", True, "Accepted", "the template can be rendered")
+    return ApplicationTemplateStatus(
+        observed_generation=generation,
+        instances=instances,
+        conditions=list(updated(old.conditions, (accepted,), generation, now)),
+    )
+
+
+def difference(old: Json, new: Json) -> Json:
+    """The JSON merge patch that makes `old` of `new`, on the first level: empty where they are equal."""
+    patch: Json = {key: value for key, value in new.items() if old.get(key) != value}
+    patch |= {key: None for key in old if key not in new}
+    return patch

@@ -1,0 +1,87 @@
+"""Reconciling one task: its status, and its deletion some time after it has finished."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from application_manager import conditions
+from application_manager.client import ApiError, Client, Object, Resource
+from application_manager.demand import Standing, Verdict
+from application_manager.recorder import Recorder
+from application_manager.status import Service, difference, finished_since, task_status
+from application_manager.store import Name
+from application_manager.world import World
+from wayside.api.applicationtask import ApplicationTaskStatus
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TaskWork:
+    """Says what became of tasks.
+
+    Attributes:
+        tasks: where ApplicationTasks live.
+        ttl: seconds that a finished task is kept.
+        again: asks for a task at a time, in seconds since 1970.
+        observe: takes an object that was read.
+    """
+
+    world: World
+    client: Client
+    recorder: Recorder
+    tasks: Resource
+    ttl: float
+    again: Callable[[Name, float], None]
+    observe: Callable[[Object], None]
+
+    async def reconcile(self, name: Name) -> None:
+        """Write the task's status if it is news; delete the task when its time has come.
+
+        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        """
+        task = self.world.task(name)
+        known = self._verdict(name)
+        if task is None or known is None or task.metadata.deletion_timestamp is not None:
+            return
+        verdict, service = known
+        now = time.time()
+        old = task.status or ApplicationTaskStatus()
+        new = task_status(task, verdict, service, now)
+        patch = difference(old.to_json() if task.status else {}, new.to_json())
+        try:
+            if patch:
+                uid = task.metadata.uid
+                self.observe(await self.client.patch_status(self.tasks, name[0], name[1], uid, patch))
+                self.recorder.transitions(task, conditions.changed(old.conditions, new.conditions), now)
+            if verdict.standing is Standing.FINISHED:
+                await self._expire(name)
+        except ApiError as error:
+            if error.terminating or error.code == 404:  # the task or its namespace is gone
+                return
+            raise
+
+    def _verdict(self, name: Name) -> tuple[Verdict, Service | None] | None:
+        """What became of the task; None where its instance was not looked at yet."""
+        verdict = self.world.claims.verdict(name)
+        if verdict is not None:
+            return verdict, None
+        claimed = self.world.claims.claim(name)
+        served = self.world.served.get((name[0], claimed.instance)) if claimed is not None else None
+        if served is None or name[1] not in served.verdicts:
+            return None
+        return served.verdicts[name[1]], served.service
+
+    async def _expire(self, name: Name) -> None:
+        task = self.world.task(name)
+        since = finished_since(task) if task is not None else None
+        if task is None or since is None:
+            return
+        if time.time() < since + self.ttl:
+            self.again(name, since + self.ttl)
+            return
+        await self.client.delete(self.tasks, name[0], name[1], task.metadata.uid)
+        log.info("task %s/%s: deleted, %g s after it finished", *name, self.ttl)

@@ -1,0 +1,69 @@
+"""Reconciling one template: whether it can be rendered, and how many instances it has."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from application_manager import conditions
+from application_manager.claims import InvalidTemplate
+from application_manager.client import ApiError, Client, Object, Resource
+from application_manager.recorder import Recorder
+from application_manager.rendering import RenderError
+from application_manager.status import difference, template_status
+from application_manager.store import Name
+from application_manager.world import TEMPLATE, World
+from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.api.base import Kind, Metadata
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateWork:
+    """Says how templates are.
+
+    Attributes:
+        templates: where ApplicationTemplates live.
+        observe: takes an object that was read.
+    """
+
+    world: World
+    client: Client
+    recorder: Recorder
+    templates: Resource
+    observe: Callable[[Object], None]
+
+    async def reconcile(self, name: Name) -> None:
+        """Write the template's status if it is news.
+
+        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        """
+        entry = self.world.store.get(TEMPLATE, name)
+        if entry is None:
+            return
+        metadata = Metadata.model_validate(entry.raw["metadata"])
+        now = time.time()
+        old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
+        new = template_status(old, metadata.generation, self._problems(name), len(self.world.instances_of(name)), now)
+        patch = difference(old.to_json() if entry.raw.get("status") else {}, new.to_json())
+        if not patch:
+            return
+        try:
+            self.observe(await self.client.patch_status(self.templates, name[0], name[1], metadata.uid, patch))
+        except ApiError as error:
+            if error.terminating or error.code == 404:
+                return
+            raise
+        about = Kind(kind=self.templates.kind, metadata=metadata)
+        self.recorder.transitions(about, conditions.changed(old.conditions, new.conditions), now)
+
+    def _problems(self, name: Name) -> tuple[str, ...]:
+        template = self.world.template(name)
+        if isinstance(template, InvalidTemplate):
+            return (template.problem,)
+        try:
+            if template is not None:
+                self.world.renderer(template)
+        except RenderError as error:
+            return error.problems
+        return ()

@@ -1,0 +1,119 @@
+"""Keys to reconcile: each at most once at a time, several at once, again after a failure.
+
+A key that is asked for while it waits is not added again; asked for while it runs, it runs once more afterwards. So
+there are never more entries than objects, and the queue needs no other bound. A failure is tried again after a growing,
+jittered pause, or after what the API server asks for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Hashable
+from typing import Generic, TypeVar
+
+from application_manager.client import ApiError, Unreachable
+
+Key = TypeVar("Key", bound=Hashable)
+
+FIRST_PAUSE = 0.2  # s, doubled with every failure of the key
+LONGEST_PAUSE = 10.0  # s
+_SHORTEST_DELAY = 0.1  # s, so that a time that is nearly there does not spin
+
+log = logging.getLogger(__name__)
+
+
+class WorkQueue(Generic[Key]):
+    """Runs `work(key)` for every key asked for, on `concurrency` workers."""
+
+    def __init__(self, name: str, work: Callable[[Key], Awaitable[None]], concurrency: int) -> None:
+        self.name = name
+        self._work = work
+        self._concurrency = concurrency
+        self._waiting: deque[Key] = deque()
+        self._queued: set[Key] = set()
+        self._running: set[Key] = set()
+        self._again: set[Key] = set()
+        self._failures: dict[Key, int] = {}
+        self._timers: dict[Key, asyncio.TimerHandle] = {}
+        self._wake = asyncio.Event()
+
+    def add(self, key: Key) -> None:
+        """Ask for the key to be worked on soon."""
+        if key in self._running:
+            self._again.add(key)
+        elif key not in self._queued:
+            self._queued.add(key)
+            self._waiting.append(key)
+            self._wake.set()
+
+    def add_at(self, key: Key, when: float) -> None:
+        """Ask for the key at `when`, in seconds since 1970; the earliest time asked for counts."""
+        self._add_after(key, max(_SHORTEST_DELAY, when - time.time()))
+
+    def _add_after(self, key: Key, delay: float) -> None:
+        loop = asyncio.get_running_loop()
+        known = self._timers.get(key)
+        if known is not None:
+            if known.when() <= loop.time() + delay:
+                return
+            known.cancel()
+        self._timers[key] = loop.call_later(delay, self._fire, key)
+
+    def _fire(self, key: Key) -> None:
+        self._timers.pop(key, None)
+        self.add(key)
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                for index in range(self._concurrency):
+                    group.create_task(self._worker(), name=f"{self.name} worker {index}")
+        finally:
+            for timer in self._timers.values():
+                timer.cancel()
+            self._timers.clear()
+
+    async def _worker(self) -> None:
+        while True:
+            while not self._waiting:
+                self._wake.clear()
+                await self._wake.wait()
+            key = self._waiting.popleft()
+            self._queued.discard(key)
+            self._running.add(key)
+            try:
+                await self._once(key)
+            finally:
+                self._running.discard(key)
+            if key in self._again:
+                self._again.discard(key)
+                self.add(key)
+
+    async def _once(self, key: Key) -> None:
+        try:
+            await self._work(key)
+        except (ApiError, Unreachable) as error:
+            pause = self._pause(key, error.retry_after if isinstance(error, ApiError) else None)
+            log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
+            self._add_after(key, pause)
+        except Exception:  # a defect in one key's work must not stop the others; it is logged, and tried again
+            pause = self._pause(key, None)
+            log.exception("%s %s failed; again in %.1f s", self.name, _text(key), pause)
+            self._add_after(key, pause)
+        else:
+            self._failures.pop(key, None)
+
+    def _pause(self, key: Key, asked: float | None) -> float:
+        failures = self._failures.get(key, 0)
+        self._failures[key] = failures + 1
+        pause: float = min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** min(failures, 10))
+        return max(asked or 0.0, pause * random.uniform(0.7, 1.3))  # noqa: S311  jitter, not a secret
+
+
+def _text(key: object) -> str:
+    return "/".join(map(str, key)) if isinstance(key, tuple) else str(key)

@@ -1,0 +1,102 @@
+"""What the manager knows, in one place: the store, the index of claims, the Leases, and the compiled templates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Final
+
+from application_manager.claimbook import ClaimBook
+from application_manager.claims import InvalidTemplate
+from application_manager.demand import Verdict
+from application_manager.leases import HealthyTime, LeaseBook, LeaseView
+from application_manager.policy import KindKey, Policy
+from application_manager.rendering import Renderer, RenderError
+from application_manager.status import Service
+from application_manager.store import Name, Store
+from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate
+
+TEMPLATE: Final[KindKey] = (API_VERSION, "ApplicationTemplate")
+TASK: Final[KindKey] = (API_VERSION, "ApplicationTask")
+INSTANCE: Final[KindKey] = (API_VERSION, "ApplicationInstance")
+OWN_KINDS: Final = (TEMPLATE, INSTANCE, TASK)
+LEASE: Final[KindKey] = ("coordination.k8s.io/v1", "Lease")
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """What was last decided of an instance, and what it has given since."""
+
+    verdicts: dict[str, Verdict]
+    service: Service
+
+
+@dataclass
+class World:
+    """All that is known; only the event loop's thread touches it.
+
+    Attributes:
+        served: by instance; empty until it was reconciled for the first time.
+    """
+
+    policy: Policy
+    store: Store = field(default_factory=lambda: Store(OWN_KINDS))
+    claims: ClaimBook = field(default_factory=ClaimBook)
+    leases: LeaseBook = field(default_factory=LeaseBook)
+    healthy: HealthyTime = field(default_factory=HealthyTime)
+    served: dict[Name, Served] = field(default_factory=dict)
+    _renderers: dict[Name, tuple[tuple[str, int], Renderer | RenderError]] = field(default_factory=dict)
+
+    def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:
+        """The template, also where it is not valid; None where there is none."""
+        entry = self.store.get(TEMPLATE, name)
+        if entry is None:
+            return None
+        return entry.model if isinstance(entry.model, ApplicationTemplate) else InvalidTemplate(name[1], entry.problem)
+
+    def instance(self, name: Name) -> ApplicationInstance | None:
+        """The instance, or None."""
+        entry = self.store.get(INSTANCE, name)
+        return entry.model if entry is not None and isinstance(entry.model, ApplicationInstance) else None
+
+    def task(self, name: Name) -> ApplicationTask | None:
+        """The task, or None where there is none, or none that is valid."""
+        entry = self.store.get(TASK, name)
+        return entry.model if entry is not None and isinstance(entry.model, ApplicationTask) else None
+
+    def instances_of(self, template: Name) -> list[Name]:
+        """The instances of a template."""
+        return [
+            name
+            for name, entry in self.store.all(INSTANCE)
+            if name[0] == template[0]
+            and isinstance(entry.model, ApplicationInstance)
+            and entry.model.spec.template == template[1]
+        ]
+
+    def lease_views(self, namespace: str, holders: Iterable[str | None]) -> dict[str, LeaseView]:
+        """The Leases of the holders, by holder."""
+        at = self.healthy.elapsed
+        return {each: self.leases.view((namespace, each), at) for each in set(holders) if each is not None}
+
+    def renderer(self, template: ApplicationTemplate) -> Renderer:
+        """The template, compiled once for each generation. Raises RenderError where it cannot be."""
+        name = (template.namespace, template.name)
+        version = (template.metadata.uid, template.metadata.generation)
+        known = self._renderers.get(name)
+        if known is None or known[0] != version:
+            known = (version, self._compiled(template))
+            self._renderers[name] = known
+        if isinstance(known[1], RenderError):
+            raise known[1]
+        return known[1]
+
+    def _compiled(self, template: ApplicationTemplate) -> Renderer | RenderError:
+        try:
+            return Renderer(template, self.policy)
+        except RenderError as error:
+            return error
+
+    def forget_template(self, name: Name) -> None:
+        """Drop the compiled template."""
+        self._renderers.pop(name, None)
