@@ -115,7 +115,7 @@ def test_what_an_application_instance_owns_goes_with_it(api: Api) -> None:
 
 
 def test_a_deleted_namespace_takes_everything_with_it(api: Api) -> None:
-    api.create(configmap("inside"))  # no pods: the namespace controller lets them pass 5 s
+    api.create(configmap("inside"))  # Takes 5 s: the controller waits for admission that lags.
     api.delete("Namespace", api.namespace)
     api.wait_gone("Namespace", api.namespace)
 

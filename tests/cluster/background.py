@@ -1,0 +1,66 @@
+"""An event loop in a thread of its own, as the detector has one beside its engine; the test is the engine."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncGenerator, Coroutine, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from detector.cluster.api import Api
+from detector.cluster.connection import connect
+
+Result = TypeVar("Result")
+
+PATIENCE = 20.0  # s
+
+
+class Background:
+    """Runs coroutines with one connection to the API server."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, api: Api):
+        self.loop = loop
+        self.api = api
+
+    def start(self, work: Coroutine[object, object, Result]) -> Future[Result]:
+        """Run it beside the test."""
+        return asyncio.run_coroutine_threadsafe(work, self.loop)
+
+    def call(self, work: Coroutine[object, object, Result]) -> Result:
+        """Run it and return what it returns."""
+        return self.start(work).result(PATIENCE)
+
+
+@contextmanager
+def background(kubeconfig: Path) -> Iterator[Background]:
+    """Start a loop; at the end whatever still runs in it is cancelled."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, name="background")
+    thread.start()
+    connection = _connection(kubeconfig)
+    try:
+        api = asyncio.run_coroutine_threadsafe(anext(connection), loop).result(PATIENCE)
+        try:
+            yield Background(loop, api)
+        finally:
+            asyncio.run_coroutine_threadsafe(_cancel_others(), loop).result(PATIENCE)
+            asyncio.run_coroutine_threadsafe(connection.aclose(), loop).result(PATIENCE)
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+async def _connection(kubeconfig: Path) -> AsyncGenerator[Api, None]:
+    async with connect(kubeconfig=kubeconfig) as cluster:
+        yield cluster.api
+
+
+async def _cancel_others() -> None:
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)

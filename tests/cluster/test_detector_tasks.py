@@ -1,0 +1,314 @@
+"""The tasks in the API server are what is demanded, whatever happens in between."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from detector.actions.deploy import DemandReconciler, DeployCounts
+from detector.actions.kubernetes_store import KubernetesTaskStore
+from detector.actions.stores import TaskExistsError, manifest, restore
+from detector.engine.demands import Demand, to_task
+from tests.cluster.api import Api, Object, Objects
+from tests.cluster.background import PATIENCE, Background, background
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.waiting import wait_until
+
+SECOND = 10**9
+START = 1_767_225_600 * SECOND + 123_456_789
+HOLDER = "intersection-a"
+
+
+def demand(namespace: str, subject: str = "car1+car2", **changes: Any) -> Demand:
+    made = Demand(
+        rule="lidar-vehicles-close",
+        action="record",
+        template="scene-recorder",
+        priority=0,
+        parameters={"vehicles": subject.split("+"), "rateHz": 10.0, "grid": {"cells": [1.5, None], "frame": "map"}},
+        detector="intersection-a",
+        holder=HOLDER,
+        namespace=namespace,
+        subject=subject,
+        subjects=tuple(subject.split("+")),
+        episode=f"episode-{subject}",
+        onset_time=START - 2 * SECOND,
+        start_time=START,
+        classification={"overarchingPurpose": ["Safety"]},
+        values={"distance": 149.0, "a": {"client": "car1"}},
+        rule_digest="0123456789abcdef",
+    )
+    return dataclasses.replace(made, **changes)
+
+
+def by_name(*demands: Demand) -> dict[str, Demand]:
+    return {each.name: each for each in demands}
+
+
+class Running:
+    """A reconciler that runs in the background."""
+
+    def __init__(self, loop: Background, namespace: str, holder: str, resync: float):
+        self._loop = loop
+        self.store = KubernetesTaskStore(loop.api, namespace, holder, resync)
+        self.reconciler = loop.call(self._make())
+        self._future = loop.start(self.reconciler.run())
+
+    async def _make(self) -> DemandReconciler:
+        return DemandReconciler(self.store)
+
+    @property
+    def counts(self) -> DeployCounts:
+        return self.reconciler.counts
+
+    def update(self, demands: Mapping[str, Demand], ended: Mapping[str, int] | None = None) -> None:
+        self.reconciler.update(demands, ended or {})
+
+    def restored(self) -> list[Demand]:
+        return self._loop.call(restore(self.store))
+
+    def stop(self, deadline: float = 3.0) -> None:
+        self._loop.loop.call_soon_threadsafe(self.reconciler.stop, deadline)
+        self._future.result(PATIENCE)
+
+
+@contextmanager
+def reconciling(kubeconfig: Path, namespace: str, holder: str = HOLDER, resync: float = 30.0) -> Iterator[Running]:
+    with background(kubeconfig) as loop:
+        running = Running(loop, namespace, holder, resync)
+        yield running
+        running.stop()
+
+
+@pytest.fixture
+def running(control_plane: ControlPlane, namespace: str) -> Iterator[Running]:
+    with reconciling(control_plane.kubeconfig, namespace) as started:
+        yield started
+
+
+def tasks_are(api: Api, live: set[str], ended: set[str] | None = None) -> Objects:
+    def holds(found: Objects) -> bool:
+        names = {
+            is_live: {each["metadata"]["name"] for each in found if is_ended(each) != is_live}
+            for is_live in (True, False)
+        }
+        return names[True] == live and names[False] == (ended or set())
+
+    return api.wait_list("ApplicationTask", holds, what=f"live tasks {live}, ended tasks {ended or set()}")
+
+
+def is_ended(task: Object) -> bool:
+    return "endTime" in task["spec"]
+
+
+def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, running: Running) -> None:
+    wanted = demand(namespace)
+    running.update(by_name(wanted))
+    [task] = tasks_are(api, {wanted.name})
+    assert task["spec"] == manifest(to_task(wanted))["spec"]
+    assert task["metadata"]["labels"] == {"wayside.dev/holder": HOLDER}
+    assert running.restored() == [wanted]
+
+    running.update({}, {wanted.name: START + 7 * SECOND + 1})
+    [task] = tasks_are(api, set(), {wanted.name})
+    assert task["spec"]["endTime"] == "2026-01-01T00:00:07.123456790Z"
+    assert running.restored() == []
+    assert running.counts == DeployCounts(created=1, ended=1)
+
+
+def test_changed_parameters_are_patched_and_removed_ones_go(api: Api, namespace: str, running: Running) -> None:
+    wanted = demand(namespace)
+    running.update(by_name(wanted))
+    [before] = tasks_are(api, {wanted.name})
+    changed = dataclasses.replace(wanted, parameters={"grid": {"cells": []}, "rateHz": 5.0, "gone": None})
+    running.update(by_name(changed))
+    after = api.wait_for(
+        "ApplicationTask",
+        wanted.name,
+        lambda task: task["spec"]["parameters"] == {"grid": {"cells": []}, "rateHz": 5},
+        what="the parameters are those of the new demand",
+    )
+    assert after["metadata"]["uid"] == before["metadata"]["uid"]
+    assert running.counts == DeployCounts(created=1, patched=1)
+
+
+def test_what_cannot_be_changed_is_made_anew_under_the_same_name(api: Api, namespace: str, running: Running) -> None:
+    wanted = demand(namespace)
+    running.update(by_name(wanted))
+    [before] = tasks_are(api, {wanted.name})
+    running.update(by_name(dataclasses.replace(wanted, template="other-recorder")))
+    after = api.wait_for(
+        "ApplicationTask",
+        wanted.name,
+        lambda task: task["spec"]["template"] == "other-recorder",
+        what="the task is for the new template",
+    )
+    assert after["metadata"]["uid"] != before["metadata"]["uid"]
+
+
+def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, running: Running) -> None:
+    wanted = demand(namespace)
+    running.update(by_name(wanted))
+    [before] = tasks_are(api, {wanted.name})
+    api.delete("ApplicationTask", wanted.name)
+    api.wait_for(
+        "ApplicationTask",
+        wanted.name,
+        lambda task: task["metadata"]["uid"] != before["metadata"]["uid"],
+        timeout=3,  # by the watch, not by the resync
+        what="the task is there again",
+    )
+    wait_until(lambda: running.counts, lambda counts: counts.recreated == 1, timeout=3, what="counted as created again")
+
+
+def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: Running) -> None:
+    wanted, other = demand(namespace), demand(namespace, "car3+car4")
+    running.update(by_name(wanted))
+    tasks_are(api, {wanted.name})
+    api.patch("ApplicationTask", wanted.name, {"spec": {"endTime": "2026-01-01T00:00:01Z"}})
+    running.update(by_name(wanted, other))
+    tasks_are(api, {other.name}, {wanted.name})
+    running.update({}, {wanted.name: START + 9 * SECOND, other.name: START + 9 * SECOND})
+    tasks_are(api, set(), {wanted.name, other.name})
+    assert api.get("ApplicationTask", wanted.name)["spec"]["endTime"] == "2026-01-01T00:00:01Z"
+    assert not running.counts.refused
+
+
+def test_an_outage_delays_starts_and_ends_and_loses_none(
+    control_plane: ControlPlane, api: Api, namespace: str, running: Running
+) -> None:
+    stays, ends, starts, passes = (demand(namespace, subject) for subject in ("a+b", "c+d", "e+f", "g+h"))
+    running.update(by_name(stays, ends))
+    before = tasks_are(api, {stays.name, ends.name})
+    with control_plane.outage():
+        running.update(by_name(stays, passes), {ends.name: START + SECOND})
+        wait_until(lambda: running.counts, lambda c: c.retried > 0, timeout=10, what="the outage was met")
+        running.update(by_name(stays, starts), {passes.name: START + 2 * SECOND})
+    after = tasks_are(api, {stays.name, starts.name}, {ends.name})
+    versions = {task["metadata"]["name"]: task["metadata"]["resourceVersion"] for task in before}
+    for task in after:
+        if task["metadata"]["name"] == stays.name:
+            assert task["metadata"]["resourceVersion"] == versions[stays.name]
+        if task["metadata"]["name"] == ends.name:
+            assert task["spec"]["endTime"] == "2026-01-01T00:00:01.123456789Z"
+
+
+def test_an_end_that_a_stopped_detector_could_not_tell_is_told_by_the_next(
+    control_plane: ControlPlane, api: Api, namespace: str
+) -> None:
+    wanted = demand(namespace)
+    with background(control_plane.kubeconfig) as loop:
+        first = Running(loop, namespace, HOLDER, 30.0)
+        first.update(by_name(wanted))
+        tasks_are(api, {wanted.name})
+        with control_plane.outage():
+            first.update({}, {wanted.name: START + SECOND})
+            first.stop(deadline=0.2)
+        [task] = tasks_are(api, {wanted.name})
+        second = Running(loop, namespace, HOLDER, 30.0)
+        assert second.restored() == [wanted]
+        assert not is_ended(api.get("ApplicationTask", wanted.name)), "nothing is ended before the engine has spoken"
+        second.update({}, {wanted.name: START + 5 * SECOND})
+        [ended] = tasks_are(api, set(), {wanted.name})
+        second.stop()
+    assert ended["metadata"]["uid"] == task["metadata"]["uid"]
+    assert ended["spec"]["endTime"] == "2026-01-01T00:00:05.123456789Z"
+
+
+def test_a_detector_that_stops_leaves_its_live_tasks_alive_and_adopts_them(
+    control_plane: ControlPlane, api: Api, namespace: str
+) -> None:
+    wanted, late = demand(namespace), demand(namespace, "car3+car4")
+    with reconciling(control_plane.kubeconfig, namespace) as first:
+        first.update(by_name(wanted))
+        tasks_are(api, {wanted.name})
+        first.update(by_name(wanted, late))  # and at once stopped: what is due is still done
+    before = tasks_are(api, {wanted.name, late.name})
+    with reconciling(control_plane.kubeconfig, namespace) as second:
+        restored = second.restored()
+        assert sorted(each.name for each in restored) == sorted([wanted.name, late.name])
+        another = demand(namespace, "car5+car6")
+        second.update(by_name(*restored, another))
+        tasks_are(api, {wanted.name, late.name, another.name})
+        assert second.counts == DeployCounts(created=1)
+    for task in before:
+        assert api.get("ApplicationTask", task["metadata"]["name"]) == task
+
+
+def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: str, running: Running) -> None:
+    wanted = demand(namespace)
+    foreign = demand(namespace, "x+y", holder="intersection-b")
+    usurped = manifest(to_task(wanted))
+    usurped["metadata"]["labels"] = {"wayside.dev/holder": "intersection-b"}
+    usurped["spec"]["requester"]["holder"] = "intersection-b"
+    disguised = manifest(to_task(foreign))  # the label says ours, the requester does not
+    disguised["metadata"]["labels"] = {"wayside.dev/holder": HOLDER}
+    persons = {
+        "apiVersion": "wayside.dev/v1alpha1",
+        "kind": "ApplicationTask",
+        "metadata": {"name": "mine", "labels": {"wayside.dev/holder": HOLDER}},
+        "spec": {"template": "scene-recorder"},
+    }
+    before = [api.create(each) for each in (usurped, disguised, persons)]
+    other = demand(namespace, "car3+car4")
+    running.update(by_name(wanted, other))
+    tasks_are(api, {wanted.name, foreign.name, "mine", other.name})
+    wait_until(lambda: running.counts.refused, lambda r: bool(r["AlreadyExists"]), timeout=5, what="it was refused")
+    running.update({}, {wanted.name: START, other.name: START})
+    tasks_are(api, {wanted.name, foreign.name, "mine"}, {other.name})
+    assert [api.get("ApplicationTask", each["metadata"]["name"]) for each in before] == before
+
+
+def test_a_task_that_exists_is_told_from_other_refusals(namespace: str, running: Running, api: Api) -> None:
+    wanted = demand(namespace)
+    running.update(by_name(wanted))
+    tasks_are(api, {wanted.name})
+    with pytest.raises(TaskExistsError, match="already exists"):
+        running._loop.call(running.store.create(to_task(wanted)))
+
+
+def test_what_is_forbidden_is_done_once_it_is_allowed(control_plane: ControlPlane, api: Api, namespace: str) -> None:
+    wanted = demand(namespace)
+    role = {"apiGroup": "rbac.authorization.k8s.io", "kind": "Role", "name": "reads"}
+    api.create(_role("reads", ["get", "list", "watch"]))
+    api.create(_binding("reads", role, namespace))
+    kubeconfig = control_plane.kubeconfig_of_service_account(namespace, "default")
+    with reconciling(kubeconfig, namespace, resync=1.0) as running:
+        running.update(by_name(wanted))
+        wait_until(lambda: running.counts.refused, lambda r: r["Forbidden"] > 0, timeout=10, what="it was refused")
+        assert api.list("ApplicationTask") == []
+        api.apply(_role("reads", ["get", "list", "watch", "create", "patch"]))
+        tasks_are(api, {wanted.name})
+
+
+def test_a_burst_of_demands_is_served_each_once(api: Api, namespace: str, running: Running) -> None:
+    wanted = by_name(*(demand(namespace, f"car{number}+rsu") for number in range(300)))
+    running.update(wanted)
+    tasks_are(api, set(wanted))
+    running.update({}, dict.fromkeys(wanted, START + SECOND))
+    tasks_are(api, set(), set(wanted))
+    assert running.counts == DeployCounts(created=300, ended=300)
+
+
+def _role(name: str, verbs: list[str]) -> Object:
+    return {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "Role",
+        "metadata": {"name": name},
+        "rules": [{"apiGroups": ["wayside.dev"], "resources": ["applicationtasks"], "verbs": verbs}],
+    }
+
+
+def _binding(name: str, role: Object, namespace: str) -> Object:
+    return {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "RoleBinding",
+        "metadata": {"name": name},
+        "roleRef": role,
+        "subjects": [{"kind": "ServiceAccount", "name": "default", "namespace": namespace}],
+    }
