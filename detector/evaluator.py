@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 from detector.assembly import DetectorError, compile_rules, inlets
@@ -18,7 +17,8 @@ from detector.engine.engine import Engine
 from detector.engine.events import Event
 from detector.engine.intake import Intake
 from detector.engine.sample import Arrival
-from wayside.api import Detector, EventRule
+from detector.rules.selection import RuleSet
+from wayside.api.detector import Stream
 
 _log = logging.getLogger(__name__)
 
@@ -35,6 +35,9 @@ class Recorder(Protocol):
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
         """Samples that the engine takes in now."""
 
+    def follow(self, streams: Iterable[Stream]) -> None:
+        """What comes from now on belongs to these streams."""
+
     def control(self, time: int, document: Mapping[str, Any]) -> None:
         """Something else that the engine is told, at a time in nanoseconds since the epoch."""
 
@@ -47,14 +50,6 @@ class Outlet(Protocol):
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Configuration:
-    """What to evaluate: the newest one counts."""
-
-    detector: Detector
-    rules: tuple[EventRule, ...]
 
 
 class Evaluator:
@@ -78,7 +73,7 @@ class Evaluator:
         self._recorder = recorder
         self._on_failure = on_failure
         self._wake = threading.Condition()
-        self._wanted: Configuration | None = None
+        self._wanted: RuleSet | None = None
         self._stopping = False
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
@@ -86,7 +81,7 @@ class Evaluator:
         self.gaps = 0
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
-    def start(self, configuration: Configuration, restored: Sequence[Demand]) -> None:
+    def start(self, rule_set: RuleSet, restored: Sequence[Demand]) -> None:
         """Begin with these rules and the episodes that were open before; returns at once."""
         start = self._engine.now
         self._record(
@@ -94,11 +89,11 @@ class Evaluator:
             {
                 "kind": "start",
                 "holder": self._engine.identity.holder,
-                "detector": configuration.detector.to_json(),
-                "rules": [rule.to_json() for rule in configuration.rules],
+                "detector": rule_set.detector.to_json(),
+                "rules": [rule.to_json() for rule in rule_set.rules],
             },
         )
-        events = self._apply_rules(configuration)
+        events = self._apply_rules(rule_set)
         if restored:
             self._record(start, {"kind": "restore", "tasks": [to_task(demand).to_json() for demand in restored]})
         self._demands = {demand.name: demand for demand in restored}
@@ -106,10 +101,10 @@ class Evaluator:
         self._hand_over(events)
         self._thread.start()
 
-    def configure(self, configuration: Configuration) -> None:
+    def configure(self, rule_set: RuleSet) -> None:
         """Go on with another Detector or other rules, from the next look on; thread-safe."""
         with self._wake:
-            self._wanted = configuration
+            self._wanted = rule_set
             self._wake.notify()
 
     def stop(self) -> None:
@@ -137,12 +132,13 @@ class Evaluator:
         """Seconds until there is something to do."""
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
 
-    def _look(self, wanted: Configuration | None) -> None:
+    def _look(self, wanted: RuleSet | None) -> None:
         """Take in what has arrived and run the ticks that are due."""
         now = self._now()
         events: list[Event] = []
         if now + _STALL < self._intake.last:
-            events += self._take(self._intake.step_back(now), self._intake.last)
+            last = self._intake.last
+            events += self._take(self._intake.step_back(now), last)
             events += self._gap(now, "the wall clock stepped back")
         else:
             if now - self._engine.next_tick() > _STALL and self._engine.on_wall_clock:
@@ -166,10 +162,10 @@ class Evaluator:
     def _gap(self, now: int, why: str) -> list[Event]:
         _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)
         self.gaps += 1
-        self._record(now, {"kind": "gap"})
+        self._record(now, {"kind": "gap", "until": self._engine.now})
         return self._engine.gap(now)
 
-    def _configure(self, wanted: Configuration) -> list[Event]:
+    def _configure(self, wanted: RuleSet) -> list[Event]:
         """Take over a changed Detector or rules; one that cannot run leaves everything as it is."""
         changed = wanted.detector.spec != self._engine.detector.spec
         if changed:
@@ -179,6 +175,8 @@ class Evaluator:
                 _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.detector.name, error)
                 return []
             self._engine.set_detector(wanted.detector, entries.decoders, entries.read_key)
+            if self._recorder is not None:
+                self._recorder.follow(wanted.detector.spec.streams)
         self._record(
             self._engine.now,
             {
@@ -189,9 +187,9 @@ class Evaluator:
         )
         return self._apply_rules(wanted)
 
-    def _apply_rules(self, configuration: Configuration) -> list[Event]:
-        entries = inlets(configuration.detector)
-        compiled, refused = compile_rules(configuration.rules, configuration.detector, entries.fields)
+    def _apply_rules(self, rule_set: RuleSet) -> list[Event]:
+        entries = inlets(rule_set.detector)
+        compiled, refused = compile_rules(rule_set.rules, rule_set.detector, entries.fields)
         for refusal in refused:
             for problem in refusal.problems:
                 _log.error("EventRule %s is refused: %s", refusal.rule.name, problem)

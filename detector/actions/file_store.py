@@ -58,6 +58,11 @@ class FileTaskStore:
                 yield snapshot
             await asyncio.sleep(self._interval)
 
+    async def all(self) -> dict[str, ApplicationTask]:
+        """All tasks of the holder, ended ones too, by name."""
+        snapshot = await self._run(self._folder.look)
+        return {name: stored.task for name, stored in snapshot.tasks.items()}
+
     async def get(self, name: str) -> StoredTask | None:
         """See `TaskStore`."""
         snapshot = await self._run(self._folder.look)

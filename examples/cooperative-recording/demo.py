@@ -1,0 +1,179 @@
+"""The main job without a cluster: vehicles, events, tasks, and what would run.
+
+Three parts that know nothing of each other: fifteen vehicles (drive.py), a detector (`detector run`), and here the
+core of the application manager, which looks at the tasks that the detector leaves in a folder. The vehicles' data and
+the events go over Zenoh. What is told is also compared with what the vehicles' positions alone say.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import yaml
+import zenoh
+from cooperative_recording.expected import episodes
+from cooperative_recording.seeds import DEMO_DURATION_S, DEMO_SEED
+from cooperative_recording.vehicles import simulate
+from foresight import Foresight, TaskFolder
+from rich.console import Console
+
+from wayside.api import ApplicationTemplate
+from wayside.api.documents import load_documents
+
+HERE = Path(__file__).resolve().parent
+ENDPOINT = "tcp/127.0.0.1:7447"
+"""Where detector.yaml listens."""
+LINGERING_S = 2.5
+"""How long after the drive the last applications are watched going."""
+
+
+def main() -> int:
+    """Run the demo; 1 means that what was detected is not what the positions say."""
+    parser = argparse.ArgumentParser(prog="demo.py", description=__doc__)
+    parser.add_argument("--output", type=Path, default=Path("out"), help="the folder for what comes out (%(default)s)")
+    output: Path = parser.parse_args().output
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(
+        "[bold]Fifteen vehicles drive; five carry a lidar. Two of those closer than 150 m: record the scene.[/]"
+    )
+    with _detector(output) as detector, _events() as events:
+        drive = _start("drive.py", "--connect", ENDPOINT, "--seed", str(DEMO_SEED), "--duration", str(DEMO_DURATION_S))
+        teller = Timeline(console, output / "tasks")
+        until = None
+        while until is None or time.monotonic() < until:
+            teller.look(events)
+            if detector.poll() is not None:
+                console.print(f"[red]the detector ended early:[/] see {output / 'detector.log'}")
+                drive.terminate()
+                return 1
+            if until is None and drive.poll() is not None:
+                until = time.monotonic() + LINGERING_S
+    teller.write_manifests(output / "manifests.yaml")
+    return _verdict(console, output, teller.running, drive.wait())
+
+
+def _start(*command: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(HERE / command[0]), *command[1:]], stdout=subprocess.DEVNULL, text=True
+    )
+
+
+@contextmanager
+def _detector(output: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`detector run` on the example's files; ended in good order."""
+    command = ["-m", "detector.cli", "run", "--detector", "detector.yaml", "--rules", "rules.yaml"]
+    with (output / "detector.log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, *command, "--output", str(output.resolve())], cwd=HERE, stderr=log, stdout=log
+        )
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(10)
+
+
+@contextmanager
+def _events() -> Iterator[queue.Queue[dict[str, Any]]]:
+    """The CloudEvents that the detector publishes, as anybody on the network gets them."""
+    events: queue.Queue[dict[str, Any]] = queue.Queue(1000)
+    config = zenoh.Config()
+    for key, value in {
+        "connect/endpoints": [ENDPOINT],
+        "connect/timeout_ms": 10_000,  # the detector is just starting
+        "connect/exit_on_failure": True,
+        "listen/endpoints": [],
+        "scouting/multicast/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as session:
+        session.declare_subscriber(
+            "wayside/events/**", lambda sample: events.put(json.loads(sample.payload.to_bytes()))
+        )
+        yield events
+
+
+class Timeline:
+    """What happens, a line each: events as they are published, instances as the tasks demand them."""
+
+    def __init__(self, console: Console, folder: Path) -> None:
+        self._console = console
+        self._folder = TaskFolder(folder)
+        self._tasks: set[str] = set()
+        self._ended: set[str] = set()
+        templates = [document.object for document in load_documents([HERE / "templates.yaml"])]
+        self._foresight = Foresight([each for each in templates if isinstance(each, ApplicationTemplate)])
+        self._begin = time.monotonic()
+
+    def look(self, events: queue.Queue[dict[str, Any]]) -> None:
+        """Wait a moment for an event, then tell what is new."""
+        with suppress(queue.Empty):
+            self._event(events.get(timeout=0.1))
+            while True:
+                self._event(events.get_nowait())
+        tasks = self._folder.tasks()
+        for name, task in sorted(tasks.items()):
+            if name not in self._tasks:
+                self._tasks.add(name)
+                self._line("task", "cyan", f"{name} demands {task.spec.template}")
+            if task.spec.end_time is not None and name not in self._ended:
+                self._ended.add(name)
+                self._line("task", "cyan", f"{name} has ended")
+        for change in self._foresight.look(tasks, time.time()):
+            self._line("instance", "green", f"{change.instance} [bold]{change.what}[/]: {change.detail}")
+
+    def write_manifests(self, path: Path) -> None:
+        """The manifests of every instance that there was, as they were last."""
+        manifests = [each for rendering in self._foresight.ever.values() for each in rendering.manifests]
+        path.write_text(yaml.safe_dump_all(manifests, sort_keys=False), encoding="utf-8")
+
+    @property
+    def running(self) -> list[str]:
+        """The instances that would still exist."""
+        return sorted(self._foresight.instances)
+
+    def _event(self, event: dict[str, Any]) -> None:
+        data = event["data"]
+        who = " and ".join(data["subjects"])
+        distance = data["values"].get("distance")
+        at = "" if distance is None else f" at {distance:.0f} m"
+        if event["type"].endswith("started"):
+            self._line("event", "yellow", f"{who} came close{at}: episode {data['episode']} of {data['rule']} starts")
+        else:
+            self._line("event", "yellow", f"{who} parted{at}: episode {data['episode']} ends ({data['reason']})")
+
+    def _line(self, kind: str, colour: str, text: str) -> None:
+        self._console.print(f"{time.monotonic() - self._begin:5.1f} s  [{colour}]{kind:8}[/]  {text}")
+
+
+def _verdict(console: Console, output: Path, running: list[str], drive_ended: int) -> int:
+    """Compare the episodes with those that the positions alone give."""
+    expected = sorted("+".join(each.pair) for each in episodes(simulate(DEMO_SEED, DEMO_DURATION_S), DEMO_DURATION_S))
+    lines = (output / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    found = sorted(event["subject"] for event in map(json.loads, lines) if event["type"].endswith("started"))
+    console.print(
+        f"[bold]{len(found)} episodes; the vehicles' positions alone say {len(expected)}."
+        f" {len(running)} applications would still run.[/]"
+    )
+    console.print(f"See {output}/events.jsonl, {output}/tasks.yaml, {output}/manifests.yaml (and detector.log).")
+    if found != expected or running or drive_ended:
+        console.print(f"[red]Not as expected:[/] detected {found}, expected {expected}, still running {running}")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
