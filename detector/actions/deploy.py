@@ -204,6 +204,7 @@ class DemandReconciler:
             task = to_task(demand)
         except ValueError as error:
             raise TaskRefusedError("Invalid", f"the demand makes no ApplicationTask: {error}") from error
+        deleted = name in self._ledger.held
         try:
             self._ledger.put(name, await self._store.create(task))
         except TaskExistsError as error:
@@ -214,7 +215,7 @@ class DemandReconciler:
             self._ledger.put(name, found)
             self.counts.adopted += 1
         else:
-            if name in self._ledger.held:
+            if deleted:
                 self.counts.recreated += 1
                 _log.info("created the task %s again, since somebody deleted it", name)
             else:
