@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -170,7 +171,7 @@ class Applier:
                 return _Problem("Waiting", f"{what} changed hands while it was applied; looking again")
             if not error.permanent or error.terminating:
                 raise
-            return _Problem("ApplyRefused", f"{what}: {error.message}")
+            return _Problem("ApplyRefused", f"{what}: {_readable(error.message)}")
         uid = raw["metadata"]["uid"]
         self._fields[uid] = _our_fields(raw)
         self._drifted.discard(uid)
@@ -245,6 +246,17 @@ def _references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, 
     return tuple(
         ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid) for key, uid in sorted(uids.items())
     )
+
+
+def _readable(message: str) -> str:
+    """The API server's refusal without the Go around a wrong type."""
+    typed = re.fullmatch(r"failed to create typed patch object \([^)]*\): \.?(.*)", message, re.DOTALL)
+    if typed is None:
+        return message
+    plain = re.sub(r"&value\.valueUnstructured\{Value:(.*)\}", r"\1", typed[1], flags=re.DOTALL)
+    if "expected string, got" in plain:
+        plain += " (inside other text a value becomes text, and alone it keeps its type)"
+    return f"{plain}: correct the template"
 
 
 def _counted(count: int) -> str:

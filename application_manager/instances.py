@@ -223,7 +223,7 @@ class InstanceWork:
         patch = difference(old.to_json() if instance.status else {}, new.to_json())
         if patch:
             self.observe(await self._patch(instance, patch))
-            self.recorder.transitions(instance, conditions.changed(old.conditions, new.conditions), now)
+            self.recorder.transitions(instance, old.conditions, new.conditions, now)
             if old.release_time is None and new.release_time is not None:
                 note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
                 self.recorder.say(instance, Reason.LINGERING, note, now)

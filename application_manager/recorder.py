@@ -10,11 +10,14 @@ import asyncio
 import logging
 import os
 import socket
+import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 from application_manager.client import EVENTS, ApiError, Client, Unreachable
+from application_manager.conditions import changed
 from application_manager.times import format_time
 from wayside.api.base import Condition, Kind
 
@@ -51,7 +54,7 @@ _OF_CONDITION = {
     ("Finished", "True"): Reason.FINISHED,
 }
 _WARNINGS = frozenset({Reason.REFUSED, Reason.HOLDER_LOST, Reason.NOT_APPLIED, Reason.TEMPLATE_INVALID})
-_EXPECTED = frozenset({"Waiting", "NotApplied"})  # reasons of conditions that come with every start
+_EXPECTED = frozenset({"Waiting", "NotApplied", "NotReady"})  # reasons that come with every start
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +81,16 @@ class Recorder:
         except asyncio.QueueFull:
             self.dropped += 1
 
-    def transitions(self, regarding: Kind, changed: list[Condition], now: float) -> None:
-        """Post an Event for each condition that changed, if it is worth one."""
-        for each in changed:
+    def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
+        """Post an Event for each condition that changed, if it is worth one: not yet being ready is none."""
+        was_true = {each.type for each in old if each.status == "True"}
+        for each in changed(old, new):
             reason = _OF_CONDITION.get((each.type, each.status))
             if each.reason in (Reason.HOLDER_LOST, Reason.TEMPLATE_INVALID):
                 reason = Reason(each.reason)
-            if reason is None or (each.status == "False" and each.reason in _EXPECTED):
-                continue
-            if reason is Reason.NOT_READY and not each.message:
-                continue
-            self.say(regarding, reason, each.message, now)
+            expected = each.status == "False" and each.type not in was_true and each.reason in _EXPECTED
+            if reason is not None and not expected:
+                self.say(regarding, reason, each.message, now)
 
     async def run(self) -> None:
         """Post until cancelled. An Event that cannot be posted is dropped."""
@@ -111,7 +113,7 @@ class Recorder:
         return {
             "apiVersion": "events.k8s.io/v1",
             "kind": "Event",
-            "metadata": {"generateName": f"{regarding.name}.", "namespace": regarding.namespace},
+            "metadata": {"name": f"{regarding.name}.{uuid.uuid4().hex[:16]}", "namespace": regarding.namespace},
             "eventTime": said.when.replace("Z", "000Z"),  # the API wants microseconds
             "reportingController": COMPONENT,
             "reportingInstance": self._instance,

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager import conditions
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.demand import Standing, Verdict
 from application_manager.recorder import Recorder
@@ -56,7 +55,7 @@ class TaskWork:
             if patch:
                 uid = task.metadata.uid
                 self.observe(await self.client.patch_status(self.tasks, name[0], name[1], uid, patch))
-                self.recorder.transitions(task, conditions.changed(old.conditions, new.conditions), now)
+                self.recorder.transitions(task, old.conditions, new.conditions, now)
             if verdict.standing is Standing.FINISHED:
                 await self._expire(name)
         except ApiError as error:

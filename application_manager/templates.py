@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager import conditions
 from application_manager.claims import InvalidTemplate
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.recorder import Recorder
@@ -55,7 +54,7 @@ class TemplateWork:
                 return
             raise
         about = Kind(kind=self.templates.kind, metadata=metadata)
-        self.recorder.transitions(about, conditions.changed(old.conditions, new.conditions), now)
+        self.recorder.transitions(about, old.conditions, new.conditions, now)
 
     def _problems(self, name: Name) -> tuple[str, ...]:
         template = self.world.template(name)
