@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 
-from detector.engine.sample import Sample
+from detector.engine.sample import SAMPLE_OVERHEAD, Sample
 
-_OVERHEAD = 160
-"""What a sample costs in memory beside its payload, in bytes: its tuple, its numbers and its place in the deque."""
+NEVER = -(2**63)
+"""Before all times: nothing has come yet."""
 
 _SLACK = 64
 """Beyond the cap over all streams, 1/64 of it is freed at once, so that the search for the oldest pays off."""
@@ -22,19 +22,18 @@ _SLACK = 64
 class Lane:
     """The samples of one client on one stream, in order of time."""
 
-    __slots__ = ("bytes", "captures", "client", "duration", "evicted", "maximum_bytes", "samples", "stream")
+    __slots__ = ("bytes", "client", "duration", "evicted", "latest", "maximum_bytes", "samples", "stream")
 
-    def __init__(
-        self, client: str, stream: str, captures: Mapping[str, str], duration: int, maximum_bytes: int | None
-    ) -> None:
-        """`duration` is in nanoseconds; `captures` are what the stream's key captured."""
+    def __init__(self, client: str, stream: str, duration: int, maximum_bytes: int | None) -> None:
+        """`duration` is in nanoseconds."""
         self.client = client
         self.stream = stream
-        self.captures = captures
         self.duration = duration
         self.maximum_bytes = maximum_bytes
         self.samples: deque[Sample] = deque()
         self.bytes = 0
+        self.latest = NEVER
+        """The greatest time of all samples that came, also of those that a cap pushed out."""
         self.evicted = 0
         """Samples that a cap pushed out before their time."""
 
@@ -46,15 +45,16 @@ class Lane:
     def insert(self, sample: Sample) -> int:
         """Put the sample in its place; returns by how many bytes the lane grew."""
         samples = self.samples
-        if samples and sample.time < samples[-1].time:
+        if sample.time >= self.latest:
+            self.latest = sample.time
+            samples.append(sample)
+        else:
             later = []
             while samples and samples[-1].time > sample.time:
                 later.append(samples.pop())
             samples.append(sample)
             samples.extend(reversed(later))
-        else:
-            samples.append(sample)
-        size = len(sample.payload) + _OVERHEAD
+        size = len(sample.payload) + SAMPLE_OVERHEAD
         self.bytes += size
         if self.maximum_bytes is not None:
             while self.bytes > self.maximum_bytes and len(samples) > 1:
@@ -64,7 +64,7 @@ class Lane:
 
     def drop_oldest(self) -> int:
         """Forget the oldest sample; returns the bytes freed."""
-        size = len(self.samples.popleft().payload) + _OVERHEAD
+        size = len(self.samples.popleft().payload) + SAMPLE_OVERHEAD
         self.bytes -= size
         return size
 
@@ -74,6 +74,12 @@ class Lane:
         while len(samples) > 1 and samples[0].time <= horizon:
             freed += self.drop_oldest()
         return freed
+
+    def clear(self) -> None:
+        """Forget all samples, and that there were any."""
+        self.samples.clear()
+        self.bytes = 0
+        self.latest = NEVER
 
     def newest_first(self, after: int | None, until: int) -> Iterator[Sample]:
         """The samples of (after, until] from the newest on; all up to `until` where `after` is None."""
@@ -91,15 +97,19 @@ class Buffer:
         """`maximum_bytes` bounds the payloads and their overhead over all lanes."""
         self.maximum_bytes = maximum_bytes
         self.bytes = 0
-        self._lanes: dict[tuple[str, str], Lane] = {}
+        self._lanes: dict[str, dict[str, Lane]] = {}
+        """By client and stream."""
+        self._evicted_before = 0
+        """Evicted from lanes that are gone."""
 
     def lane(self, client: str, stream: str) -> Lane | None:
-        """The client's lane of the stream, if it ever had one."""
-        return self._lanes.get((client, stream))
+        """The client's lane of the stream, if it has one."""
+        lanes = self._lanes.get(client)
+        return None if lanes is None else lanes.get(stream)
 
     def add(self, lane: Lane) -> Lane:
         """Take the lane in; the one that is there already where there is one."""
-        return self._lanes.setdefault((lane.client, lane.stream), lane)
+        return self._lanes.setdefault(lane.client, {}).setdefault(lane.stream, lane)
 
     def grew(self, size: int) -> None:
         """Account for what was inserted, and keep to the cap."""
@@ -109,41 +119,49 @@ class Buffer:
 
     def expire(self, now: int) -> None:
         """Forget what is older than the lanes' durations."""
-        for lane in self._lanes.values():
+        for lane in self:
             self.bytes -= lane.expire(now)
 
-    def forget(self, client: str) -> list[Lane]:
-        """Drop all lanes of a client; returns them."""
-        gone = [lane for lane in self._lanes.values() if lane.client == client]
-        for lane in gone:
-            del self._lanes[lane.client, lane.stream]
-            self.bytes -= lane.bytes
-        return gone
+    def latest(self) -> Iterator[tuple[str, int]]:
+        """Of each client, the greatest time of what came on any stream."""
+        for client, lanes in self._lanes.items():
+            yield client, max(lane.latest for lane in lanes.values())
+
+    def forget(self, client: str) -> None:
+        """Drop all lanes of a client."""
+        for lane in self._lanes.pop(client, {}).values():
+            self._drop(lane)
 
     def keep(self, streams: Collection[str]) -> None:
         """Drop the lanes of all other streams."""
-        self._lanes = {key: lane for key, lane in self._lanes.items() if lane.stream in streams}
-        self.bytes = sum(lane.bytes for lane in self._lanes.values())
+        for client, lanes in list(self._lanes.items()):
+            for stream in [stream for stream in lanes if stream not in streams]:
+                self._drop(lanes.pop(stream))
+            if not lanes:
+                del self._lanes[client]
 
     def clear(self) -> None:
         """Forget all samples; the lanes stay."""
-        for lane in self._lanes.values():
-            lane.samples.clear()
-            lane.bytes = 0
+        for lane in self:
+            lane.clear()
         self.bytes = 0
 
     @property
     def evicted(self) -> int:
         """Samples that a cap pushed out before their time."""
-        return sum(lane.evicted for lane in self._lanes.values())
+        return self._evicted_before + sum(lane.evicted for lane in self)
 
     def __iter__(self) -> Iterator[Lane]:
-        return iter(self._lanes.values())
+        return (lane for lanes in self._lanes.values() for lane in lanes.values())
+
+    def _drop(self, lane: Lane) -> None:
+        self.bytes -= lane.bytes
+        self._evicted_before += lane.evicted
 
     def _shrink(self) -> None:
         """Free the oldest samples over all lanes."""
         target = self.maximum_bytes - self.maximum_bytes // _SLACK
-        heads = [(lane.samples[0].time, index, lane) for index, lane in enumerate(self._lanes.values()) if lane.samples]
+        heads = [(lane.samples[0].time, index, lane) for index, lane in enumerate(self) if lane.samples]
         heapq.heapify(heads)
         while self.bytes > target and heads:
             _, index, lane = heads[0]

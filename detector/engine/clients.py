@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from detector.engine.buffer import Buffer
+from detector.engine.buffer import NEVER, Buffer
 
 
 @dataclass(slots=True)
@@ -31,10 +31,14 @@ class Clients:
 
     def heard(self, client: str, time: int) -> None:
         """A sample of the client, or a restored episode about it."""
-        presence = self._present.get(client)
-        if presence is None:
+        if client not in self._present:
             self._present[client] = Presence(time, time)
-        elif time > presence.last:
+        self.still_heard(client, time)
+
+    def still_heard(self, client: str, time: int) -> None:
+        """The newest sample of the client is of this time; one that is not known stays unknown."""
+        presence = self._present.get(client)
+        if presence is not None and time > presence.last:
             presence.last = time
 
     def lose(self, now: int) -> list[str]:
@@ -58,6 +62,9 @@ class Clients:
         """The labels that the Detector gives the client."""
         return self._labels.get(client, {})
 
+    def __len__(self) -> int:
+        return len(self._present)
+
     def __contains__(self, client: str) -> bool:
         return client in self._present
 
@@ -73,5 +80,4 @@ def fresh_streams(client: str, streams: Mapping[str, int | None], buffer: Buffer
 def is_fresh(client: str, stream: str, limit: int | None, buffer: Buffer, now: int) -> bool:
     """Whether the newest sample is at most `limit` nanoseconds old (None: of any age)."""
     lane = buffer.lane(client, stream)
-    newest = None if lane is None else lane.newest
-    return newest is not None and (limit is None or now - newest.time <= limit)
+    return lane is not None and lane.latest != NEVER and (limit is None or now - lane.latest <= limit)

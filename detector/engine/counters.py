@@ -41,6 +41,8 @@ class Counters:
     last_undecodable: dict[str, str] = field(default_factory=dict)
     unnamed: Counter[str] = field(default_factory=Counter)
     """Samples dropped since their key names no valid client, by stream."""
+    crowded: Counter[str] = field(default_factory=Counter)
+    """Samples dropped since too many clients were known already, by stream."""
     rules: dict[str, RuleCounters] = field(default_factory=dict)
 
     def rule(self, name: str) -> RuleCounters:

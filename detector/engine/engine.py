@@ -7,35 +7,25 @@ It reads no clock and does no I/O. Live operation, the replay of a recording and
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol
 
-from detector.engine.buffer import Buffer, Lane
+from detector.engine.buffer import Buffer
 from detector.engine.clients import Clients
 from detector.engine.counters import Counters
 from detector.engine.demands import Demand
 from detector.engine.episodes import Reason
 from detector.engine.evaluation import Identity, RuleRun, same_semantics
 from detector.engine.events import Event
-from detector.engine.sample import Arrival, DecodeError, Decoder, Sample
+from detector.engine.inflow import Inflow
+from detector.engine.messages import KeyReader, Messages
+from detector.engine.sample import Arrival, Decoder
 from detector.engine.scopes import Views
-from detector.engine.signals import Messages, Signals
+from detector.engine.signals import Signals
 from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Ticks, Timeline, WallTimeline
 from wayside.api import Detector
 from wayside.api.detector import Clock, Stream
-from wayside.expressions import EvaluationError
-from wayside.rules import CompiledRule, CompiledStream, compile_stream
+from wayside.rules import CompiledRule, compile_stream
 
-_new_sample = tuple.__new__
-"""Makes a Sample from a plain tuple at a third of the cost of calling the class: it is made for every message."""
-
-_NO_LANES: Mapping[str, Lane] = {}
-
-
-class KeyReader(Protocol):
-    """Tells whose a sample is."""
-
-    def __call__(self, stream: str, key: str) -> tuple[str, Mapping[str, str]] | None:
-        """The client and the captured chunks; None where the key names no valid client."""
+__all__ = ["Engine", "KeyReader"]
 
 
 class Engine:
@@ -57,12 +47,14 @@ class Engine:
         """
         self.identity = Identity(detector.name, holder, detector.namespace)
         self.counters = Counters()
-        self._number = 0
         self._runs: dict[str, RuleRun] = {}
         self._rules_version = 0
         self._ticks = Ticks()
         self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
         self.clients = Clients({}, detector.spec.client_timeout.ns)
+        self._floor: int | None = None
+        """Windows do not reach back further than the last gap; nanoseconds."""
+        self._inflow = Inflow(self.buffer, self.clients, self.counters)
         self._configure(detector, decoders, read_key)
         self._timeline = self._make_timeline(start)
 
@@ -79,31 +71,30 @@ class Engine:
         self._configure(detector, decoders, read_key)
         kept = {stream.name for stream in detector.spec.streams if _reads_like(stream, before.stream(stream.name))}
         self.buffer.keep(kept)
+        streams = {stream.name: stream for stream in detector.spec.streams}
         for lane in self.buffer:
-            stream = self._streams[lane.stream]
+            stream = streams[lane.stream]
             lane.duration = detector.spec.buffer_duration_ns(stream)
             lane.maximum_bytes = None if stream.buffer.bytes is None else stream.buffer.bytes.bytes
+        if isinstance(self._timeline, DataTimeline):
+            self._timeline.max_behind = _longest(detector)
         times = (detector.spec.clock, detector.spec.lateness, detector.spec.max_ahead)
         if times != (before.clock, before.lateness, before.max_ahead):
+            self._run(self._timeline.rest())
             now = self._timeline.now
             self._timeline = self._make_timeline(now)
             self._gap(now, backwards=detector.spec.clock is not before.clock)
 
     def _configure(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
         spec = detector.spec
-        self._stamps: dict[str, CompiledStream] = {
-            stream.name: compile_stream(stream, index) for index, stream in enumerate(spec.streams)
-        }
+        compiled = {stream.name: compile_stream(stream, index) for index, stream in enumerate(spec.streams)}
         self.detector = detector
         self.buffer.maximum_bytes = spec.buffer.bytes.bytes
         self.clients.configure({c.name: c.labels for c in spec.clients}, spec.client_timeout.ns)
-        self._read_key = read_key
-        self._decoders = decoders
-        self._messages = Messages(decoders, self.counters)
+        self._inflow.configure(detector, read_key)
+        self._messages = Messages(decoders, compiled, read_key, self.counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
-        self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after)
-        self._streams = {stream.name: stream for stream in spec.streams}
-        self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in spec.streams}
+        self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after, self._floor)
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, in order, none after `until`, and run the ticks up to there."""
@@ -119,6 +110,7 @@ class Engine:
         new = {rule.name: rule for rule in rules}
         events: list[Event] = []
         runs: dict[str, RuleRun] = {}
+        kept: set[str] = set()
         for name, run in sorted(self._runs.items()):
             rule = new.get(name)
             if rule is None or not same_semantics(run, rule):
@@ -126,24 +118,25 @@ class Engine:
             else:
                 run.change_actions(rule)
                 runs[name] = run
+                kept.add(name)
         for name, rule in new.items():
             if name not in runs:
                 runs[name] = RuleRun(rule, self.identity, self.counters.rule(name))
         self._runs = dict(sorted(runs.items()))
-        self._signals.forget(lambda rule, client: rule in runs)
+        self._signals.forget(lambda rule, client: rule in kept)
         self._ticks.set_periods([rule.every_ns for rule in rules if rule.enabled])
         self._rules_version += 1
         return events
 
     def restore(self, demands: Sequence[Demand], now: int) -> list[Event]:
         """Take up the episodes that were open before a restart; those whose rule changed meanwhile end."""
-        episodes: dict[tuple[str, str], list[Demand]] = {}
+        episodes: dict[tuple[str, str, str], list[Demand]] = {}
         for demand in demands:
-            episodes.setdefault((demand.rule, demand.episode), []).append(demand)
+            episodes.setdefault((demand.rule, demand.subject, demand.episode), []).append(demand)
         events: list[Event] = []
-        for (name, _), of_one in sorted(episodes.items()):
+        for (name, _, _), of_one in sorted(episodes.items()):
             run = self._runs.get(name)
-            if run is not None and run.rule.enabled and run.rule.digest == of_one[0].rule_digest:
+            if run is not None and run.can_restore(of_one[0]):
                 run.restore(of_one)
                 for client in of_one[0].subjects:
                     self.clients.heard(client, now)
@@ -190,63 +183,21 @@ class Engine:
         for step in steps:
             match step:
                 case Insert(arrivals, times):
-                    self._insert(arrivals, times)
+                    self._inflow.insert(arrivals, times)
                 case Tick(time):
                     events += self._tick(time)
                 case Gap(time, backwards):
                     self._gap(time, backwards)
         return events
 
-    def _insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
-        """The hot path: everything that is received comes through here."""
-        lanes, buffer, first = self._lanes, self.buffer, self._number
-        for index, arrival in enumerate(arrivals):
-            received, stream, key, payload = arrival
-            if times is not None:
-                received = times[index]  # with clock Data, there is no other time
-            lane = lanes.get(stream, _NO_LANES).get(key)
-            if lane is None:
-                lane = self._route(stream, key, received)
-                if lane is None:
-                    continue
-            self._number += 1
-            buffer.grew(lane.insert(_new_sample(Sample, (received, self._number, payload, received, key))))
-            self.counters.samples[stream] += 1
-            if times is not None:
-                self.clients.heard(lane.client, received)
-        if times is None:
-            for lane in buffer:
-                newest = lane.newest
-                if newest is not None and newest.number > first:
-                    self.clients.heard(lane.client, newest.time)
-
-    def _route(self, stream: str, key: str, time: int) -> Lane | None:
-        """The lane for a key that has none at hand: a new key, or one of a client that was lost."""
-        spec = self._streams.get(stream)
-        whose = None if spec is None else self._read_key(stream, key)
-        if spec is None or whose is None:
-            self.counters.unnamed[stream] += 1  # also what still came in on a stream that the Detector no longer has
-            return None
-        client, captures = whose
-        limit = spec.buffer.bytes
-        lane = self.buffer.add(
-            Lane(
-                client,
-                stream,
-                captures,
-                self.detector.spec.buffer_duration_ns(spec),
-                None if limit is None else limit.bytes,
-            )
-        )
-        self._lanes[stream][key] = lane
-        self.clients.heard(client, time)
-        return lane
-
     def _tick(self, time: int) -> list[Event]:
         self.buffer.expire(time)
+        for client, latest in self.buffer.latest():
+            self.clients.still_heard(client, latest)
         lost = self.clients.lose(time)
         if lost:
-            self._unroute(set(lost))
+            self._inflow.lose(set(lost))
+            self._signals.forget(lambda rule, client: client in self.clients)
         events: list[Event] = []
         for run in self._runs.values():
             if run.due(time):
@@ -258,55 +209,32 @@ class Engine:
     def _gap(self, time: int, backwards: bool) -> None:
         if backwards:
             self.buffer.clear()
+        self._floor = time
         self._signals.gap(time)
         self.clients.gap(time)
         for run in self._runs.values():
             run.gap(time)
 
-    def _unroute(self, lost: set[str]) -> None:
-        """The next sample of a lost client makes it known again; its latched samples are still there then."""
-        for lanes in self._lanes.values():
-            for key in [key for key, lane in lanes.items() if lane.client in lost]:
-                del lanes[key]
-        self._signals.forget(lambda rule, client: client in self.clients)
-
     def _make_timeline(self, start: int) -> Timeline:
         spec = self.detector.spec
         if spec.clock is Clock.WALL:
             return WallTimeline(self._ticks, start)
-        longest = max(spec.buffer_duration_ns(stream) for stream in spec.streams)
         return DataTimeline(
             self._ticks,
+            start=start,
             lateness=spec.lateness.ns,
             max_ahead=spec.max_ahead.ns,
-            max_behind=longest,
-            stamp_of=self._stamp_of,
-            client_of=self._client_of,
+            max_behind=_longest(self.detector),
+            alone_after=spec.client_timeout.ns,
+            maximum_bytes=spec.buffer.bytes.bytes,
+            stamp_of=lambda arrival: self._messages.time(arrival.stream, arrival.received, arrival.payload),
+            client_of=self._inflow.client_of,
         )
 
-    def _client_of(self, arrival: Arrival) -> str | None:
-        lane = self._lanes.get(arrival.stream, _NO_LANES).get(arrival.key)
-        if lane is not None:
-            return lane.client
-        whose = self._read_key(arrival.stream, arrival.key) if arrival.stream in self._streams else None
-        if whose is None:
-            self.counters.unnamed[arrival.stream] += 1
-            return None
-        return whose[0]
 
-    def _stamp_of(self, arrival: Arrival) -> int | None:
-        """The sender's time in nanoseconds; the receive time where the message carries none."""
-        stream = arrival.stream
-        decoder, stamp = self._decoders[stream], self._stamps[stream].stamp
-        try:
-            if stamp is None:
-                own = decoder.stamp(arrival.payload)
-                return arrival.received if own is None else own
-            return _nanoseconds(stamp.evaluate({"msg": decoder.decode(arrival.payload)}))
-        except (DecodeError, EvaluationError, ValueError) as error:
-            self.counters.undecodable[stream] += 1
-            self.counters.last_undecodable[stream] = str(error)
-            return None
+def _longest(detector: Detector) -> int:
+    """How long the stream that is kept longest is kept, in nanoseconds."""
+    return max(detector.spec.buffer_duration_ns(stream) for stream in detector.spec.streams)
 
 
 def _reads_like(stream: Stream, before: Stream | None) -> bool:
@@ -317,13 +245,6 @@ def _reads_like(stream: Stream, before: Stream | None) -> bool:
         before.encoding,
         before.type,
     )
-
-
-def _nanoseconds(seconds: object) -> int:
-    """A stamp in seconds, to the microsecond: a double holds no more of a time since the epoch."""
-    if not isinstance(seconds, int | float) or not 0 <= seconds < 1e11:
-        raise ValueError(f"stamp {seconds!r} is no time in seconds since the epoch")
-    return round(seconds * 1e6) * 1000
 
 
 def _ended_while_away(demand: Demand, now: int) -> Event:

@@ -41,7 +41,7 @@ class Observation:
     """What the rule says of the subject at one tick."""
 
     in_scope: Truth
-    near: bool
+    near: Truth
     """Whether an episode may start at all (a pair within reach)."""
     when: Truth
     until: Truth
@@ -109,11 +109,11 @@ class SubjectState:
         return Ended(reason)
 
     def _idle_step(self, now: int, timing: Timing, seen: Observation) -> Started | None:
-        condition = both(seen.when, negation(seen.until))
-        if seen.in_scope is False or not seen.near or condition is False:
+        condition = both(both(seen.in_scope, seen.near), both(seen.when, negation(seen.until)))
+        if condition is False:
             self.onset = self.unknown_since = None
             return None
-        if condition is UNKNOWN or seen.in_scope is UNKNOWN:
+        if condition is UNKNOWN:
             if self.onset is not None:
                 if self.unknown_since is None:
                     self.unknown_since = now

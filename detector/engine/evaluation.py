@@ -16,7 +16,7 @@ from detector.engine.events import Event
 from detector.engine.scopes import Candidate, Members, Views, candidates, snapshot
 from wayside.expressions import UNKNOWN, Expression, InterpolationError
 from wayside.names import subject_text
-from wayside.rules import CompiledDeploy, CompiledRule
+from wayside.rules import CompiledDeploy, CompiledRule, PairSubject
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +75,25 @@ class RuleRun:
             state.gap()
             state.rests_until = min(state.rests_until, time + self._timing.cooldown)
 
+    def can_restore(self, demand: Demand) -> bool:
+        """Whether the demand's episode is one of this rule, as it is now."""
+        wanted = 2 if isinstance(self.rule.subject, PairSubject) else 1
+        members = demand.subjects
+        return (
+            self.rule.enabled
+            and self.rule.digest == demand.rule_digest
+            and len(members) == wanted
+            and list(members) == sorted(set(members))
+            and members not in self._open
+        )
+
     def restore(self, demands: list[Demand]) -> None:
-        """Take up an episode that was open before a restart, from the demands of its actions."""
+        """Take up an episode that was open before a restart, from the demands of its actions.
+
+        Where an action is not what it was, its demand is rendered anew at the next evaluation.
+        """
         first = demands[0]
+        deploys = {deploy.action: (deploy.template, deploy.priority) for deploy in self.rule.deploys}
         self._states[first.subjects] = SubjectState(is_open=True)
         self._open[first.subjects] = Episode(
             first.episode,
@@ -86,7 +102,7 @@ class RuleRun:
             first.start_time,
             first.values,
             None,
-            {demand.action: demand for demand in demands},
+            {d.action: d for d in demands if deploys.get(d.action) == (d.template, d.priority)},
         )
 
     def change_actions(self, rule: CompiledRule) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
+SAMPLE_OVERHEAD = 160
+"""What a sample costs in memory beside its payload, in bytes: its tuple, its numbers and its place in a queue."""
+
 
 class Arrival(NamedTuple):
     """One message as the intake queued it, before the engine has looked at it."""

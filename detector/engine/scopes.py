@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from detector.engine.buffer import Buffer
 from detector.engine.clients import Clients, fresh_streams
 from detector.engine.counters import RuleCounters
+from detector.engine.episodes import Truth
 from detector.engine.signals import Position, Signals
 from wayside.expressions import UNKNOWN
 from wayside.rules import ClientSubject, CompiledRule, PairSubject
@@ -24,6 +25,9 @@ Members = tuple[str, ...]
 _FEW = 32
 """Up to so many clients, looking at every pair is faster than building a tree."""
 
+_ROUNDING = 1 + 1e-9
+"""The tree is asked for a little more than wanted, lest it round a pair away that is just within reach."""
+
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
@@ -32,8 +36,8 @@ class Candidate:
     members: Members
     variables: Mapping[str, Any]
     """What the conditions see; what is unknown is left out."""
-    near: bool
-    """Whether an episode may start."""
+    near: Truth
+    """Whether an episode may start; unknown for a pair of which one's position is."""
 
 
 class Views:
@@ -101,9 +105,10 @@ def _pairs(subject: PairSubject, views: Views, clients: Clients, pending: Iterab
     for members in sorted(near | known):
         a, b = members
         variables: dict[str, Any] = {"a": _member(views, a, positions), "b": _member(views, b, positions)}
-        if a in positions and b in positions:
+        placed = a in positions and b in positions
+        if placed:
             variables["distance"] = math.dist(positions[a], positions[b])
-        yield Candidate(members, variables, near=members in near)
+        yield Candidate(members, variables, near=members in near if placed else UNKNOWN)
 
 
 def _member(views: Views, client: str, positions: Mapping[str, Position]) -> dict[str, Any]:
@@ -122,8 +127,10 @@ def near_pairs(positions: Mapping[str, Position], within: float) -> Iterator[tup
                 yield a, b
         return
     tree = cKDTree(np.array([positions[name] for name in names]))
-    for i, j in tree.query_pairs(within):
-        yield names[i], names[j]
+    for i, j in tree.query_pairs(within * _ROUNDING):
+        # The tree rounds in its own way; this is what expressions see as distance.
+        if math.dist(positions[names[i]], positions[names[j]]) <= within:
+            yield names[i], names[j]
 
 
 def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
@@ -143,4 +150,15 @@ def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
 
 
 def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
-    return {signal.name: view[signal.name] for signal in rule.signals if signal.name in view}
+    return {signal.name: _without_bytes(view[signal.name]) for signal in rule.signals if signal.name in view}
+
+
+def _without_bytes(value: Any) -> Any:
+    """Neither an event nor a task can carry bytes, which CEL yields where it is asked to: null stands for them."""
+    if isinstance(value, bytes):
+        return None
+    if isinstance(value, list):
+        return [_without_bytes(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _without_bytes(child) for key, child in value.items()}
+    return value

@@ -1,16 +1,18 @@
 """Turns arrivals into what the engine does next: samples to insert, ticks to evaluate, gaps to say.
 
 With clock Wall a sample's time is its receive time, and the shell says how far time has come. With clock Data it is the
-sender's stamp, and the samples themselves say it: tick t is due once a stamp of at least t + lateness was seen.
+sender's stamp, and the samples themselves say it: tick t is due once a stamp of at least t + lateness was seen. Either
+way, what a tick sees are the samples up to its time and none later.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
-from detector.engine.sample import Arrival
+from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
 
 _RECEIVED = itemgetter(0)
 
@@ -69,11 +71,15 @@ class WallTimeline:
         """Up to here all ticks have run."""
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
-        """All that happens up to `until`; the arrivals are in order of their receive times, none after `until`.
+        """All that happens up to `until`, or up to the last arrival if that is later; they are in order.
 
+        The intake stamps what it queues while it is being emptied later than `until`. Whatever comes after that is
+        later still, so the ticks up to there can run, and a sample never enters before a tick that it comes after.
         What was received exactly at a tick counts at it.
         """
         first, count = 0, len(arrivals)
+        if count:
+            until = max(until, arrivals[-1].received)
         while (tick := self._ticks.after(self.now)) <= until:
             last = _first_after(arrivals, tick, first)
             if last > first:
@@ -90,6 +96,10 @@ class WallTimeline:
         backwards, self.now = time < self.now, time
         yield Gap(time, backwards)
 
+    def rest(self) -> Iterator[Step]:
+        """Nothing waits here."""
+        yield from ()
+
 
 def _first_after(arrivals: Sequence[Arrival], time: int, low: int) -> int:
     """The index of the first arrival received after `time`, at least `low`."""
@@ -103,42 +113,69 @@ def _first_after(arrivals: Sequence[Arrival], time: int, low: int) -> int:
     return low
 
 
+@dataclass(slots=True)
+class _Row:
+    """Samples in a row that agree with each other, but not with the time."""
+
+    client: str
+    first: int
+    last: int
+    several: bool = False
+    """Whether they are of more than one client."""
+
+
 class DataTimeline:
     """Clock Data: time is the senders' stamps.
 
+    A sample waits until the tick that comes after it, and then enters in the order of the stamps: so the order in which
+    samples arrive does not matter as long as `lateness` covers it. One that is later than that enters at once.
+
     A stamp more than `max_ahead` ahead of the rest, or so far behind that the buffer has no room for it, is dropped and
     counted. Time that really jumped (a pause in a recording, a simulation that began again) shows in what follows: when
-    two samples in a row agree on another time, from two clients where there are two, that time holds from then on.
+    samples in a row agree on another time, that time holds from then on. Two are enough, if they are of two clients or
+    there is only one; one client among several must keep it up for `alone_after` while nobody contradicts.
     """
 
     def __init__(
         self,
         ticks: Ticks,
         *,
+        start: int,
         lateness: int,
         max_ahead: int,
         max_behind: int,
+        alone_after: int,
+        maximum_bytes: int,
         stamp_of: Callable[[Arrival], int | None],
         client_of: Callable[[Arrival], str | None],
     ) -> None:
-        """Times are in nanoseconds.
+        """Times are in nanoseconds; `start` stands for now until the first stamp is seen.
 
-        `stamp_of` and `client_of` give None where they cannot tell; the sample is then left out, and they count it.
+        `maximum_bytes` bounds the payloads that wait; what comes when they are full is dropped and counted. `stamp_of`
+        and `client_of` give None where they cannot tell; the sample is then left out, and they count it.
         """
         self._ticks = ticks
         self._lateness = lateness
         self._max_ahead = max_ahead
-        self._max_behind = max_behind
+        self._alone_after = alone_after
+        self._maximum_bytes = maximum_bytes
         self._stamp_of = stamp_of
         self._client_of = client_of
         self._newest: int | None = None
-        self._clients: set[str] = set()
-        self._astray: dict[str, int] = {}
-        """The stamps of the last samples in a row that do not fit the time, by client."""
-        self._astray_count = 0
-        self.now = 0
+        self._ticked = False
+        self._waiting: list[tuple[int, int, Arrival]] = []
+        """A heap by stamp and order of arrival."""
+        self._waiting_bytes = 0
+        self._number = 0
+        self._some_client: str | None = None
+        self._several_clients = False
+        self._row: _Row | None = None
+        self.max_behind = max_behind
+        self.now = start
         self.dropped_ahead = 0
         self.dropped_late = 0
+        self.dropped_full = 0
+        self.jumps = 0
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
         """All that the arrivals make happen; `until`, a time of the wall, says nothing here."""
@@ -147,43 +184,83 @@ class DataTimeline:
             stamp = None if client is None else self._stamp_of(arrival)
             if client is None or stamp is None:
                 continue
-            self._clients.add(client)
-            if self._newest is None:
-                self.now = stamp - 1
-                self._newest = stamp
-            elif self._fits(stamp, self._newest):
-                self._astray.clear()
-                self._astray_count = 0
-                self._newest = max(self._newest, stamp)
-            elif self._jumped(client, stamp):
-                backwards, self._newest, self.now = stamp < self._newest, stamp, stamp - 1
-                yield Gap(self.now, backwards)
+            self._know(client)
+            newest = self._newest
+            if newest is None:
+                newest = stamp
+                yield self._begin(stamp, backwards=False)
+            elif newest - self.max_behind <= stamp <= newest + self._max_ahead:
+                self._row = None
+                if not self._ticked and newest - self._lateness <= stamp <= self.now:
+                    yield self._begin(stamp, backwards=False)  # the first to arrive was not the first
+                newest = max(newest, stamp)
+            elif self._jumped(client, stamp, newest):
+                self.jumps += 1
+                yield from self.rest()
+                backwards, newest = stamp < newest, stamp
+                yield self._begin(stamp, backwards)
             else:
                 continue
-            yield Insert((arrival,), (stamp,))
-            while (tick := self._ticks.after(self.now)) <= self._newest - self._lateness:
-                self.now = tick
+            self._newest = newest
+            if stamp <= self.now:
+                yield Insert((arrival,), (stamp,))
+            else:
+                self._wait(arrival, stamp)
+            while (tick := self._ticks.after(self.now)) <= newest - self._lateness:
+                self.now, self._ticked = tick, True
+                yield from self._release(tick)
                 yield Tick(tick)
 
     def gap(self, time: int) -> Iterator[Step]:
         """Steps and stalls of the wall clock do not touch the time of the data."""
         yield from ()
 
-    def _fits(self, stamp: int, newest: int) -> bool:
-        return newest - self._max_behind <= stamp <= newest + self._max_ahead
+    def rest(self) -> Iterator[Step]:
+        """All that waits, at once: no tick of this axis comes any more."""
+        yield from self._release(None)
 
-    def _jumped(self, client: str, stamp: int) -> bool:
+    def _begin(self, stamp: int, backwards: bool) -> Gap:
+        """Time begins, or begins anew, with this stamp."""
+        self.now, self._ticked = stamp - 1, False
+        return Gap(self.now, backwards)
+
+    def _wait(self, arrival: Arrival, stamp: int) -> None:
+        if self._waiting_bytes >= self._maximum_bytes:
+            self.dropped_full += 1
+            return
+        self._number += 1
+        self._waiting_bytes += len(arrival.payload) + SAMPLE_OVERHEAD
+        heapq.heappush(self._waiting, (stamp, self._number, arrival))
+
+    def _release(self, until: int | None) -> Iterator[Insert]:
+        """What waits with a stamp up to `until` (None: all), in order."""
+        arrivals, times = [], []
+        while self._waiting and (until is None or self._waiting[0][0] <= until):
+            stamp, _, arrival = heapq.heappop(self._waiting)
+            self._waiting_bytes -= len(arrival.payload) + SAMPLE_OVERHEAD
+            arrivals.append(arrival)
+            times.append(stamp)
+        if arrivals:
+            yield Insert(arrivals, times)
+
+    def _know(self, client: str) -> None:
+        if self._some_client is None:
+            self._some_client = client
+        elif client != self._some_client:
+            self._several_clients = True
+
+    def _jumped(self, client: str, stamp: int, newest: int) -> bool:
         """Whether this sample, which does not fit, shows that time jumped; else it is dropped."""
-        if any(abs(stamp - other) > self._max_ahead for other in self._astray.values()):
-            self._astray.clear()
-            self._astray_count = 0
-        self._astray[client] = stamp
-        self._astray_count += 1
-        if self._astray_count >= 2 and len(self._astray) >= min(2, len(self._clients)):
-            self._astray.clear()
-            self._astray_count = 0
-            return True
-        if self._newest is not None and stamp > self._newest:
+        row = self._row
+        if row is not None and abs(stamp - row.last) <= self._max_ahead:
+            row.several = row.several or client != row.client
+            row.last = stamp
+            if row.several or not self._several_clients or abs(stamp - row.first) >= self._alone_after:
+                self._row = None
+                return True
+        else:
+            self._row = _Row(client, stamp, stamp)
+        if stamp > newest:
             self.dropped_ahead += 1
         else:
             self.dropped_late += 1

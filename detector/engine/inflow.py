@@ -1,0 +1,115 @@
+"""The way of a sample into the buffer: whose it is, and which lane takes it.
+
+Keys and clients come from outside, so there are bounds on how many are remembered: a publisher that makes up names
+costs no more memory than the bounds allow, and does not push out the clients that are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+from detector.engine.buffer import Buffer, Lane
+from detector.engine.clients import Clients
+from detector.engine.counters import Counters
+from detector.engine.messages import KeyReader
+from detector.engine.sample import Arrival, Sample
+from wayside.api import Detector
+
+MAXIMUM_CLIENTS = 100_000
+"""So many clients are known at a time; samples of further ones are dropped and counted."""
+
+MAXIMUM_KEYS = 200_000
+"""So many keys of a stream are remembered; beyond, they are read anew, which is slower and otherwise the same."""
+
+MAXIMUM_LOST = 1_000
+"""Of so many lost clients the newest samples are kept, for the case that they return; those lost first go first."""
+
+_new_sample = tuple.__new__
+"""Makes a Sample from a plain tuple at a third of the cost of calling the class: it is made for every message."""
+
+_NO_LANES: Mapping[str, Lane] = {}
+
+
+class Inflow:
+    """Puts arrivals into the lanes of their clients and streams."""
+
+    def __init__(self, buffer: Buffer, clients: Clients, counters: Counters) -> None:
+        self._buffer = buffer
+        self._clients = clients
+        self._counters = counters
+        self._number = 0
+        self._lost: dict[str, None] = {}
+        """The lost clients of which samples are kept, in the order of their loss."""
+
+    def configure(self, detector: Detector, read_key: KeyReader) -> None:
+        """Take in the streams of this Detector from now on."""
+        self._detector = detector
+        self._read_key = read_key
+        self._streams = {stream.name: stream for stream in detector.spec.streams}
+        self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
+
+    def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
+        """The hot path: everything that is received comes through here. `times`: None for the receive times."""
+        lanes, grew, samples, number = self._lanes, self._buffer.grew, self._counters.samples, self._number
+        for index, (received, stream, key, payload) in enumerate(arrivals):
+            time = received if times is None else times[index]  # with clock Data, there is no other time
+            lane = lanes.get(stream, _NO_LANES).get(key)
+            if lane is None:
+                lane = self._route(stream, key, time)
+                if lane is None:
+                    continue
+            number += 1
+            grew(lane.insert(_new_sample(Sample, (time, number, payload, time, key))))
+            samples[stream] += 1
+        self._number = number
+
+    def client_of(self, arrival: Arrival) -> str | None:
+        """Whose the arrival is; None, and counted, where its key names no valid client."""
+        lane = self._lanes.get(arrival.stream, _NO_LANES).get(arrival.key)
+        return lane.client if lane is not None else self._read(arrival.stream, arrival.key)
+
+    def lose(self, lost: Collection[str]) -> None:
+        """These clients are lost. The next sample of one makes it known again; its last samples are still there then.
+
+        (A latched sample would not come again, since its sender may not know that it was away.)
+        """
+        for lanes in self._lanes.values():
+            for key in [key for key, lane in lanes.items() if lane.client in lost]:
+                del lanes[key]
+        self._lost.update(dict.fromkeys(lost))
+        while len(self._lost) > MAXIMUM_LOST:
+            client = next(iter(self._lost))
+            del self._lost[client]
+            self._buffer.forget(client)
+
+    def _route(self, stream: str, key: str, time: int) -> Lane | None:
+        """The lane for a key that has none at hand: a new key, or one of a client that was lost."""
+        client = self._read(stream, key)
+        if client is None:
+            return None
+        if client not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS:
+            self._counters.crowded[stream] += 1
+            return None
+        spec = self._streams[stream]
+        limit = spec.buffer.bytes
+        lane = self._buffer.add(
+            Lane(
+                client,
+                stream,
+                self._detector.spec.buffer_duration_ns(spec),
+                None if limit is None else limit.bytes,
+            )
+        )
+        if len(self._lanes[stream]) >= MAXIMUM_KEYS:
+            self._lanes[stream].clear()
+        self._lanes[stream][key] = lane
+        self._lost.pop(client, None)
+        self._clients.heard(client, time)
+        return lane
+
+    def _read(self, stream: str, key: str) -> str | None:
+        whose = self._read_key(stream, key) if stream in self._streams else None
+        if whose is None:
+            self._counters.unnamed[stream] += 1  # also what still came in on a stream that the Detector no longer has
+            return None
+        return whose[0]

@@ -1,0 +1,107 @@
+"""What expressions over one sample see of it: payloads are decoded when they are asked for, and stamps are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from detector.engine.counters import Counters
+from detector.engine.sample import DecodeError, Decoder, Sample
+from wayside.expressions import UNKNOWN, EvaluationError
+from wayside.rules import CompiledStream
+
+_MISSING = object()
+
+
+class KeyReader(Protocol):
+    """Tells whose a sample is."""
+
+    def __call__(self, stream: str, key: str) -> tuple[str, Mapping[str, str]] | None:
+        """The client and the captured chunks; None where the key names no valid client."""
+
+
+class Messages:
+    """Decodes payloads when an expression asks for them, each at most once a tick."""
+
+    def __init__(
+        self,
+        decoders: Mapping[str, Decoder],
+        streams: Mapping[str, CompiledStream],
+        read_key: KeyReader,
+        counters: Counters,
+    ) -> None:
+        self._decoders = decoders
+        self._streams = streams
+        self._read_key = read_key
+        self._counters = counters
+        self._decoded: dict[tuple[str, int], Any] = {}
+
+    def forget(self) -> None:
+        """Drop what was decoded: the tick is over."""
+        self._decoded.clear()
+
+    def message(self, stream: str, sample: Sample) -> Any:
+        """The decoded sample, or UNKNOWN where it cannot be read; that is counted."""
+        at = (stream, sample.number)
+        message = self._decoded.get(at, _MISSING)
+        if message is _MISSING:
+            try:
+                message = self._decoders[stream].decode(sample.payload)
+            except DecodeError as error:
+                self._unreadable(stream, error)
+                message = UNKNOWN
+            self._decoded[at] = message
+        return message
+
+    def values(self, stream: str, sample: Sample, names: frozenset[str]) -> dict[str, Any] | None:
+        """What an expression over one sample sees; None where the sample cannot be read."""
+        values: dict[str, Any] = {}
+        if "msg" in names:
+            message = self.message(stream, sample)
+            if message is UNKNOWN:
+                return None
+            values["msg"] = message
+        if "key" in names:
+            whose = self._read_key(stream, sample.key)
+            values["key"] = {} if whose is None else whose[1]
+        if "sample" in names:
+            try:
+                stamp = self._stamp(stream, sample.payload)
+            except (DecodeError, EvaluationError, ValueError):
+                stamp = None
+            values["sample"] = {
+                "received": sample.received / 1e9,
+                "size": float(len(sample.payload)),
+                **({} if stamp is None else {"stamp": stamp / 1e9, "latency": (sample.received - stamp) / 1e9}),
+            }
+        return values
+
+    def time(self, stream: str, received: int, payload: bytes) -> int | None:
+        """A sample's time with clock Data, in nanoseconds: its stamp, or the receive time where it carries none.
+
+        None where it cannot be read; that is counted.
+        """
+        try:
+            stamp = self._stamp(stream, payload)
+        except (DecodeError, EvaluationError, ValueError) as error:
+            self._unreadable(stream, error)
+            return None
+        return received if stamp is None else stamp
+
+    def _stamp(self, stream: str, payload: bytes) -> int | None:
+        """The sender's time in nanoseconds, where the message carries one."""
+        decoder, expression = self._decoders[stream], self._streams[stream].stamp
+        if expression is None:
+            return decoder.stamp(payload)
+        return _nanoseconds(expression.evaluate({"msg": decoder.decode(payload)}))
+
+    def _unreadable(self, stream: str, error: Exception) -> None:
+        self._counters.undecodable[stream] += 1
+        self._counters.last_undecodable[stream] = str(error)
+
+
+def _nanoseconds(seconds: object) -> int:
+    """A stamp in seconds, to the microsecond: a double holds no more of a time since the epoch."""
+    if not isinstance(seconds, int | float) or not 0 <= seconds < 1e11:
+        raise ValueError(f"stamp {seconds!r} is no time in seconds since the epoch")
+    return round(seconds * 1e6) * 1000

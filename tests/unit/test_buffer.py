@@ -1,0 +1,148 @@
+"""The buffer: order, caps, and bytes that add up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detector.engine.buffer import Buffer, Lane
+from detector.engine.sample import SAMPLE_OVERHEAD, Sample
+
+
+def a_lane(client: str = "car", stream: str = "s", duration: int = 10**9, maximum_bytes: int | None = None) -> Lane:
+    return Lane(client, stream, duration, maximum_bytes)
+
+
+def a_sample(time: int, number: int = 0, payload: bytes = b"") -> Sample:
+    return Sample(time, number, payload, time, "k")
+
+
+def held(buffer: Buffer) -> int:
+    return sum(len(sample.payload) + SAMPLE_OVERHEAD for lane in buffer for sample in lane.samples)
+
+
+@given(st.lists(st.integers(0, 20)))
+def test_samples_stand_in_order_of_time_and_ties_in_order_of_arrival(times: list[int]) -> None:
+    lane = a_lane()
+    for number, time in enumerate(times):
+        lane.insert(a_sample(time, number))
+    assert [(sample.time, sample.number) for sample in lane.samples] == sorted(
+        (time, number) for number, time in enumerate(times)
+    )
+    if times:
+        assert lane.latest == max(times)
+
+
+@given(st.lists(st.integers(0, 30)), st.integers(0, 40), st.integers(1, 40))
+def test_a_window_leaves_out_its_beginning_and_takes_in_its_end(times: list[int], now: int, over: int) -> None:
+    lane = a_lane()
+    for number, time in enumerate(times):
+        lane.insert(a_sample(time, number))
+    window = [sample.time for sample in lane.newest_first(now - over, now)]
+    assert window == sorted((time for time in times if now - over < time <= now), reverse=True)
+
+
+@given(st.lists(st.integers(0, 50), min_size=1), st.integers(0, 60), st.integers(1, 60))
+def test_what_is_older_than_the_duration_goes_but_the_newest_never(times: list[int], now: int, duration: int) -> None:
+    lane = a_lane(duration=duration)
+    for number, time in enumerate(times):
+        lane.insert(a_sample(time, number))
+    freed = lane.expire(now)
+    young = sorted(time for time in times if time > now - duration)
+    assert [sample.time for sample in lane.samples] == (young or [max(times)])
+    assert freed == (len(times) - len(lane.samples)) * SAMPLE_OVERHEAD
+
+
+def test_beyond_its_bytes_a_lane_forgets_the_oldest() -> None:
+    lane = a_lane(maximum_bytes=2 * (SAMPLE_OVERHEAD + 10))
+    for time in range(4):
+        lane.insert(a_sample(time, payload=b"x" * 10))
+    assert [sample.time for sample in lane.samples] == [2, 3]
+    assert lane.evicted == 2
+
+
+def test_a_sample_bigger_than_the_lane_may_hold_is_held_alone() -> None:
+    lane = a_lane(maximum_bytes=5)
+    for time in range(3):
+        lane.insert(a_sample(time, payload=b"x" * 10))
+    assert [sample.time for sample in lane.samples] == [2]
+
+
+def test_the_cap_over_all_pushes_out_the_oldest_wherever_it_is() -> None:
+    buffer = Buffer(6 * SAMPLE_OVERHEAD)
+    lanes = [buffer.add(a_lane(client)) for client in ("a", "b", "c")]
+    for time in (5, 1, 4, 2, 6, 3):
+        buffer.grew(lanes[time % 3].insert(a_sample(time)))
+    assert buffer.evicted == 0
+    buffer.grew(lanes[0].insert(a_sample(7)))
+    assert sorted(sample.time for lane in buffer for sample in lane.samples) == [3, 4, 5, 6, 7]
+    assert buffer.evicted == 2
+    buffer.forget("b")  # whose lane had held the oldest
+    assert buffer.evicted == 2
+
+
+def test_the_newest_of_all_stays_when_the_cap_leaves_room_for_one() -> None:
+    buffer = Buffer(2 * SAMPLE_OVERHEAD)
+    lane = buffer.add(a_lane())
+    for time in range(50):
+        buffer.grew(lane.insert(a_sample(time)))
+        assert lane.newest is not None
+        assert lane.newest.time == time
+
+
+@dataclass
+class Doing:
+    """A step of the life of a buffer."""
+
+    what: str
+    client: str = ""
+    stream: str = ""
+    time: int = 0
+    payload: bytes = field(default=b"", repr=False)
+
+
+doings = st.one_of(
+    st.builds(
+        Doing,
+        st.just("insert"),
+        st.sampled_from("abc"),
+        st.sampled_from("st"),
+        st.integers(0, 100),
+        st.binary(max_size=300),
+    ),
+    st.builds(Doing, st.just("expire"), time=st.integers(0, 120)),
+    st.builds(Doing, st.just("forget"), st.sampled_from("abc")),
+    st.builds(Doing, st.just("keep"), stream=st.sampled_from("st")),
+    st.builds(Doing, st.just("clear")),
+)
+
+
+@given(st.lists(doings, max_size=60), st.integers(200, 3_000), st.one_of(st.none(), st.integers(200, 1_000)))
+def test_the_bytes_are_those_of_what_is_held_and_within_the_cap(
+    steps: list[Doing], cap: int, lane_cap: int | None
+) -> None:
+    buffer = Buffer(cap)
+    came: set[int] = set()
+    for number, step in enumerate(steps):
+        match step.what:
+            case "insert":
+                lane = buffer.add(a_lane(step.client, step.stream, 50, lane_cap))
+                buffer.grew(lane.insert(a_sample(step.time, number, step.payload)))
+                came.add(number)
+            case "expire":
+                buffer.expire(step.time)
+            case "forget":
+                buffer.forget(step.client)
+                assert all(lane.client != step.client for lane in buffer)
+            case "keep":
+                buffer.keep({step.stream})
+                assert all(lane.stream == step.stream for lane in buffer)
+            case _:
+                buffer.clear()
+        assert buffer.bytes == held(buffer) <= cap
+        assert all(lane.bytes == sum(len(s.payload) + SAMPLE_OVERHEAD for s in lane.samples) for lane in buffer)
+        assert {sample.number for lane in buffer for sample in lane.samples} <= came
+        for client, latest in buffer.latest():
+            assert all(sample.time <= latest for lane in buffer if lane.client == client for sample in lane.samples)

@@ -1,0 +1,107 @@
+"""The intake: one order for all streams, whoever puts, and never a wait."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+
+from detector.engine.intake import Intake
+from detector.engine.sample import Arrival
+
+
+class Clock:
+    """A clock that a test sets; it may stand still and go back."""
+
+    def __init__(self, now: int) -> None:
+        self.now = now
+
+    def __call__(self) -> int:
+        return self.now
+
+
+def test_many_threads_at_once_get_receive_times_that_strictly_increase_in_the_order_of_the_queue() -> None:
+    intake = Intake(time.time_ns)
+    begin = threading.Barrier(8)
+
+    def publish(stream: str) -> None:
+        put = intake.putter(stream)
+        begin.wait()
+        for number in range(2_000):
+            put(f"k/{number}", b"x")
+
+    threads = [threading.Thread(target=publish, args=(f"s{index}",)) for index in range(8)]
+    for thread in threads:
+        thread.start()
+    arrivals: list[Arrival] = []
+    boundaries = []
+    while any(thread.is_alive() for thread in threads):
+        until = time.time_ns()
+        arrivals += intake.drain(until)
+        boundaries.append((len(arrivals), until))
+    arrivals += intake.drain(time.time_ns())
+    for thread in threads:
+        thread.join()
+
+    times = [arrival.received for arrival in arrivals]
+    assert len(times) == 16_000
+    assert all(first < second for first, second in itertools.pairwise(times))
+    for count, until in boundaries:
+        assert all(received > until for received in times[count:])
+    for index in range(8):  # and each publisher's own order is kept
+        own = [arrival.key for arrival in arrivals if arrival.stream == f"s{index}"]
+        assert own == [f"k/{number}" for number in range(2_000)]
+
+
+def test_a_clock_that_stands_still_or_goes_back_does_not_repeat_a_time() -> None:
+    clock = Clock(100)
+    intake = Intake(clock)
+    put = intake.putter("s")
+    for now in (100, 100, 40, 101, 500):
+        clock.now = now
+        put("k", b"")
+    assert [arrival.received for arrival in intake.drain(0)] == [100, 101, 102, 103, 500]
+
+
+def test_what_comes_after_a_drain_is_later_than_its_tick() -> None:
+    intake = Intake(Clock(100))
+    put = intake.putter("s")
+    assert intake.drain(1_000) == []
+    put("k", b"")
+    assert [arrival.received for arrival in intake.drain(1_000)] == [1_001]
+    assert intake.last == 1_001
+
+
+def test_a_full_queue_drops_what_comes_and_counts_it() -> None:
+    intake = Intake(Clock(0), maximum_count=2)
+    put = intake.putter("s")
+    for key in "abcd":
+        put(key, b"")
+    assert intake.dropped == 2
+    assert [arrival.key for arrival in intake.drain(0)] == ["a", "b"]
+    put("e", b"")
+    assert [arrival.key for arrival in intake.drain(0)] == ["e"]
+    assert intake.dropped == 2
+
+
+def test_the_bytes_that_wait_are_bounded_over_all_streams() -> None:
+    intake = Intake(Clock(0), maximum_bytes=10)
+    first, second = intake.putter("s"), intake.putter("t")
+    first("a", b"12345")
+    second("b", b"67890")
+    first("c", b"")
+    assert intake.dropped == 1
+    assert [arrival.key for arrival in intake.drain(0)] == ["a", "b"]
+    first("d", b"1")
+    assert intake.dropped == 1
+
+
+def test_after_a_step_back_of_the_clock_time_goes_on_from_there() -> None:
+    clock = Clock(1_000)
+    intake = Intake(clock)
+    put = intake.putter("s")
+    put("a", b"")
+    clock.now = 200
+    assert [arrival.key for arrival in intake.step_back(200)] == ["a"]
+    put("b", b"")
+    assert [arrival.received for arrival in intake.drain(0)] == [201]
