@@ -106,17 +106,22 @@ class HolderLease:
         self.held = asyncio.Event()
         """Set while this process may emit tasks. An outage of the API server does not clear it: nobody else can have
         taken over."""
-        self.renewals = 0
+        self.attempts = 0
+        """How often it was looked at, to renew or acquire it."""
+        self.failures = 0
+        """How many of the attempts failed."""
 
     async def run(self) -> None:
         """Acquire and renew until `stop`, then release."""
         while not self._stopping.is_set():
+            self.attempts += 1
             try:
                 delay = await self._once()
                 self._backoff.succeed()
             except ApiError as error:
                 if not self._backoff.failures:
                     _log.warning("cannot renew the Lease %s, and try again until I can: %s", self.name, error)
+                self.failures += 1
                 delay = self._backoff.fail()
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._stopping.wait(), delay)
@@ -150,7 +155,6 @@ class HolderLease:
             _log.info("holding the Lease %s as %s", self.name, self._identity.text)
         self._refused_by = ""
         self.held.set()
-        self.renewals += 1
         return self._duration / 3
 
     def _renewed(self, lease: JsonObject | None) -> JsonObject:

@@ -1,0 +1,178 @@
+"""The holder's Lease: renewed while the detector lives, and never held by two."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Future
+from datetime import datetime
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from detector.actions.lease import HolderLease, Identity
+from tests.cluster.api import Api, Object
+from tests.cluster.background import PATIENCE, Background, background
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.waiting import wait_until
+
+NAME = "wayside-intersection-a"
+
+
+class Holding:
+    """A process that wants the Lease, as far as the Lease is concerned."""
+
+    def __init__(self, loop: Background, namespace: str, identity: Identity, **options: Any):
+        self._loop = loop
+        self.lease = loop.call(self._make(namespace, identity, options))
+        self._future: Future[None] = loop.start(self.lease.run())
+
+    async def _make(self, namespace: str, identity: Identity, options: dict[str, Any]) -> HolderLease:
+        return HolderLease(self._loop.api, namespace, "intersection-a", identity, **options)
+
+    @property
+    def held(self) -> bool:
+        return self.lease.held.is_set()
+
+    def wait_held(self, held: bool = True, timeout: float = 10) -> None:
+        wait_until(lambda: self.held, lambda state: state is held, timeout=timeout, what=f"held is {held}")
+
+    def stop(self) -> None:
+        self._loop.loop.call_soon_threadsafe(self.lease.stop)
+        self._future.result(PATIENCE)
+
+    def die(self) -> None:
+        """As by kill -9: nothing is said to anybody."""
+        self._future.cancel()
+        with pytest.raises(CancelledError):
+            self._future.result(PATIENCE)
+
+
+@pytest.fixture
+def loop(control_plane: ControlPlane) -> Iterator[Background]:
+    with background(control_plane.kubeconfig) as started:
+        yield started
+
+
+def renewals(api: Api, count: int) -> list[Object]:
+    """The specs that the Lease has one after the other."""
+    seen: list[Object] = []
+
+    def look() -> list[Object]:
+        spec = api.get("Lease", NAME)["spec"]
+        if not seen or seen[-1] != spec:
+            seen.append(spec)
+        return seen
+
+    return wait_until(look, lambda specs: len(specs) >= count, timeout=15, what=f"{count} states of the Lease")
+
+
+def moment(spec: Object) -> datetime:
+    return datetime.fromisoformat(spec["renewTime"])
+
+
+def test_it_lasts_15_seconds_and_belongs_to_the_pod(
+    api: Api, namespace: str, loop: Background, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pod = {"containers": [{"name": "detector", "image": "registry.example/detector:1"}]}
+    created = api.create({"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "detector-1"}, "spec": pod})
+    monkeypatch.setenv("POD_NAME", "detector-1")
+    monkeypatch.setenv("POD_UID", created["metadata"]["uid"])
+    Holding(loop, namespace, Identity.of_this_process()).wait_held()
+    lease = api.get("Lease", NAME)
+    assert lease["spec"]["leaseDurationSeconds"] == 15
+    assert lease["spec"]["holderIdentity"] == "detector-1"
+    [owner] = lease["metadata"]["ownerReferences"]
+    assert (owner["kind"], owner["name"], owner["uid"]) == ("Pod", "detector-1", created["metadata"]["uid"])
+
+
+def test_it_is_renewed_after_each_third_of_its_duration(api: Api, namespace: str, loop: Background) -> None:
+    Holding(loop, namespace, Identity("pod-1"), duration=3.0).wait_held()
+    specs = renewals(api, 4)
+    gaps = [(moment(after) - moment(before)).total_seconds() for before, after in pairwise(specs)]
+    assert all(0.9 < gap < 2.0 for gap in gaps), gaps
+    assert {spec["leaseTransitions"] for spec in specs} == {0}
+    assert len({spec["acquireTime"] for spec in specs}) == 1
+
+
+def test_one_that_was_deleted_by_hand_comes_back(api: Api, namespace: str, loop: Background) -> None:
+    Holding(loop, namespace, Identity("pod-1"), duration=3.0).wait_held()
+    api.delete("Lease", NAME)
+    api.wait_for("Lease", NAME, lambda _: True, timeout=5, what="the Lease is there again")
+
+
+def test_a_second_process_waits_until_the_first_has_been_silent_for_the_duration(
+    api: Api, namespace: str, loop: Background, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = Holding(loop, namespace, Identity("pod-1"), duration=3.0)
+    first.wait_held()
+    second = Holding(loop, namespace, Identity("pod-2"), duration=3.0)
+    renewals(api, 5)  # for longer than the duration
+    assert first.held
+    assert not second.held
+    assert "held by pod-1" in caplog.text
+    first.die()
+    silent = time.monotonic()
+    second.wait_held()
+    assert 1.5 < time.monotonic() - silent < 6.0
+    assert api.get("Lease", NAME)["spec"]["leaseTransitions"] == 1
+
+
+def test_what_was_released_is_taken_at_once_and_still_lasts(api: Api, namespace: str, loop: Background) -> None:
+    first = Holding(loop, namespace, Identity("pod-1"))
+    first.wait_held()
+    first.stop()
+    released = api.get("Lease", NAME)["spec"]
+    assert released.get("holderIdentity") in {None, ""}
+    assert released["leaseDurationSeconds"] == 15, "the manager keeps counting the demands for the usual time"
+    Holding(loop, namespace, Identity("pod-2")).wait_held(timeout=2)
+
+
+def test_the_next_container_of_the_same_pod_takes_over_at_once(namespace: str, loop: Background) -> None:
+    first = Holding(loop, namespace, Identity("pod-1"))
+    first.wait_held()
+    first.die()
+    Holding(loop, namespace, Identity("pod-1")).wait_held(timeout=2)
+
+
+def test_a_process_that_died_on_this_machine_is_succeeded_at_once_and_a_live_one_is_not(
+    namespace: str, loop: Background
+) -> None:
+    own = Identity.of_this_process()
+    machine = own.text.removesuffix(str(os.getpid()))
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        first = Holding(loop, namespace, Identity(f"{machine}{other.pid}"))
+        first.wait_held()
+        first.die()
+        second = Holding(loop, namespace, own)
+        wait_until(lambda: second.lease.attempts, lambda n: n >= 2, timeout=5, what="it has tried twice")
+        assert not second.held
+        other.kill()
+    second.wait_held(timeout=3)
+
+
+def test_one_that_was_taken_over_holds_no_more(
+    api: Api, namespace: str, loop: Background, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = Holding(loop, namespace, Identity("pod-1"), duration=3.0)
+    first.wait_held()
+    api.patch("Lease", NAME, {"spec": {"holderIdentity": "pod-2"}})
+    first.wait_held(False)
+    assert "pod-2 has taken over" in caplog.text
+
+
+def test_an_outage_does_not_take_it_away(
+    control_plane: ControlPlane, api: Api, namespace: str, loop: Background
+) -> None:
+    holding = Holding(loop, namespace, Identity("pod-1"), duration=3.0)
+    holding.wait_held()
+    with control_plane.outage():
+        wait_until(lambda: holding.lease.failures, lambda n: n >= 2, timeout=10, what="two renewals failed")
+        assert holding.held
+    before = api.get("Lease", NAME)["spec"]
+    api.wait_for("Lease", NAME, lambda lease: lease["spec"] != before, what="the Lease is renewed again")
+    assert holding.held

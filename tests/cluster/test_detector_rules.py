@@ -1,0 +1,153 @@
+"""The Detector and its rules are followed as they change in the API server."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from detector.rules.kubernetes import ClusterRules
+from detector.rules.selection import RuleSet
+from tests.cluster.api import Api, Object
+from tests.cluster.background import Background, background
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.waiting import wait_until
+
+API_VERSION = "wayside.dev/v1alpha1"
+SITE = {"site": "a"}
+
+
+def detector(**spec: Any) -> Object:
+    stream = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json"}
+    full = {"streams": [stream], "rules": {"matchLabels": SITE}, **spec}
+    return {"apiVersion": API_VERSION, "kind": "Detector", "metadata": {"name": "intersection-a"}, "spec": full}
+
+
+def rule(name: str, labels: dict[str, str] | None = None, **spec: Any) -> Object:
+    full = {"when": "speed > 10", "signals": [{"name": "speed", "stream": "pose", "value": "msg.speed"}], **spec}
+    metadata = {"name": name, "labels": SITE if labels is None else labels}
+    return {"apiVersion": API_VERSION, "kind": "EventRule", "metadata": metadata, "spec": full}
+
+
+class Following:
+    """Collects each set as it comes."""
+
+    def __init__(self, loop: Background, namespace: str):
+        self.sets: list[RuleSet] = []
+        self.rules = loop.call(self._make(loop, namespace))
+        self._future = loop.start(self._follow())
+
+    async def _make(self, loop: Background, namespace: str) -> ClusterRules:
+        return ClusterRules(loop.api, namespace, "intersection-a")
+
+    async def _follow(self) -> None:
+        async for rule_set in self.rules.follow():
+            self.sets.append(rule_set)
+
+    def wait(self, holds: Callable[[RuleSet], bool], what: str, timeout: float = 10) -> RuleSet:
+        sets = wait_until(lambda: self.sets, lambda sets: bool(sets) and holds(sets[-1]), timeout=timeout, what=what)
+        return sets[-1]
+
+    def wait_rules(self, *names: str, timeout: float = 10) -> RuleSet:
+        return self.wait(lambda last: names_of(last) == list(names), f"the rules are {names}", timeout)
+
+
+def names_of(rule_set: RuleSet) -> list[str]:
+    return [each.name for each in rule_set.rules]
+
+
+@pytest.fixture
+def following(control_plane: ControlPlane, namespace: str) -> Iterator[Following]:
+    with background(control_plane.kubeconfig) as loop:
+        yield Following(loop, namespace)
+
+
+def test_the_selected_rules_come_by_name_and_others_do_not(
+    control_plane: ControlPlane, api: Api, namespace: str
+) -> None:
+    for each in (rule("c"), rule("b", {"site": "b"}), rule("a"), detector()):
+        api.create(each)
+    with background(control_plane.kubeconfig) as loop:
+        following = Following(loop, namespace)
+        following.wait_rules("a", "c")
+        assert len(following.sets) == 1, "nothing comes before all is known"
+
+
+def test_each_change_is_followed(api: Api, following: Following) -> None:
+    api.create(detector())
+    following.wait_rules()
+    api.create(rule("a"))
+    following.wait_rules("a")
+    api.apply(rule("b", {"site": "elsewhere"}))
+    api.apply(rule("a", when="speed > 20"))
+    following.wait(lambda last: last.rules[0].spec.when == "speed > 20", "the rule is the changed one")
+    api.apply(rule("b"))
+    following.wait_rules("a", "b")
+    api.delete("EventRule", "a")
+    following.wait_rules("b")
+    api.patch("Detector", "intersection-a", {"spec": {"rules": {"matchLabels": {"site": "none"}}}})
+    following.wait_rules()
+    api.patch("Detector", "intersection-a", {"spec": {"clientTimeout": "7s"}})
+    following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the Detector is the changed one")
+
+
+def test_a_status_or_an_annotation_is_no_change(api: Api, following: Following) -> None:
+    api.create(detector())
+    api.create(rule("a"))
+    following.wait_rules("a")
+    before = len(following.sets)
+    api.patch("EventRule", "a", {"status": {"observedGeneration": 1}}, subresource="status")
+    api.patch("EventRule", "a", {"metadata": {"annotations": {"note": "to self"}}})
+    api.create(rule("b"))
+    following.wait_rules("a", "b")
+    assert len(following.sets) == before + 1
+
+
+def test_the_last_known_set_holds_while_the_detector_is_gone(
+    api: Api, following: Following, caplog: pytest.LogCaptureFixture
+) -> None:
+    wait_until(lambda: caplog.text, lambda text: "no Detector 'intersection-a'" in text, timeout=5, what="it is said")
+    api.create(detector())
+    api.create(rule("a"))
+    following.wait_rules("a")
+    before = len(following.sets)
+    api.delete("Detector", "intersection-a")
+    api.create(rule("b"))
+    wait_until(lambda: caplog.text.count("no Detector"), lambda n: n == 2, timeout=5, what="it is said again")
+    assert len(following.sets) == before
+    api.create(detector())
+    following.wait_rules("a", "b")
+
+
+def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
+    api: Api, following: Following, caplog: pytest.LogCaptureFixture
+) -> None:
+    # A map's keys are one thing that a CRD's schema cannot say, so the API server lets this in.
+    deploy = {"name": "x", "deploy": {"template": "t", "parameters": {"not-an-identifier": 1}}}
+    api.create(detector())
+    api.create(rule("broken", actions=[deploy]))
+    api.create(rule("sound"))
+    following.wait_rules("sound")
+    wait_until(lambda: following.rules.problems, bool, timeout=5, what="the problem is known")
+    assert "not-an-identifier" in following.rules.problems["EventRule broken"]
+    assert "EventRule broken cannot be read" in caplog.text
+    api.apply(rule("broken", actions=[]))
+    following.wait_rules("broken", "sound")
+    assert following.rules.problems == {}
+
+
+def test_what_changed_during_an_outage_is_seen_after_it(
+    control_plane: ControlPlane, api: Api, following: Following
+) -> None:
+    api.create(detector())
+    api.create(rule("a"))
+    api.create(rule("b"))
+    following.wait_rules("a", "b")
+    before = len(following.sets)
+    with control_plane.outage():
+        assert len(following.sets) == before
+    api.delete("EventRule", "a")
+    api.create(rule("c"))
+    following.wait_rules("b", "c", timeout=15)
+    assert all(set(names_of(each)) & {"a", "b"} for each in following.sets[before:]), "the outage took no rule away"
