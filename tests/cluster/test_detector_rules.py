@@ -132,7 +132,7 @@ def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
     wait_until(lambda: following.rules.problems, bool, timeout=5, what="the problem is known")
     assert "not-an-identifier" in following.rules.problems["EventRule broken"]
     assert "EventRule broken cannot be read" in caplog.text
-    api.apply(rule("broken", actions=[]))
+    api.patch("EventRule", "broken", {"spec": {"actions": []}})
     following.wait_rules("broken", "sound")
     assert following.rules.problems == {}
 
