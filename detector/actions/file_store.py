@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -43,7 +43,7 @@ class FileTaskStore:
         self._lock = asyncio.Lock()
         self._interval = interval
 
-    async def follow(self) -> AsyncIterator[Snapshot | Update]:
+    async def follow(self) -> AsyncGenerator[Snapshot | Update, None]:
         """See `TaskStore`. All changes come as snapshots."""
         away = False
         while True:

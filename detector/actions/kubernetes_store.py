@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncGenerator, Iterator, Mapping
 from contextlib import contextmanager
 
 from pydantic import ValidationError
@@ -43,7 +43,7 @@ class KubernetesTaskStore:
         self._resync = resync
         self._unreadable: set[str] = set()
 
-    async def follow(self) -> AsyncIterator[Snapshot | Update]:
+    async def follow(self) -> AsyncGenerator[Snapshot | Update, None]:
         """See `TaskStore`."""
         selectors = {"labelSelector": f"{HOLDER_LABEL}={holder_label(self._holder)}"}
         reflector = Reflector(self._api, TASKS, self._namespace, selectors, self._resync)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -76,7 +77,7 @@ class TaskExistsError(StoreError):
 class TaskStore(Protocol):
     """The tasks of one holder. Every method but `follow` raises a `StoreError`."""
 
-    def follow(self) -> AsyncIterator[Snapshot | Update]:
+    def follow(self) -> AsyncGenerator[Snapshot | Update, None]:
         """What is, then what changes, with a fresh snapshot at least every half minute. Never ends, raises nothing."""
 
     async def get(self, name: str) -> StoredTask | None:
@@ -100,10 +101,11 @@ async def restore(store: TaskStore) -> list[Demand]:
 
     Waits for as long as the store is away; cancel it to give up.
     """
-    async for change in store.follow():
-        if isinstance(change, Snapshot):
-            live = (from_task(stored.task) for stored in change.tasks.values() if stored.live and not stored.leaving)
-            return sorted((demand for demand in live if demand), key=lambda demand: (demand.start_time, demand.name))
+    async with aclosing(store.follow()) as changes:
+        async for change in changes:
+            if isinstance(change, Snapshot):
+                live = (from_task(each.task) for each in change.tasks.values() if each.live and not each.leaving)
+                return sorted((demand for demand in live if demand), key=lambda each: (each.start_time, each.name))
     raise AssertionError("a store's changes never end")
 
 

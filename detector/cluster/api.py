@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlencode
@@ -84,7 +84,7 @@ class Api:
 
     async def watch(
         self, resource: Resource, namespace: str, selectors: Mapping[str, str], since: str, seconds: float
-    ) -> AsyncIterator[JsonObject]:
+    ) -> AsyncGenerator[JsonObject, None]:
         """The changes after the resource version `since`, as they happen, for about `seconds`.
 
         Yields:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
+from contextlib import aclosing
 from dataclasses import dataclass
 
 from detector.cluster.api import Api, JsonObject, Resource
@@ -84,26 +85,28 @@ class Reflector:
         self.outages = 0
         """How often the server stopped answering or refused."""
 
-    async def follow(self) -> AsyncIterator[Change]:
+    async def follow(self) -> AsyncGenerator[Change, None]:
         """What is, and then what changes. Never ends and raises nothing; errors are logged, counted and retried."""
         while True:
             try:
                 listed = await self._api.list(self._resource, self._namespace, self._selectors)
                 self._recovered()
                 yield Listed(listed["items"], version_of(listed))
-                async for change in self._watch(listed["metadata"]["resourceVersion"]):
-                    yield change
+                async with aclosing(self._watch(listed["metadata"]["resourceVersion"])) as changes:
+                    async for change in changes:
+                        yield change
                 await asyncio.sleep(_PAUSE)  # a server that ends each watch at once is not to be flooded with lists
             except GoneError:
                 await asyncio.sleep(_PAUSE)  # its history is gone, but the server is there
             except ApiError as error:
                 await asyncio.sleep(self._failed(error))
 
-    async def _watch(self, since: str) -> AsyncIterator[Change]:
+    async def _watch(self, since: str) -> AsyncGenerator[Change, None]:
         events = self._api.watch(self._resource, self._namespace, self._selectors, since, self._resync)
-        async for event in events:
-            kind = Deleted if event["type"] == "DELETED" else Changed
-            yield kind(event["object"])
+        async with aclosing(events):
+            async for event in events:
+                kind = Deleted if event["type"] == "DELETED" else Changed
+                yield kind(event["object"])
 
     def _recovered(self) -> None:
         self.lists += 1

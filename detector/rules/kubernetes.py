@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Generic, TypeVar
 
 from detector.cluster.api import Api, JsonObject, Resource
@@ -52,7 +52,7 @@ class ClusterRules:
             for name, why in known.unreadable.items()
         }
 
-    async def follow(self) -> AsyncIterator[RuleSet]:
+    async def follow(self) -> AsyncGenerator[RuleSet, None]:
         """The set as soon as it is known, then each time that it has changed. Never ends and raises nothing."""
         last: RuleSet | None = None
         tasks = [
