@@ -110,6 +110,11 @@ class Child:
         _register(f"-{self.pid}")
 
 
+def remove_afterwards(folder: Path) -> None:
+    """Have the folder removed when the test run ends, however it ends."""
+    _register(str(folder.absolute()))
+
+
 def _register(message: str) -> None:
     global _reaper  # noqa: PLW0603  one reaper for all children of this process
     with _register_lock:

@@ -59,6 +59,7 @@ def control_plane(request: pytest.FixtureRequest) -> Iterator[ControlPlane]:
 @pytest.fixture
 def namespace(control_plane: ControlPlane, request: pytest.FixtureRequest) -> Iterator[str]:
     """A fresh namespace that has its default service account; deleted afterwards without waiting."""
+    control_plane.recover()
     api = control_plane.api()
     readable = re.sub(r"[^a-z0-9]+", "-", request.node.name.removeprefix("test_").lower()).strip("-")[:40].rstrip("-")
     name = f"{readable}-{secrets.token_hex(3)}"

@@ -7,7 +7,15 @@ from typing import Any
 
 from tests.cluster.api import Object
 
-ABSENT = object()
+
+class Absent:
+    """Stands for a field that is to be removed."""
+
+    def __repr__(self) -> str:
+        return "absent"
+
+
+ABSENT = Absent()
 
 EVENT_RULE: Object = {
     "apiVersion": "wayside.dev/v1alpha1",

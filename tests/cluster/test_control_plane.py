@@ -188,3 +188,12 @@ class TestOutage:
             pass
         api.apply(deployment("app"))
         api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=10, what="the controllers make pods again")
+
+    def test_what_a_failed_test_left_stopped_is_started_for_the_next(
+        self, control_plane: ControlPlane, api: Api
+    ) -> None:
+        control_plane.stop_controller_manager()
+        control_plane.stop_api_server()
+        control_plane.recover()
+        api.apply(deployment("app"))
+        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=10, what="the controllers make pods again")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -121,10 +120,13 @@ def test_what_a_program_started_is_killed_with_it(processes: Processes) -> None:
 
 
 def test_a_killed_test_run_leaves_nothing_behind(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    (data / "inner").mkdir(parents=True)
     run = f"""
 import os, signal, sys
 from pathlib import Path
-from tests.cluster.children import Child
+from tests.cluster.children import Child, remove_afterwards
+remove_afterwards(Path({str(data)!r}))
 ended = Child("ended", ["true"], Path({str(tmp_path)!r}) / "ended.log")
 ended.wait(5)
 left = Child("left", [sys.executable, "-c", "import signal; signal.pause()"], Path({str(tmp_path)!r}) / "left.log")
@@ -135,4 +137,4 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert done.returncode == -9
     left = int(done.stdout)
     wait_until(lambda: exists(left), lambda lives: not lives, timeout=5, what=f"process {left} is killed")
-    assert exists(os.getpid())
+    wait_until(data.exists, lambda there: not there, timeout=5, what="its data is removed")

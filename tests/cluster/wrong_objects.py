@@ -1,0 +1,204 @@
+"""What the API server must refuse: wrong objects and forbidden changes of each kind, and what it says of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.cluster.manifests import ABSENT, EVENT_RULE
+
+Changes = dict[str, Any]
+
+PAIRS = "spec.scope.pairs"
+STREAM = "spec.streams.0"
+PARAMETER = "spec.parameters.rateHz"
+
+WRONG: list[tuple[str, str, Changes, str]] = [
+    # kind, what is wrong, how it becomes so, what the message says
+    (
+        "EventRule",
+        "two scopes",
+        {"spec.scope.client": {}},
+        r"spec\.scope: .*exactly one of client and pairs must be given",
+    ),
+    ("EventRule", "no scope", {"spec.scope": {}}, r"spec\.scope: .*exactly one of client and pairs must be given"),
+    ("EventRule", "no condition", {"spec.when": ABSENT}, r"spec\.when: Required value"),
+    ("EventRule", "an empty condition", {"spec.when": ""}, r"spec\.when: .*at least 1 chars"),
+    ("EventRule", "a number as condition", {"spec.when": True}, r"spec\.when: .*must be of type string"),
+    ("EventRule", "a duration without unit", {"spec.for": "2"}, r"spec\.for: .*\(ms\|s\|m\|h\)"),
+    ("EventRule", "a duration as number", {"spec.cooldown": 30}, r"spec\.cooldown: .*must be of type string"),
+    ("EventRule", "evaluation too often", {"spec.evaluation.every": "5ms"}, r"every: give 10ms or more"),
+    ("EventRule", "an unknown field", {"spec.untl": "distance > 200"}, r'unknown field "spec\.untl"'),
+    (
+        "EventRule",
+        "an unknown aggregate",
+        {"spec.signals.0.aggregate": "Maximum"},
+        r'spec\.signals\[0\]\.aggregate: Unsupported value: "Maximum": supported values: .*"Max"',
+    ),
+    (
+        "EventRule",
+        "an aggregate without its window",
+        {"spec.signals.0.over": ABSENT},
+        r"spec\.signals\[0\]: .*need a window: give over, e\.g\. over: 5s",
+    ),
+    (
+        "EventRule",
+        "a signal without value",
+        {"spec.signals.0.value": ABSENT},
+        r"spec\.signals\[0\]: .*give value, e\.g\. value: msg\.speed",
+    ),
+    (
+        "EventRule",
+        "a value that is not looked at",
+        {"spec.signals.0.aggregate": "Count"},
+        r"none for the aggregates Count and Age, which look at no value",
+    ),
+    (
+        "EventRule",
+        "two signals of one name",
+        {"spec.signals.1": EVENT_RULE["spec"]["signals"][0]},
+        r'spec\.signals\[1\]: Duplicate value: .*"speed"',
+    ),
+    ("EventRule", "a signal's name that is no variable", {"spec.signals.0.name": "my-speed"}, r"signals\[0\]\.name: "),
+    ("EventRule", "no distance at all", {f"{PAIRS}.within": 0}, r"spec\.scope\.pairs\.within: .*greater than 0"),
+    (
+        "EventRule",
+        "a classification that the scheme does not know",
+        {"spec.classification.overarchingPurpose": ["Fun"]},
+        r'spec\.classification\.overarchingPurpose\[0\]: Unsupported value: "Fun": supported values: .*"Safety"',
+    ),
+    (
+        "EventRule",
+        "a template's name that is too long",
+        {"spec.actions.0.deploy.template": "x" * 41},
+        r"spec\.actions\[0\]\.deploy\.template: Too long: may not be more than 40 ",
+    ),
+    (
+        "EventRule",
+        "an action that does nothing",
+        {"spec.actions.0.deploy": ABSENT},
+        r"spec\.actions\[0\]\.deploy: Required value",
+    ),
+    ("EventRule", "a name that is too long", {"metadata.name": "x" * 64}, r"metadata\.name: .*63"),
+    ("Detector", "no streams", {"spec.streams": []}, r"spec\.streams: .*at least 1 items"),
+    (
+        "Detector",
+        "a cdr stream without its type",
+        {f"{STREAM}.type": ABSENT},
+        r"spec\.streams\[0\]: .*type is for cdr streams, and they need it, e\.g\. geometry_msgs",
+    ),
+    (
+        "Detector",
+        "a json stream with a type",
+        {f"{STREAM}.encoding": "json"},
+        r"spec\.streams\[0\]: .*type is for cdr streams",
+    ),
+    (
+        "Detector",
+        "a type that is none",
+        {f"{STREAM}.type": "PoseStamped"},
+        r"spec\.streams\[0\]\.type: .*PoseStamped.*should match",
+    ),
+    (
+        "Detector",
+        "a key without its client",
+        {f"{STREAM}.key": "vehicles/pose"},
+        r"spec\.streams\[0\]: .*key must capture the client, as \$\{client:\*\}, or client must name it",
+    ),
+    (
+        "Detector",
+        "two clients of one stream",
+        {f"{STREAM}.client": "ego"},
+        r"spec\.streams\[0\]: .*key must capture the client.*not both",
+    ),
+    (
+        "Detector",
+        "an unknown encoding",
+        {f"{STREAM}.encoding": "protobuf"},
+        r'spec\.streams\[0\]\.encoding: Unsupported value: "protobuf": supported values: "cdr", "json"',
+    ),
+    ("Detector", "a size without number", {"spec.buffer.bytes": "much"}, r"spec\.buffer\.bytes: .*should match"),
+    ("Detector", "a size as number", {"spec.buffer.bytes": 512}, r"spec\.buffer\.bytes: .*must be of type string"),
+    ("Detector", "a client's name with a slash", {"spec.clients.0.name": "a/b"}, r"spec\.clients\[0\]\.name: "),
+    (
+        "Detector",
+        "two streams of one name",
+        {"spec.streams.1.name": "pose"},
+        r'spec\.streams\[1\]: Duplicate value: .*"pose"',
+    ),
+    ("Detector", "an endpoint that is none", {"spec.zenoh.connect": ["zenoh:7447"]}, r"spec\.zenoh\.connect\[0\]: "),
+    ("Detector", "an unknown clock", {"spec.clock": "Sun"}, r'spec\.clock: Unsupported value: "Sun".*"Wall", "Data"'),
+    ("ApplicationTemplate", "no manifests", {"spec.manifests": []}, r"spec\.manifests: .*at least 1 items"),
+    (
+        "ApplicationTemplate",
+        "a name that is too long for its instances'",
+        {"metadata.name": "x" * 41},
+        r"metadata\.name: .*40",
+    ),
+    (
+        "ApplicationTemplate",
+        "an unknown type",
+        {f"{PARAMETER}.type": "float"},
+        r'spec\.parameters\[?.?rateHz\]?\.type: Unsupported value: "float": supported values: .*"number"',
+    ),
+    (
+        "ApplicationTemplate",
+        "a union of numbers",
+        {f"{PARAMETER}.merge": "Union"},
+        r"spec\.parameters\[?.?rateHz\]?: .*merge Union needs type array",
+    ),
+    (
+        "ApplicationTemplate",
+        "a maximum of strings",
+        {"spec.parameters.region.merge": "Max"},
+        r"merge Max and Min need type number or integer",
+    ),
+    (
+        "ApplicationTemplate",
+        "bounds of a string",
+        {"spec.parameters.region.minimum": 1},
+        r"minimum and maximum need type number or integer",
+    ),
+    ("ApplicationTemplate", "items of a number", {f"{PARAMETER}.items": "string"}, r"items needs type array"),
+    (
+        "ApplicationTemplate",
+        "a lifecycle without unit",
+        {"spec.lifecycle.linger": "30"},
+        r"spec\.lifecycle\.linger: .*should match",
+    ),
+    ("ApplicationTask", "no template", {"spec.template": ABSENT}, r"spec\.template: Required value"),
+    (
+        "ApplicationTask",
+        "a template's name that is none",
+        {"spec.template": "Scene Fusion"},
+        r"spec\.template: .*should match",
+    ),
+    (
+        "ApplicationTask",
+        "a start that is no time",
+        {"spec.event.startTime": "yesterday"},
+        r"spec\.event\.startTime: .*should match",
+    ),
+    ("ApplicationTask", "a priority beyond bounds", {"spec.priority": 2_000_000}, r"spec\.priority: .*1e\+06|1000000"),
+    ("ApplicationTask", "parameters as a list", {"spec.parameters": []}, r"spec\.parameters: .*must be of type object"),
+    ("ApplicationTask", "an unknown field", {"spec.templat": "x"}, r'unknown field "spec\.templat"'),
+    ("ApplicationInstance", "no template", {"spec.template": ABSENT}, r"spec\.template: Required value"),
+    ("ApplicationInstance", "a key as number", {"spec.key": 3}, r"spec\.key: .*must be of type string"),
+    ("ApplicationInstance", "a name that is too long", {"metadata.name": "x" * 64}, r"metadata\.name: .*63"),
+]
+
+TIME = "2026-01-02T03:05:00Z"
+
+UPDATES: list[tuple[str, Changes, str]] = [
+    ("ApplicationTemplate", {"spec.key": "other"}, "spec.key is immutable, also in being there"),
+    ("ApplicationTemplate", {"spec.key": ABSENT}, "spec.key is immutable, also in being there"),
+    ("ApplicationTask", {"spec.template": "other"}, "only spec.parameters may change, and spec.endTime be set"),
+    ("ApplicationTask", {"spec.priority": 4}, "only spec.parameters may change, and spec.endTime be set"),
+    ("ApplicationTask", {"spec.requester.holder": "other"}, "only spec.parameters may change"),
+    ("ApplicationTask", {"spec.requester.subjects": ["car3"]}, "only spec.parameters may change"),
+    ("ApplicationTask", {"spec.requester": ABSENT}, "only spec.parameters may change"),
+    ("ApplicationTask", {"spec.event": ABSENT}, "only spec.parameters may change"),
+    ("ApplicationTask", {"spec.event.startTime": TIME}, "only spec.parameters may change"),
+    ("ApplicationInstance", {"spec.template": "other"}, "spec.template and spec.key are immutable"),
+    ("ApplicationInstance", {"spec.key": "south"}, "spec.template and spec.key are immutable"),
+    ("ApplicationInstance", {"spec.key": ABSENT}, "spec.template and spec.key are immutable"),
+]
