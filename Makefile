@@ -27,8 +27,8 @@ $(BIN)/.installed-dev: $(BIN)/.installed
 demo: $(BIN)/.installed ## the main job: vehicles, events, tasks and what would run, without a cluster
 	@$(BIN)/python examples/cooperative-recording/demo.py --output out
 
-demo-cluster: $(BIN)/.installed-dev ## the same against a real control plane
-	@$(BIN)/python examples/cooperative-recording/demo_cluster.py --output out
+demo-cluster: $(BIN)/.installed-dev ## the same against a real control plane; CONTEXT=current: that of the current kubeconfig
+	@$(BIN)/python examples/cooperative-recording/demo_cluster.py --output out $(if $(filter current,$(CONTEXT)),--current)
 
 test: lint unit cluster ## everything that CI runs
 
