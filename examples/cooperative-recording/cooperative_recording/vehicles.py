@@ -24,7 +24,7 @@ STRAIGHT_ON = 3.0
 FASTEST = 28.0
 """No segment is driven faster than this, in m/s."""
 LOOKAHEAD = FASTEST**2 / (2 * ACCELERATION)
-"""How far ahead, in metres, a driver may have to brake for something: routes are known this much beyond their horizon."""
+"""How far ahead, in metres, one may have to brake: routes are known this much beyond their horizon."""
 
 
 @dataclass(frozen=True, slots=True)
