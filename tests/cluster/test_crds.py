@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from tests.cluster.api import Api, ApiError
 from tests.cluster.controlplane import ControlPlane
@@ -20,6 +22,12 @@ from tests.cluster.manifests import (
     changed,
 )
 from tests.cluster.wrong_objects import TIME, UPDATES, WRONG, Changes
+
+EXAMPLES = [
+    file
+    for file in sorted((Path(__file__).parents[2] / "examples").glob("*/*.yaml"))
+    if "wayside.dev/" in file.read_text()
+]
 
 CHANGED: dict[str, Changes] = {
     "EventRule": {"spec.when": "true"},
@@ -39,6 +47,15 @@ def test_a_valid_object_is_stored_as_it_was_written(kind: str, api: Api) -> None
     written = VALID[kind]
     stored = api.create(written)
     assert _covers(stored["spec"], written["spec"]), stored["spec"]
+
+
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: f"{file.parent.name}/{file.name}")
+def test_every_example_is_accepted(file: Path, api: Api) -> None:
+    manifests = [each for each in yaml.safe_load_all(file.read_text()) if each and "wayside.dev" in each["apiVersion"]]
+    assert manifests
+    for manifest in manifests:
+        manifest["metadata"].pop("namespace", None)
+        api.apply(manifest)
 
 
 @pytest.mark.parametrize(
