@@ -12,8 +12,8 @@ import asyncio
 import json
 import logging
 import re
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from application_manager.client import FIELD_MANAGER, ApiError, Client, Object, Resource
@@ -30,6 +30,19 @@ ObjectKey = tuple[str, str, str]
 _WORKLOADS = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod"})
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What was applied before.
+
+    Attributes:
+        digest: of the rendering that was last applied in full.
+        objects: the uids of what belongs to the instance; None where it may not have been applied.
+    """
+
+    digest: str | None = None
+    objects: Mapping[ObjectKey, str | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +75,7 @@ class Applier:
         self._resources = dict(resources)
         self._fields: dict[str, str] = {}  # uid → the fields that are ours, as of our last apply
         self._drifted: set[str] = set()
+        self._controlled: dict[str, dict[str, ObjectKey]] = {}  # uid of the controller → uid → object
 
     def live(self, namespace: str, key: ObjectKey) -> Object | None:
         """The object, where we watch it: it bears an instance's label."""
@@ -73,6 +87,7 @@ class Applier:
         uid, fields = raw["metadata"]["uid"], _our_fields(raw)
         if self._fields.setdefault(uid, fields) != fields:
             self._drifted.add(uid)
+        self._controlled.setdefault(controller_uid(raw) or "", {})[uid] = object_key(raw)
 
     def has_drifted(self, uid: str) -> bool:
         """Whether somebody took a field of the object from us."""
@@ -80,19 +95,24 @@ class Applier:
 
     def forget(self, raw: Object) -> None:
         """Note that an object is gone."""
-        self._fields.pop(raw["metadata"]["uid"], None)
-        self._drifted.discard(raw["metadata"]["uid"])
+        uid = raw["metadata"]["uid"]
+        self._fields.pop(uid, None)
+        self._drifted.discard(uid)
+        controller = controller_uid(raw) or ""
+        members = self._controlled.get(controller)
+        if members is not None:
+            members.pop(uid, None)
+            if not members:
+                del self._controlled[controller]
 
-    def pending(self, instance: ApplicationInstance, rendering: Rendering) -> list[Manifest]:
+    def pending(self, instance: ApplicationInstance, rendering: Rendering, known: Known) -> list[Manifest]:
         """The manifests that need applying: all of a new rendering, else those that are missing or have drifted."""
-        recorded = _recorded(instance)
-        status = instance.status
-        if status is None or status.spec_hash != rendering.digest:
+        if known.digest != rendering.digest:
             return list(rendering.manifests)
         return [
             manifest
             for manifest in rendering.manifests
-            if not self._is_as_recorded(instance.namespace, object_key(manifest), recorded)
+            if not self._is_as_recorded(instance.namespace, object_key(manifest), known.objects)
         ]
 
     def _is_as_recorded(self, namespace: str, key: ObjectKey, recorded: Mapping[ObjectKey, str | None]) -> bool:
@@ -113,19 +133,16 @@ class Applier:
         instance: ApplicationInstance,
         rendering: Rendering,
         manifests: Sequence[Manifest],
+        known: Known,
         looked: Mapping[ObjectKey, Object | None],
-        record: Callable[[tuple[ObjectReference, ...]], Awaitable[None]],
     ) -> Applied:
         """Apply the manifests, which are all or some of the rendering, and prune what it has no more.
 
-        `looked` is from `look`; `record` is awaited with what will belong to the instance before anything is applied.
-        Raises ApiError or Unreachable for what may pass, once all else was tried.
+        `looked` is from `look`, for the same manifests. Raises ApiError or Unreachable for what may pass, once all
+        else was tried.
         """
-        recorded = _recorded(instance)
-        wanted = {object_key(manifest): None for manifest in rendering.manifests}
-        before = _references({**wanted, **recorded})
-        if wanted.keys() - recorded.keys():
-            await record(before)
+        wanted = rendering.keys()
+        recorded = dict(known.objects)
         supporting = [each for each in manifests if each["kind"] not in _WORKLOADS]
         workloads = [each for each in manifests if each["kind"] in _WORKLOADS]
         results: list[Object | _Problem | BaseException] = []
@@ -142,10 +159,12 @@ class Applier:
                 uids[object_key(result)] = result["metadata"]["uid"]
         problems = [result for result in results if isinstance(result, _Problem)]
         if problems:
-            return Applied(_refused(problems), _references({**wanted, **uids}), complete=False)
-        for key in recorded.keys() - wanted.keys():
+            return Applied(_refused(problems), _references({**dict.fromkeys(wanted), **uids}), complete=False)
+        # What has the instance as controller is its own, recorded or not.
+        controlled = self._controlled.get(instance.metadata.uid, {})
+        for key in (recorded.keys() | set(controlled.values())) - wanted:
             await self._prune(instance, key)
-            del uids[key]
+            uids.pop(key, None)
         return Applied(Aspect("Applied", True, "Applied", _counted(len(wanted))), _references(uids), complete=True)
 
     async def _apply_one(
@@ -175,6 +194,7 @@ class Applier:
         uid = raw["metadata"]["uid"]
         self._fields[uid] = _our_fields(raw)
         self._drifted.discard(uid)
+        self.note(raw)
         self._store.put(raw)
         log.info("instance %s/%s: applied %s", instance.namespace, instance.name, what)
         return raw
@@ -235,11 +255,6 @@ def _foreign(live: Object, instance: ApplicationInstance, recorded: str | None, 
 def _refused(problems: Sequence[_Problem]) -> Aspect:
     worst = min(problems, key=lambda each: ("ObjectExists", "ApplyRefused", "Waiting").index(each.reason))
     return Aspect("Applied", False, worst.reason, "; ".join(each.message for each in problems))
-
-
-def _recorded(instance: ApplicationInstance) -> dict[ObjectKey, str | None]:
-    objects = instance.status.objects if instance.status else []
-    return {(each.api_version, each.kind, each.name): each.uid for each in objects}
 
 
 def _references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:

@@ -44,6 +44,10 @@ class Rendering:
     manifests: tuple[Manifest, ...]
     digest: str
 
+    def keys(self) -> set[tuple[str, str, str]]:
+        """What tells the objects apart: apiVersion, kind and name of each."""
+        return {object_key(each) for each in self.manifests}
+
 
 class Renderer:
     """A template, compiled.

@@ -19,6 +19,7 @@ from application_manager.apply import Applier
 from application_manager.client import LEASES, ApiError, Client, ConfigurationError, Resource, Unreachable
 from application_manager.client import load_configuration as load
 from application_manager.instances import InstanceWork
+from application_manager.instancestatus import InstanceStatusWork
 from application_manager.leases import lease_name
 from application_manager.operator import watch
 from application_manager.policy import KindKey, Policy, kind_text
@@ -33,8 +34,9 @@ from application_manager.world import INSTANCE, OWN_KINDS, TASK, TEMPLATE, World
 
 LOOK_EVERY = 1.0  # s between two looks at the API server's health and at Leases that seem to have lapsed
 FIRST_RESYNC = 3.0  # s after the watches began: what vanished between our first list and theirs
+TEMPLATE_PAUSE = 0.3  # s from news of a template or of its instances to its status
 _INSTANCE_WORKERS = 16
-_STATUS_WORKERS = 4
+_STATUS_WORKERS = 2  # few: what runs goes before what is said of it
 _START_PAUSE = 1.0  # s between attempts to reach the API server at the start
 
 log = logging.getLogger(__name__)
@@ -83,9 +85,21 @@ class Manager:
         self._recorder = Recorder(client)
         applier = Applier(client, self._world.store, resources)
         self._instances: WorkQueue[Name] = WorkQueue("instance", self._reconcile_instance, _INSTANCE_WORKERS)
-        self._tasks: WorkQueue[Name] = WorkQueue("task", self._reconcile_task, _STATUS_WORKERS)
-        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1)
-        self._router = Router(self._world, applier, self._instances.add, self._tasks.add, self._templates.add)
+        self._statuses: WorkQueue[Name] = WorkQueue(
+            "instance status", self._say_instance, _STATUS_WORKERS, self._instances
+        )
+        self._tasks: WorkQueue[Name] = WorkQueue("task", self._reconcile_task, _STATUS_WORKERS, self._instances)
+        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances)
+        self._router = Router(self._world, applier, self._instances.add, self._tasks.add, self._soon)
+        self._status_work = InstanceStatusWork(
+            world=self._world,
+            client=client,
+            applier=applier,
+            recorder=self._recorder,
+            instances=resources[INSTANCE],
+            task_changed=self._tasks.add,
+            observe=self._router.observe,
+        )
         self._instance_work = InstanceWork(
             world=self._world,
             client=client,
@@ -94,7 +108,8 @@ class Manager:
             instances=resources[INSTANCE],
             tasks=resources[TASK],
             again=self._instances.add_at,
-            task_changed=self._tasks.add,
+            done=self._statuses.add,
+            absent=lambda name, decision: self._status_work.tell(name, decision, None),
             observe=self._router.observe,
         )
         self._task_work = TaskWork(
@@ -124,6 +139,7 @@ class Manager:
         tasks = [
             asyncio.create_task(self._watch(watching), name="watches"),
             asyncio.create_task(self._instances.run(), name="instances"),
+            asyncio.create_task(self._statuses.run(), name="instance statuses"),
             asyncio.create_task(self._tasks.run(), name="tasks"),
             asyncio.create_task(self._templates.run(), name="templates"),
             asyncio.create_task(self._recorder.run(), name="events"),
@@ -143,6 +159,13 @@ class Manager:
 
     async def _reconcile_instance(self, name: Name) -> None:
         await self._instance_work.reconcile(name)
+
+    async def _say_instance(self, name: Name) -> None:
+        await self._status_work.reconcile(name)
+
+    def _soon(self, template: Name) -> None:
+        """Templates count their instances: once for many that come together."""
+        self._templates.add_at(template, time.time() + TEMPLATE_PAUSE)
 
     async def _reconcile_task(self, name: Name) -> None:
         await self._task_work.reconcile(name)

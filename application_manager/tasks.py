@@ -15,6 +15,8 @@ from application_manager.store import Name
 from application_manager.world import World
 from wayside.api.applicationtask import ApplicationTaskStatus
 
+_OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, whose Events tell of them
+
 log = logging.getLogger(__name__)
 
 
@@ -55,7 +57,8 @@ class TaskWork:
             if patch:
                 uid = task.metadata.uid
                 self.observe(await self.client.patch_status(self.tasks, name[0], name[1], uid, patch))
-                self.recorder.transitions(task, old.conditions, new.conditions, now)
+                own = [each for each in new.conditions if each.type in _OWN_CONDITIONS]
+                self.recorder.transitions(task, old.conditions, own, now)
             if verdict.standing is Standing.FINISHED:
                 await self._expire(name)
         except ApiError as error:

@@ -13,7 +13,7 @@ import random
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Hashable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from application_manager.client import ApiError, Unreachable
 
@@ -21,16 +21,27 @@ Key = TypeVar("Key", bound=Hashable)
 
 FIRST_PAUSE = 0.2  # s, doubled with every failure of the key
 LONGEST_PAUSE = 10.0  # s
+_TURN, _TURNS = 0.05, 20  # s, and how many of them a queue waits for the one before it
 _SHORTEST_DELAY = 0.1  # s, so that a time that is nearly there does not spin
 
 log = logging.getLogger(__name__)
 
 
 class WorkQueue(Generic[Key]):
-    """Runs `work(key)` for every key asked for, on `concurrency` workers."""
+    """Runs `work(key)` for every key asked for, on `concurrency` workers.
 
-    def __init__(self, name: str, work: Callable[[Key], Awaitable[None]], concurrency: int) -> None:
+    While the queue `after` has keys that wait, this one is slowed down to one key a second and worker.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        work: Callable[[Key], Awaitable[None]],
+        concurrency: int,
+        after: WorkQueue[Any] | None = None,
+    ) -> None:
         self.name = name
+        self._after = after
         self._work = work
         self._concurrency = concurrency
         self._waiting: deque[Key] = deque()
@@ -40,6 +51,11 @@ class WorkQueue(Generic[Key]):
         self._failures: dict[Key, int] = {}
         self._timers: dict[Key, asyncio.TimerHandle] = {}
         self._wake = asyncio.Event()
+
+    @property
+    def busy(self) -> bool:
+        """Whether keys wait for a worker."""
+        return bool(self._waiting)
 
     def add(self, key: Key) -> None:
         """Ask for the key to be worked on soon."""
@@ -80,6 +96,7 @@ class WorkQueue(Generic[Key]):
 
     async def _worker(self) -> None:
         while True:
+            await self._let_others_go_first()
             while not self._waiting:
                 self._wake.clear()
                 await self._wake.wait()
@@ -93,6 +110,12 @@ class WorkQueue(Generic[Key]):
             if key in self._again:
                 self._again.discard(key)
                 self.add(key)
+
+    async def _let_others_go_first(self) -> None:
+        for _ in range(_TURNS):
+            if self._after is None or not self._after.busy:
+                return
+            await asyncio.sleep(_TURN)
 
     async def _once(self, key: Key) -> None:
         try:

@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
+from application_manager.apply import Applied
 from application_manager.claimbook import ClaimBook
 from application_manager.claims import InvalidTemplate
-from application_manager.demand import Verdict
+from application_manager.demand import Decision, Verdict
 from application_manager.leases import HealthyTime, LeaseBook, LeaseView
 from application_manager.policy import KindKey, Policy
 from application_manager.rendering import Renderer, RenderError
@@ -31,12 +32,30 @@ class Served:
     service: Service
 
 
+@dataclass(frozen=True, slots=True)
+class Record:
+    """How the last work on an instance went.
+
+    Attributes:
+        uid: the instance's; a record of a namesake is worth nothing.
+        decision: what was wanted.
+        applied: what came of it.
+        digest: of the rendering that was last applied in full.
+    """
+
+    uid: str
+    decision: Decision
+    applied: Applied
+    digest: str | None
+
+
 @dataclass
 class World:
     """All that is known; only the event loop's thread touches it.
 
     Attributes:
         served: by instance; empty until it was reconciled for the first time.
+        records: by instance; ahead of its status, and empty likewise.
     """
 
     policy: Policy
@@ -45,6 +64,7 @@ class World:
     leases: LeaseBook = field(default_factory=LeaseBook)
     healthy: HealthyTime = field(default_factory=HealthyTime)
     served: dict[Name, Served] = field(default_factory=dict)
+    records: dict[Name, Record] = field(default_factory=dict)
     _renderers: dict[Name, tuple[tuple[str, int], Renderer | RenderError]] = field(default_factory=dict)
 
     def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:

@@ -1,0 +1,76 @@
+"""An instance as a decision wants it, before the cluster has it: its spec, its manifest and its objects. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from application_manager.claims import InvalidTemplate
+from application_manager.conditions import Aspect
+from application_manager.demand import LINGER_ANNOTATION, Decision, is_managed, linger_of
+from application_manager.rendering import Renderer, RenderError, Rendering
+from application_manager.store import Name
+from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
+from wayside.api.applicationinstance import ApplicationInstanceSpec
+from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
+
+TemplateState = ApplicationTemplate | InvalidTemplate | None
+
+RendererOf = Callable[[ApplicationTemplate], Renderer]
+"""Compiles a template, or raises RenderError."""
+
+
+def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) -> ApplicationInstance:
+    """The instance as it should be; without a uid where it does not exist yet."""
+    if existing is not None and decision.parameters is None:
+        return existing
+    spec = ApplicationInstanceSpec(
+        template=decision.template, key=decision.key, parameters=dict(decision.parameters or {})
+    )
+    if existing is not None:
+        return existing.model_copy(update={"spec": spec})
+    labels = {MANAGED_BY_LABEL: MANAGED_BY}
+    return ApplicationInstance(metadata=Metadata(name=name[1], namespace=name[0], labels=labels), spec=spec)
+
+
+def manifest(
+    wanted: ApplicationInstance, existing: ApplicationInstance | None, template: TemplateState
+) -> dict[str, Any] | None:
+    """What to apply so that the instance becomes as wanted; None if it is so already, or is a person's."""
+    usable = template if isinstance(template, ApplicationTemplate) else None
+    linger = str(linger_of(wanted, usable))
+    if existing is not None:
+        if not is_managed(existing):
+            return None
+        noted = existing.metadata.annotations.get(LINGER_ANNOTATION)
+        if existing.spec == wanted.spec and (usable is None or noted == linger):
+            return None
+    return {
+        "apiVersion": API_VERSION,
+        "kind": wanted.kind,
+        "metadata": {
+            "name": wanted.name,
+            "namespace": wanted.namespace,
+            "labels": {MANAGED_BY_LABEL: MANAGED_BY},
+            "annotations": {LINGER_ANNOTATION: linger},
+            **({"uid": existing.metadata.uid} if existing else {}),
+        },
+        "spec": wanted.spec.to_json(),
+    }
+
+
+def objects(wanted: ApplicationInstance, template: TemplateState, renderer: RendererOf) -> Rendering | Aspect:
+    """The instance's objects, or why it has none, as the condition Applied says it."""
+    of = wanted.spec.template
+    if template is None:
+        message = (
+            f"spec.template: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create it; "
+            "until then what runs stays as it is"
+        )
+        return Aspect("Applied", False, "TemplateNotFound", message)
+    if isinstance(template, InvalidTemplate):
+        return Aspect("Applied", False, "TemplateInvalid", f"ApplicationTemplate {of}: {template.problem}")
+    try:
+        return renderer(template).render(wanted)
+    except RenderError as error:
+        return Aspect("Applied", False, "RenderFailed", f"ApplicationTemplate {of}: {error}")

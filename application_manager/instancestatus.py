@@ -1,0 +1,99 @@
+"""Saying how an instance is, after the work: its status, its Events, and the news for its tasks.
+
+Apart from the work itself, so that words never hold up what runs. Until a status is written, the world's record of the
+instance stands for it; should we die before, the work is done again, and finds that nothing is left to do.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from application_manager.apply import Applied, Applier
+from application_manager.client import ApiError, Client, Object, Resource
+from application_manager.conditions import Aspect
+from application_manager.demand import Decision
+from application_manager.readiness import not_ready
+from application_manager.recorder import Reason, Recorder
+from application_manager.status import Service, difference, instance_status
+from application_manager.store import Name
+from application_manager.world import Served, World
+from wayside.api import ApplicationInstance
+from wayside.api.applicationinstance import ApplicationInstanceStatus
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class InstanceStatusWork:
+    """Writes statuses of instances.
+
+    Attributes:
+        instances: where ApplicationInstances live.
+        task_changed: asks for a task's status to be looked at.
+        observe: takes an object that was read.
+    """
+
+    world: World
+    client: Client
+    applier: Applier
+    recorder: Recorder
+    instances: Resource
+    task_changed: Callable[[Name], None]
+    observe: Callable[[Object], None]
+
+    async def reconcile(self, name: Name) -> None:
+        """Write the instance's status if it is news.
+
+        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        """
+        instance, record = self.world.instance(name), self.world.records.get(name)
+        if instance is None or record is None or record.uid != instance.metadata.uid:
+            return
+        now = time.time()
+        old = instance.status or ApplicationInstanceStatus()
+        ready = self._ready(instance, record.applied)
+        applied = record.applied
+        new = instance_status(instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now)
+        patch = difference(old.to_json() if instance.status else {}, new.to_json())
+        if patch:
+            uid = instance.metadata.uid
+            try:
+                self.observe(await self.client.patch_status(self.instances, name[0], name[1], uid, patch))
+            except ApiError as error:
+                if error.terminating or error.code in (404, 409):  # the instance is gone, or another has its name
+                    return
+                raise
+            self.recorder.transitions(instance, old.conditions, new.conditions, now)
+            if old.release_time is None and new.release_time is not None:
+                note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
+                self.recorder.say(instance, Reason.LINGERING, note, now)
+        why_not = applied.aspect.message if not applied.aspect.holds else "" if ready.holds else ready.message
+        self.tell(name, record.decision, Service(name[1], applied.aspect.holds, ready.holds, why_not))
+
+    def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:
+        """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
+        old = self.world.served.pop(name, None)
+        if decision is None:
+            return
+        served = Served(decision.verdicts, service or Service(name[1], applied=False, ready=False))
+        self.world.served[name] = served
+        all_changed = old is None or old.service != served.service
+        for task, verdict in decision.verdicts.items():
+            if all_changed or old is None or old.verdicts.get(task) != verdict:
+                self.task_changed((name[0], task))
+
+    def _ready(self, instance: ApplicationInstance, applied: Applied) -> Aspect:
+        missing = []
+        for each in applied.objects:
+            live = self.applier.live(instance.namespace, (each.api_version, each.kind, each.name))
+            problem = "does not exist" if live is None else not_ready(live)
+            if problem is not None:
+                missing.append(f"{each.kind} {each.name} {problem}")
+        if not applied.objects:
+            return Aspect("Ready", False, "NotApplied", "nothing is applied yet")
+        if missing:
+            return Aspect("Ready", False, "NotReady", "; ".join(missing))
+        return Aspect("Ready", True, "Ready", "all workloads are ready")

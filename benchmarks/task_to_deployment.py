@@ -1,0 +1,245 @@
+"""Task created → Deployment exists, beside the raw API calls alone, in the same run.
+
+Sequential: one task after the other, alternated with the raw calls: create the task, apply the instance, apply the
+Deployment, by the same client library, in a namespace that no manager looks at. Burst: many tasks at once, beside as
+many raw series at once. Existence is told by a watch on Deployments in both cases.
+
+    python -m benchmarks.task_to_deployment [--sequential 100] [--burst 1000]
+
+Uses the cluster of KUBECONFIG where that is set, else a control plane of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+
+from application_manager.claims import instance_name
+from application_manager.client import Client, Resource, load_configuration
+from application_manager.policy import Policy
+from application_manager.rendering import Renderer, owned
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.crds import CRDS
+from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
+
+TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
+INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
+TEMPLATES = Resource(API_VERSION, "ApplicationTemplate", "applicationtemplates")
+DEPLOYMENTS = Resource("apps/v1", "Deployment", "deployments")
+NAMESPACES = Resource("v1", "Namespace", "namespaces", namespaced=False)
+AT_ONCE = 16
+PATIENCE = 300.0  # s
+
+TEMPLATE: dict[str, Any] = {
+    "apiVersion": API_VERSION,
+    "kind": "ApplicationTemplate",
+    "metadata": {"name": "app"},
+    "spec": {
+        "parameters": {"region": {"type": "string", "required": True}},
+        "key": "${parameters.region}",
+        "lifecycle": {"linger": "0s"},
+        "manifests": [
+            {
+                "apiVersion": "apps/v1",
+                "kind": "Deployment",
+                "metadata": {"name": "${instance.name}"},
+                "spec": {
+                    "replicas": 0,
+                    "selector": {"matchLabels": {"app": "${instance.name}"}},
+                    "template": {
+                        "metadata": {"labels": {"app": "${instance.name}"}},
+                        "spec": {"containers": [{"name": "main", "image": "registry.example/app:1"}]},
+                    },
+                },
+            }
+        ],
+    },
+}
+
+
+def task(namespace: str, region: str) -> dict[str, Any]:
+    """A task that wants an instance of its own."""
+    return {
+        "apiVersion": API_VERSION,
+        "kind": "ApplicationTask",
+        "metadata": {"name": region, "namespace": namespace},
+        "spec": {"template": "app", "parameters": {"region": region}},
+    }
+
+
+class Raw:
+    """The three calls, as a program would make them that knows everything beforehand."""
+
+    def __init__(self, client: Client, namespace: str) -> None:
+        self.client = client
+        self.namespace = namespace
+        metadata = {"name": "app", "namespace": namespace}
+        self.renderer = Renderer(ApplicationTemplate.model_validate({**TEMPLATE, "metadata": metadata}), Policy())
+
+    async def series(self, region: str) -> float:
+        """Seconds from the start of the first call to the end of the last."""
+        began = time.perf_counter()
+        await self.client.create(TASKS, task(self.namespace, region))
+        raw = await self.client.apply(INSTANCES, self.instance(region))
+        model = ApplicationInstance.model_validate(raw)
+        await self.client.apply(DEPLOYMENTS, owned(self.renderer.render(model).manifests[0], model))
+        return time.perf_counter() - began
+
+    def instance(self, region: str) -> dict[str, Any]:
+        """The instance for a region."""
+        return {
+            "apiVersion": API_VERSION,
+            "kind": "ApplicationInstance",
+            "metadata": {"name": instance_name("app", region), "namespace": self.namespace},
+            "spec": {"template": "app", "key": region, "parameters": {"region": region}},
+        }
+
+
+class Seen:
+    """When each Deployment of a namespace came up, by a watch."""
+
+    def __init__(self) -> None:
+        self.at: dict[str, float] = {}
+        self._news = asyncio.Condition()
+
+    @asynccontextmanager
+    async def watching(self, client: Client, namespace: str) -> AsyncIterator[None]:
+        """Watch meanwhile."""
+        started = asyncio.Event()
+        watch = asyncio.create_task(self._watch(client, namespace, started))
+        await started.wait()
+        try:
+            yield
+        finally:
+            watch.cancel()
+            await asyncio.gather(watch, return_exceptions=True)
+
+    async def _watch(self, client: Client, namespace: str, started: asyncio.Event) -> None:
+        configuration = client.configuration
+        token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
+        url = f"{configuration.host}{DEPLOYMENTS.path(namespace)}?watch=true"
+        response = await client._api.rest_client.request(  # the manager's own verbs have no watch: kopf does that
+            "GET", url, headers={"Authorization": token or ""}, _request_timeout=aiohttp.ClientTimeout(total=None)
+        )
+        started.set()
+        async for line in response.response.content:
+            event = json.loads(line)
+            if event["type"] == "ADDED":
+                self.at[event["object"]["metadata"]["name"]] = time.perf_counter()
+                async with self._news:
+                    self._news.notify_all()
+
+    async def wait(self, count: int) -> None:
+        """Wait until so many were seen."""
+        async with self._news, asyncio.timeout(PATIENCE):
+            await self._news.wait_for(lambda: len(self.at) >= count)
+
+
+async def at_once(series: list[Any]) -> None:
+    """Run the coroutines, AT_ONCE of them at a time."""
+    gate = asyncio.Semaphore(AT_ONCE)
+
+    async def one(each: Any) -> None:
+        async with gate:
+            await each
+
+    await asyncio.gather(*(one(each) for each in series))
+
+
+def cpu_seconds(pid: int) -> float:
+    """The CPU time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+async def measure(sequential: int, burst: int, manager: subprocess.Popen[bytes], namespaces: tuple[str, str]) -> None:
+    """Measure and print."""
+    ours, theirs = namespaces
+    client = Client(await load_configuration())
+    raw, seen = Raw(client, theirs), Seen()
+    await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": ours}})
+    async with seen.watching(client, ours):
+        for index in range(5):  # warm up both
+            await client.create(TASKS, task(ours, f"warm{index}"))
+            await seen.wait(index + 1)
+            await raw.series(f"warm{index}")
+        took: list[float] = []
+        alone: list[float] = []
+        for index in range(sequential):
+            alone.append(await raw.series(f"s{index}"))
+            began = time.perf_counter()
+            await client.create(TASKS, task(ours, f"s{index}"))
+            await seen.wait(6 + index)
+            took.append(seen.at[instance_name("app", f"s{index}")] - began)
+            await asyncio.sleep(0.05)  # the statuses that follow are not part of either
+        for name, values in (("task → Deployment", took), ("raw calls alone", alone)):
+            cuts = statistics.quantiles(values, n=20)
+            print(f"sequential  {name:18} p50 {cuts[9] * 1e3:6.1f} ms   p95 {cuts[18] * 1e3:6.1f} ms")
+        print(f"sequential  ratio of p50       {statistics.median(took) / statistics.median(alone):.2f}")
+
+        began = time.perf_counter()
+        await at_once([raw.series(f"b{index}") for index in range(burst)])
+        alone_rate = burst / (time.perf_counter() - began)
+        before, count = cpu_seconds(manager.pid), len(seen.at)
+        began = time.perf_counter()
+        creating = asyncio.create_task(
+            at_once([client.create(TASKS, task(ours, f"b{index}")) for index in range(burst)])
+        )
+        await seen.wait(count + burst)
+        await creating
+        elapsed = time.perf_counter() - began
+        rate, cpu = burst / elapsed, cpu_seconds(manager.pid) - before
+        print(f"burst of {burst}  task → Deployment  {rate:6.1f} /s, the manager used {cpu / elapsed:.0%} of one core")
+        print(f"burst of {burst}  raw calls alone    {alone_rate:6.1f} /s")
+        print(f"burst of {burst}  ratio of times     {alone_rate / rate:.2f}")
+    await client.close()
+
+
+async def fresh_namespaces() -> tuple[str, str]:
+    """Two new namespaces: the manager's, and that of the raw calls."""
+    client = Client(await load_configuration())
+    stamp = f"{time.time_ns():x}"
+    names = (f"bench-managed-{stamp}", f"bench-raw-{stamp}")
+    for name in names:
+        await client.create(
+            NAMESPACES, {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name, "namespace": ""}}
+        )
+    await client.close()
+    return names
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--sequential", type=int, default=100, help="tasks one after the other")
+    parser.add_argument("--burst", type=int, default=1000, help="tasks at once")
+    options = parser.parse_args()
+    given = "KUBECONFIG" in os.environ
+    with nullcontext() if given else ControlPlane(crds=CRDS) as plane, tempfile.TemporaryFile() as log:
+        if plane is not None:
+            os.environ["KUBECONFIG"] = str(plane.kubeconfig)
+        namespaces = asyncio.run(fresh_namespaces())
+        command = [sys.executable, "-m", "application_manager.cli", "run", "--namespace", namespaces[0]]
+        manager = subprocess.Popen(command, stdout=log, stderr=log)
+        try:
+            asyncio.run(measure(options.sequential, options.burst, manager, namespaces))
+        finally:
+            manager.terminate()
+            manager.wait()
+
+
+if __name__ == "__main__":
+    main()
