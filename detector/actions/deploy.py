@@ -88,6 +88,8 @@ class DemandReconciler:
         self._stopping = asyncio.Event()
         self._deadline = 0.0
         self.counts = DeployCounts()
+        self.looks = 0
+        """How often the store has told all that it has."""
 
     @property
     def pending(self) -> int:
@@ -146,6 +148,7 @@ class DemandReconciler:
         async for change in self._store.follow():
             self._enqueue(self._ledger.see(change))
             if isinstance(change, Snapshot):
+                self.looks += 1
                 self._reachable.set()
 
     def _enqueue(self, names: Iterable[str]) -> None:

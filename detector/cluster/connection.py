@@ -10,12 +10,16 @@ from pathlib import Path
 
 from kubernetes.aio.client import ApiClient, Configuration
 from kubernetes.aio.config import ConfigException, kube_config, load_incluster_config, load_kube_config
+from yaml import YAMLError
 
 from detector.cluster.api import Api
 
 _OWN_NAMESPACE = Path("/var/run/secrets/kubernetes.io/serviceaccount/namespace")
 _IN_CLUSTER = "KUBERNETES_SERVICE_HOST"
 _CONNECTIONS = 32
+
+_BROKEN = (ConfigException, OSError, YAMLError, ValueError, TypeError, KeyError, AttributeError)
+"""What the loader stumbles over in files that are missing, no YAML, or of another shape: it checks few things itself."""
 
 
 class NoClusterError(Exception):
@@ -43,8 +47,14 @@ async def connect(namespace: str | None = None, kubeconfig: Path | None = None) 
     """
     configuration = Configuration()
     configuration.connection_pool_maxsize = _CONNECTIONS
-    found = await _load(configuration, kubeconfig)
-    api = Api(ApiClient(configuration))
+    try:
+        found = await _load(configuration, kubeconfig)
+        api = Api(ApiClient(configuration))
+    except _BROKEN as error:
+        raise NoClusterError(
+            f"no API server: {error or type(error).__name__}. Set KUBECONFIG to a kubeconfig file, or run in a pod "
+            "with a service account; or run without a cluster, with --detector FILE and --rules FILE"
+        ) from error
     try:
         yield Cluster(api, namespace or found)
     finally:
@@ -53,18 +63,11 @@ async def connect(namespace: str | None = None, kubeconfig: Path | None = None) 
 
 async def _load(configuration: Configuration, kubeconfig: Path | None) -> str:
     """Fill in the configuration; the default namespace."""
-    try:
-        if kubeconfig is None and "KUBECONFIG" not in os.environ and _IN_CLUSTER in os.environ:
-            load_incluster_config(configuration)  # type: ignore[no-untyped-call]
-            return _OWN_NAMESPACE.read_text().strip()  # noqa: ASYNC240  once, at the start
-        file = str(kubeconfig) if kubeconfig else os.environ.get("KUBECONFIG", kube_config.KUBE_CONFIG_DEFAULT_LOCATION)
-        loader = await load_kube_config(  # type: ignore[no-untyped-call]
-            file, client_configuration=configuration, persist_config=False
-        )
-        context = loader.current_context.get("context", {})
-        return str(context.get("namespace") or "default")
-    except (ConfigException, OSError) as error:
-        raise NoClusterError(
-            f"no API server: {error}. Set KUBECONFIG to a kubeconfig file, or run in a pod with a service account; "
-            "or run without a cluster, with --detector FILE and --rules FILE"
-        ) from error
+    if kubeconfig is None and "KUBECONFIG" not in os.environ and _IN_CLUSTER in os.environ:
+        load_incluster_config(configuration)  # type: ignore[no-untyped-call]
+        return _OWN_NAMESPACE.read_text().strip()  # noqa: ASYNC240  once, at the start
+    file = str(kubeconfig) if kubeconfig else os.environ.get("KUBECONFIG", kube_config.KUBE_CONFIG_DEFAULT_LOCATION)
+    loader = await load_kube_config(  # type: ignore[no-untyped-call]
+        file, client_configuration=configuration, persist_config=False
+    )
+    return str(loader.current_context.get("context", {}).get("namespace") or "default")

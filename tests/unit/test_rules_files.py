@@ -1,0 +1,97 @@
+"""A Detector and its rules from files: what counts, what is left out, and what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from detector.rules.files import load_rules
+from wayside.api.documents import DocumentError
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    def to(name: str, *objects: dict[str, Any]) -> Path:
+        file = tmp_path / name
+        file.write_text(yaml.safe_dump_all(objects))
+        return file
+
+    return to
+
+
+def detector(name: str = "d", **spec: Any) -> dict[str, Any]:
+    streams = [{"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json"}]
+    return made("Detector", name, {}, {"streams": streams, **spec})
+
+
+def rule(name: str, **labels: str) -> dict[str, Any]:
+    return made("EventRule", name, labels, {"when": "true"})
+
+
+def made(kind: str, name: str, labels: dict[str, str], spec: dict[str, Any]) -> dict[str, Any]:
+    metadata: dict[str, Any] = {"name": name, "labels": labels}
+    return {"apiVersion": "wayside.dev/v1alpha1", "kind": kind, "metadata": metadata, "spec": spec}
+
+
+def test_rules_come_by_name_from_all_files(write: Write) -> None:
+    loaded = load_rules(
+        write("d.yaml", detector()), [write("1.yaml", rule("b"), rule("c")), write("2.yaml", rule("a"))]
+    )
+    assert [each.name for each in loaded.rule_set.rules] == ["a", "b", "c"]
+    assert loaded.rules["c"].file.endswith("1.yaml")
+    assert loaded.warnings == ()
+
+
+def test_one_folder_may_hold_everything(write: Write, tmp_path: Path) -> None:
+    template = made("ApplicationTemplate", "t", {}, {"manifests": [{"apiVersion": "v1", "kind": "ConfigMap"}]})
+    write("all.yaml", detector(), rule("a"), template)
+    loaded = load_rules(tmp_path, [tmp_path])
+    assert loaded.rule_set.detector.name == "d"
+    assert [each.name for each in loaded.rule_set.rules] == ["a"]
+
+
+def test_a_rule_that_the_detector_does_not_select_is_left_out_and_said(write: Write) -> None:
+    selecting = detector(rules={"matchLabels": {"site": "a"}})
+    loaded = load_rules(write("d.yaml", selecting), [write("r.yaml", rule("in", site="a"), rule("out", site="b"))])
+    assert [each.name for each in loaded.rule_set.rules] == ["in"]
+    [warning] = loaded.warnings
+    assert "r.yaml:" in warning
+    assert "'out' is not evaluated" in warning
+    assert "{site: a}: add them" in warning
+
+
+def test_a_rule_of_another_namespace_is_left_out_and_said(write: Write) -> None:
+    elsewhere = rule("out")
+    elsewhere["metadata"]["namespace"] = "elsewhere"
+    loaded = load_rules(write("d.yaml", detector()), [write("r.yaml", elsewhere)])
+    assert loaded.rule_set.rules == ()
+    assert "own namespace only" in loaded.warnings[0]
+
+
+def test_no_detector_and_two_detectors_are_refused(write: Write) -> None:
+    rules = [write("r.yaml", rule("a"))]
+    with pytest.raises(DocumentError, match="holds no Detector: give one"):
+        load_rules(write("none.yaml", rule("a")), rules)
+    with pytest.raises(DocumentError, match=r"two\.yaml:\d+:\d+: metadata\.name: is a second Detector"):
+        load_rules(write("two.yaml", detector("d"), detector("e")), rules)
+
+
+def test_two_rules_of_one_name_are_refused_with_both_places(write: Write) -> None:
+    with pytest.raises(DocumentError, match=r"2\.yaml:.*'a' is also in .*1\.yaml:1: rename or remove one"):
+        load_rules(write("d.yaml", detector()), [write("1.yaml", rule("a")), write("2.yaml", rule("a"))])
+
+
+def test_all_problems_come_at_once_and_each_once(write: Write) -> None:
+    broken = write("broken.yaml", made("EventRule", "x", {}, {"wen": "true"}))
+    with pytest.raises(DocumentError) as caught:
+        load_rules(broken, [broken, "/nowhere/rules.yaml"])
+    fields = [problem.field for problem in caught.value.problems]
+    assert fields.count("spec.wen") == 1
+    assert fields.count("spec.when") == 1
+    assert any("no such file" in problem.message for problem in caught.value.problems)
