@@ -12,6 +12,9 @@ from wayside.rules import CompiledStream
 
 _MISSING = object()
 
+_SECOND = 10**9
+"""An integer: Python divides integers to the nearest double, where a double of nanoseconds would be 256 ns off."""
+
 
 class KeyReader(Protocol):
     """Tells whose a sample is."""
@@ -70,9 +73,9 @@ class Messages:
             except (DecodeError, EvaluationError, ValueError):
                 stamp = None
             values["sample"] = {
-                "received": sample.received / 1e9,
+                "received": sample.received / _SECOND,
                 "size": float(len(sample.payload)),
-                **({} if stamp is None else {"stamp": stamp / 1e9, "latency": (sample.received - stamp) / 1e9}),
+                **({} if stamp is None else {"stamp": stamp / _SECOND, "latency": (sample.received - stamp) / _SECOND}),
             }
         return values
 
