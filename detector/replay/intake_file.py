@@ -1,0 +1,108 @@
+"""Intake files: what a detector consumed, in the order in which it did, so that its replay gives the same events.
+
+An intake file is an MCAP file, so any MCAP tool opens it. A channel holds the messages of one stream and key as they
+came; its metadata names the stream. One more channel holds the controls: what else the engine was told, in between.
+What counts is the order in the file, not the order of the times.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import zstandard
+from mcap.exceptions import EndOfFile, InvalidMagic, RecordLengthLimitExceeded
+from mcap.records import Channel, DataEnd, Header, McapRecord, Message
+from mcap.stream_reader import CRCValidationError, StreamReader
+
+from detector.engine.sample import Arrival
+from detector.replay.errors import RecordingError
+
+LIBRARY = "wayside intake 1"
+"""By this text in the header, an intake file is known; the number is the version of what follows."""
+STREAM = "stream"
+"""Metadata of a channel of messages: the stream's name."""
+CONTROL_TOPIC = "wayside/intake"
+_MAX_RECORD = 1 << 30
+
+_DAMAGE = (
+    EndOfFile,
+    InvalidMagic,
+    RecordLengthLimitExceeded,
+    CRCValidationError,
+    struct.error,
+    UnicodeDecodeError,
+    zstandard.ZstdError,
+    msgspec.DecodeError,
+)
+"""All that the reader raises where a file is cut or damaged."""
+
+
+class Control(NamedTuple):
+    """Something else that the engine was told between arrivals."""
+
+    time: int
+    """Nanoseconds since the epoch."""
+    document: dict[str, Any]
+    """Its `kind`, and what belongs to that. Of the writer: `lost` (`arrivals`: how many are missing here, because the
+    disk was too slow); of the reader: `cut` (`reason`: the file ends here without having been closed)."""
+
+    @property
+    def kind(self) -> str:
+        """What it is about."""
+        return str(self.document.get("kind", ""))
+
+
+def is_intake_file(path: Path) -> bool:
+    """Whether the file is an intake file, whole or cut. Raises OSError."""
+    if path.is_dir():
+        return False
+    with path.open("rb") as file:
+        try:
+            first = next(StreamReader(file, record_size_limit=_MAX_RECORD).records)
+        except (*_DAMAGE, StopIteration):
+            return False
+    return isinstance(first, Header) and first.library == LIBRARY
+
+
+def read_intake(path: Path) -> Iterator[Arrival | Control]:
+    """Arrivals and controls in the order in which they were consumed.
+
+    A file that was not closed (kill -9) gives what can be read, then a control `cut`. Raises RecordingError if it is
+    no intake file.
+    """
+    if not is_intake_file(path):
+        raise RecordingError(f"{path}: no intake file: give one that `detector run --record-intake` wrote")
+    time = 0
+    with path.open("rb") as file:
+        channels: dict[int, Channel] = {}
+        records = StreamReader(file, validate_crcs=True, record_size_limit=_MAX_RECORD).records
+        while True:
+            try:
+                record: McapRecord = next(records)
+                if isinstance(record, DataEnd):
+                    return
+                item = _item(record, channels)
+            except StopIteration:
+                return
+            except _DAMAGE as error:
+                yield Control(time, {"kind": "cut", "reason": str(error) or type(error).__name__})
+                return
+            if item is not None:
+                time = item[0]
+                yield item
+
+
+def _item(record: McapRecord, channels: dict[int, Channel]) -> Arrival | Control | None:
+    if isinstance(record, Channel):
+        channels[record.id] = record
+    elif isinstance(record, Message):
+        channel = channels[record.channel_id]
+        stream = channel.metadata.get(STREAM)
+        if stream is None:
+            return Control(record.log_time, msgspec.json.decode(record.data, type=dict[str, Any]))
+        return Arrival(record.log_time, stream, channel.topic, record.data)
+    return None

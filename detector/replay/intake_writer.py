@@ -1,0 +1,215 @@
+"""Writes an intake file beside a running engine, which never waits for the disk.
+
+What is to be written waits in a bounded queue for a thread of its own. If the disk is too slow and the queue is full,
+arrivals are left out; that is counted, logged, and marked in the file, whose replay then cannot be faithful.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+from mcap.writer import Writer
+
+from detector.engine.sample import Arrival
+from detector.replay.intake_file import CONTROL_TOPIC, LIBRARY, STREAM, Control
+from detector.streams.codecs.ros import definition, known
+from wayside.api.detector import Stream
+
+log = logging.getLogger(__name__)
+
+_FLUSH_SECONDS = 0.8
+"""What is written is on its way to the disk after this long: about what a kill -9 may cost."""
+_OVERHEAD = 100
+"""Bytes that an arrival takes in the queue beside its payload."""
+_MAX_CHANNELS = 60_000
+"""MCAP numbers channels with 16 bits; messages on more keys than this are left out."""
+
+
+class _Streams(NamedTuple):
+    """From here on, these are the Detector's streams."""
+
+    streams: tuple[Stream, ...]
+
+
+class _Arrivals(NamedTuple):
+    """Samples, and the bytes that they take in the queue."""
+
+    arrivals: Sequence[Arrival]
+    size: int
+
+
+class IntakeWriter:
+    """Takes what the engine consumes, from one thread at a time, and writes it on another."""
+
+    def __init__(self, path: Path, streams: Iterable[Stream] = (), *, maximum_bytes: int = 256 * 2**20) -> None:
+        """`streams` tell how messages read, for other tools to open the file. Raises OSError."""
+        self._path = path
+        self._mcap = _Mcap(path)
+        self._queue: list[_Arrivals | Control | _Streams] = [_Streams(tuple(streams))]
+        self._bytes = 0
+        self._maximum_bytes = maximum_bytes
+        self._changed = threading.Condition()
+        self._closing = False
+        self._unmarked = 0
+        self._unmarked_since = 0
+        self.lost = 0
+        """Arrivals that the file does not hold, and so its replay does not see."""
+        self.error: OSError | None = None
+        """Why writing ended early, if it did."""
+        self._thread = threading.Thread(target=self._run, name="intake-writer", daemon=True)
+        self._thread.start()
+
+    def follow(self, streams: Iterable[Stream]) -> None:
+        """The Detector changed: what comes from now on belongs to these streams."""
+        self._append(_Streams(tuple(streams)))
+
+    def arrivals(self, arrivals: Sequence[Arrival]) -> None:
+        """Samples that the engine takes in now. Never waits; with the queue full they are left out and counted."""
+        size = sum(len(arrival.payload) for arrival in arrivals) + _OVERHEAD * len(arrivals)
+        with self._changed:
+            if self.error is not None or self._bytes + size > self._maximum_bytes:
+                self._leave_out(arrivals)
+                return
+            self._mark_lost()
+            self._bytes += size
+            self._queue.append(_Arrivals(arrivals, size))
+            self._changed.notify()
+
+    def control(self, time: int, document: Mapping[str, Any]) -> None:
+        """Something else that the engine is told, at a time in nanoseconds. They are few: none is left out."""
+        self._append(Control(time, dict(document)))
+
+    def close(self) -> None:
+        """Writes what waits and completes the file; without it, the file can be read up to about the last second."""
+        with self._changed:
+            self._mark_lost()
+            self._closing = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _append(self, item: Control | _Streams) -> None:
+        with self._changed:
+            if self.error is None:
+                self._mark_lost()
+                self._queue.append(item)
+                self._changed.notify()
+
+    def _leave_out(self, arrivals: Sequence[Arrival]) -> None:
+        if not self._unmarked and arrivals:
+            self._unmarked_since = arrivals[0].received
+            if self.error is None:
+                log.error("%s: writing is too slow, samples are left out: its replay will differ", self._path)
+        self._unmarked += len(arrivals)
+        self.lost += len(arrivals)
+
+    def _mark_lost(self) -> None:
+        if self._unmarked:
+            self._queue.append(Control(self._unmarked_since, {"kind": "lost", "arrivals": self._unmarked}))
+            self._unmarked = 0
+
+    def _run(self) -> None:
+        try:
+            self._write()
+        except OSError as error:
+            log.error("%s: writing failed, the recording ends here: %s", self._path, error)
+            with self._changed:
+                self.error = error
+                self._queue.clear()
+
+    def _write(self) -> None:
+        flushed, closing = time.monotonic(), False
+        with self._mcap as mcap:
+            while not closing:
+                with self._changed:
+                    self._changed.wait_for(
+                        lambda: self._queue or self._closing, max(0.0, flushed + _FLUSH_SECONDS - time.monotonic())
+                    )
+                    queue, self._queue = self._queue, []
+                    closing = self._closing
+                for item in queue:
+                    self._write_item(mcap, item)
+                if time.monotonic() - flushed >= _FLUSH_SECONDS:
+                    mcap.flush()
+                    flushed = time.monotonic()
+
+    def _write_item(self, mcap: _Mcap, item: _Arrivals | Control | _Streams) -> None:
+        if isinstance(item, Control):
+            mcap.control(item)
+        elif isinstance(item, _Streams):
+            mcap.follow(item.streams)
+        else:
+            left_out = [arrival for arrival in item.arrivals if not mcap.arrival(arrival)]
+            with self._changed:
+                self._bytes -= item.size
+                self._leave_out(left_out)
+
+
+class _Mcap:
+    """The file itself: a channel per stream and key, made when its first message comes."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb")
+        self._writer = Writer(self._file)
+        self._writer.start("ros2", LIBRARY)  # the profile that tools for ROS bags ask for
+        self._control = self._writer.register_channel(CONTROL_TOPIC, "json", 0)
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
+        self._streams: dict[str, Stream] = {}
+        self._newest = self._control
+
+    def __enter__(self) -> _Mcap:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        with self._file:
+            if kind is None:
+                self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def flush(self) -> None:
+        """From here on, everything so far can be read, whatever happens to the process."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def follow(self, streams: Iterable[Stream]) -> None:
+        """Messages from now on are of these streams: where a stream reads otherwise than before, in new channels."""
+        old, self._streams = self._streams, {stream.name: stream for stream in streams}
+        same = {name for name, stream in self._streams.items() if _reading(old.get(name)) == _reading(stream)}
+        self._channels = {place: channel for place, channel in self._channels.items() if place[0] in same}
+
+    def control(self, control: Control) -> None:
+        """Adds a control."""
+        self._add(self._control, control.time, msgspec.json.encode(control.document))
+
+    def arrival(self, arrival: Arrival) -> bool:
+        """Adds a message; False if there are too many keys."""
+        place = (arrival.stream, arrival.key)
+        channel = self._channels.get(place)
+        if channel is None:
+            if self._newest >= _MAX_CHANNELS:
+                return False
+            channel = self._newest = self._channels[place] = self._open_channel(*place)
+        self._add(channel, arrival.received, arrival.payload)
+        return True
+
+    def _add(self, channel: int, time: int, data: bytes) -> None:
+        self._writer.add_message(channel, log_time=time, data=data, publish_time=time)
+
+    def _open_channel(self, stream: str, key: str) -> int:
+        encoding, type_name = _reading(self._streams.get(stream))
+        schema = 0
+        if type_name is not None and known(type_name):
+            schema = self._schemas.get(type_name) or self._writer.register_schema(
+                type_name, "ros2msg", definition(type_name).encode()
+            )
+            self._schemas[type_name] = schema
+        return self._writer.register_channel(key, encoding, schema, {STREAM: stream})
+
+
+def _reading(stream: Stream | None) -> tuple[str, str | None]:
+    """The encoding and the type of the stream's messages."""
+    return ("", None) if stream is None else (stream.encoding.value, stream.type)
