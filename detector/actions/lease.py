@@ -37,6 +37,9 @@ _log = logging.getLogger(__name__)
 
 LEASES = Resource("coordination.k8s.io/v1", "leases")
 
+_RELEASE_DEADLINE = 2.0
+"""Seconds that the end of the process may wait for an API server that does not answer."""
+
 Owner = dict[str, str]
 """An ownerReference."""
 
@@ -210,11 +213,12 @@ class HolderLease:
         if not self.held.is_set():
             return
         self.held.clear()
-        with suppress(ApiError):  # then it lapses
-            lease = await self._api.get(LEASES, self._namespace, self.name)
-            if lease["spec"].get("holderIdentity") == self._identity.text:
-                lease["spec"]["holderIdentity"] = None
-                await self._api.replace(LEASES, self._namespace, self.name, lease)
+        with suppress(ApiError, TimeoutError):  # then it lapses
+            async with asyncio.timeout(_RELEASE_DEADLINE):
+                lease = await self._api.get(LEASES, self._namespace, self.name)
+                if lease["spec"].get("holderIdentity") == self._identity.text:
+                    lease["spec"]["holderIdentity"] = None
+                    await self._api.replace(LEASES, self._namespace, self.name, lease)
 
 
 def _machine() -> str:

@@ -19,7 +19,7 @@ _IN_CLUSTER = "KUBERNETES_SERVICE_HOST"
 _CONNECTIONS = 32
 
 _BROKEN = (ConfigException, OSError, YAMLError, ValueError, TypeError, KeyError, AttributeError)
-"""What the loader stumbles over in files that are missing, no YAML, or of another shape: it checks few things itself."""
+"""What the loader stumbles over in files that are missing, no YAML or of another shape: it checks little itself."""
 
 
 class NoClusterError(Exception):

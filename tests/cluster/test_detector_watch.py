@@ -1,0 +1,114 @@
+"""Lists that are kept current, however the watch behind them ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from detector.cluster.api import JsonObject, Resource
+from detector.cluster.errors import GoneError
+from detector.cluster.reflector import Change, Changed, Deleted, Listed, Reflector
+from tests.cluster.api import Api
+from tests.cluster.background import Background, background
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.waiting import wait_until
+
+CONFIG_MAPS = Resource("v1", "configmaps")
+MARKED = {"labelSelector": "test=yes"}
+
+
+@pytest.fixture
+def loop(control_plane: ControlPlane) -> Iterator[Background]:
+    with background(control_plane.kubeconfig) as started:
+        yield started
+
+
+class Following:
+    """Keeps what a reflector says, and the state that follows from it."""
+
+    def __init__(self, loop: Background, namespace: str, resync: float = 30.0):
+        self.changes: list[Change] = []
+        self.data: dict[str, str] = {}
+        self.reflector = Reflector(loop.api, CONFIG_MAPS, namespace, MARKED, resync)
+        loop.start(self._follow())
+
+    async def _follow(self) -> None:
+        async for change in self.reflector.follow():
+            match change:
+                case Listed(objects, _):
+                    self.data = {name(each): each["data"]["x"] for each in objects}
+                case Changed(each):
+                    self.data[name(each)] = each["data"]["x"]
+                case Deleted(each):
+                    del self.data[name(each)]
+            self.changes.append(change)
+
+    def wait(self, **data: str) -> None:
+        wait_until(lambda: dict(self.data), lambda found: found == data, timeout=15, what=f"known: {data}")
+
+
+def name(obj: JsonObject) -> str:
+    return str(obj["metadata"]["name"])
+
+
+def config_map(named: str, x: str, marked: str = "yes") -> JsonObject:
+    metadata = {"name": named, "labels": {"test": marked}}
+    return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata, "data": {"x": x}}
+
+
+def test_creations_changes_and_deletions_come_without_another_list(api: Api, namespace: str, loop: Background) -> None:
+    api.create(config_map("a", "1"))
+    api.create(config_map("other", "1", marked="no"))
+    following = Following(loop, namespace)
+    following.wait(a="1")
+    api.create(config_map("b", "1"))
+    api.patch("ConfigMap", "a", {"data": {"x": "2"}})
+    following.wait(a="2", b="1")
+    api.delete("ConfigMap", "a")
+    api.patch("ConfigMap", "b", {"metadata": {"labels": {"test": "no"}}})
+    following.wait()
+    assert following.reflector.lists == 1
+
+
+def test_all_is_listed_again_after_the_resync_period(api: Api, namespace: str, loop: Background) -> None:
+    api.create(config_map("a", "1"))
+    following = Following(loop, namespace, resync=1.0)
+    wait_until(lambda: following.reflector.lists, lambda n: n >= 3, timeout=10, what="three lists")
+    assert following.reflector.outages == 0
+    assert following.data == {"a": "1"}
+
+
+def test_what_happens_around_an_outage_is_not_missed(
+    control_plane: ControlPlane, api: Api, namespace: str, loop: Background
+) -> None:
+    api.create(config_map("a", "1"))
+    api.create(config_map("b", "1"))
+    following = Following(loop, namespace)
+    following.wait(a="1", b="1")
+    control_plane.stop_api_server()
+    try:
+        wait_until(lambda: following.reflector.outages, lambda n: n == 1, timeout=10, what="the outage was noticed")
+    finally:
+        control_plane.start_api_server()
+    api.delete("ConfigMap", "a")
+    api.patch("ConfigMap", "b", {"data": {"x": "2"}})
+    following.wait(b="2")
+    assert following.reflector.outages == 1
+
+
+def test_history_that_the_server_no_longer_has_is_told_as_such(
+    control_plane: ControlPlane, api: Api, namespace: str, loop: Background
+) -> None:
+    old = api.create(config_map("a", "1"))["metadata"]["resourceVersion"]
+    for x in "23":
+        api.patch("ConfigMap", "a", {"data": {"x": x}})
+    with control_plane.outage():
+        pass  # a fresh API server knows what is, not what was
+
+    async def watch() -> None:
+        async for _ in loop.api.watch(CONFIG_MAPS, namespace, MARKED, old, 2.0):
+            pass
+
+    with pytest.raises(GoneError, match="too old resource version"):
+        loop.call(watch())
