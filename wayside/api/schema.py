@@ -86,8 +86,8 @@ def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, 
             values = node.get("additionalProperties", {})
             patterned = node.get("patternProperties", {})
             values = next(iter(patterned.values())) if patterned else values
-            if isinstance(values, dict):
-                result["additionalProperties"] = _structural(values, definitions)
+            # `true` is how pydantic says that anything goes.
+            result["additionalProperties"] = _structural(values if isinstance(values, dict) else {}, definitions)
             if result.get("x-kubernetes-preserve-unknown-fields"):
                 result.pop("additionalProperties", None)
     elif result.get("type") == "array":
