@@ -18,8 +18,6 @@ from tests.cluster.api import Api, Object, Objects
 from tests.cluster.background import PATIENCE, Background, background
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.waiting import wait_until
-from wayside.api import ApplicationTask
-from wayside.api.schema import crd
 
 SECOND = 10**9
 START = 1_767_225_600 * SECOND + 123_456_789
@@ -123,15 +121,6 @@ def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, run
     assert running.counts == DeployCounts(created=1, ended=1)
 
 
-def _values_are_pruned() -> bool:
-    schema = crd(ApplicationTask)["spec"]["versions"][0]["schema"]["openAPIV3Schema"]
-    values = schema["properties"]["spec"]["properties"]["event"]["properties"]["values"]
-    return "additionalProperties" not in values and "x-kubernetes-preserve-unknown-fields" not in values
-
-
-@pytest.mark.xfail(
-    _values_are_pruned(), strict=True, reason="the CRD says nothing of what is in event.values, so it is dropped"
-)
 def test_the_values_at_the_start_are_kept(api: Api, namespace: str, running: Running) -> None:
     wanted = demand(namespace, values={"distance": 149.5, "a": {"client": "car1", "streams": ["pose"]}})
     running.update(by_name(wanted))
