@@ -70,7 +70,8 @@ class InstanceStatusWork:
             if old.release_time is None and new.release_time is not None:
                 note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
                 self.recorder.say(instance, Reason.LINGERING, note, now)
-        why_not = applied.aspect.message if not applied.aspect.holds else "" if ready.holds else ready.message
+        # Why the workload is not ready stays with the instance: it changes often, and the tasks may be many.
+        why_not = "" if applied.aspect.holds else applied.aspect.message
         self.tell(name, record.decision, Service(name[1], applied.aspect.holds, ready.holds, why_not))
 
     def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:

@@ -1,0 +1,189 @@
+"""What the manager should have made of a namespace, computed anew from what is live, and how the world differs.
+
+The expectation comes from `demand` and `Renderer`, called here on the live objects: whatever the manager has been
+through, after a while the world must equal this pure function of it, and nothing else may bear the manager's label.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from application_manager.demand import Outcome, Standing, demand, is_managed
+from application_manager.leases import LeaseView
+from application_manager.policy import Policy
+from application_manager.rendering import Renderer, RenderError
+from application_manager.status import task_status
+from tests.cluster.api import Api, Object
+from tests.cluster.processes import Process, Processes
+from tests.cluster.waiting import wait_until
+from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
+
+KINDS = ("Deployment", "ConfigMap", "Service")  # those that the tests' templates make
+MANAGED = "app.kubernetes.io/managed-by=wayside"
+
+
+def start_manager(processes: Processes, namespace: str, *options: str) -> Process:
+    """Start `application-manager run` for the namespace and wait until it watches."""
+    manager = processes.start("application-manager", "run", "--namespace", namespace, "--resync", "5s", *options)
+    manager.wait_for_output("watching")
+    return manager
+
+
+def wait_settled(api: Api, *, timeout: float = 30, lost: Mapping[str, LeaseView] | None = None) -> None:
+    """Wait until the namespace is as what is live in it demands; `lost` are holders that are to count as lost."""
+    wait_until(
+        lambda: list(differences(api, lost or {})),
+        lambda found: not found,
+        timeout=timeout,
+        what="the world equals the pure function of what is live",
+    )
+
+
+def differences(api: Api, leases: Mapping[str, LeaseView]) -> Iterator[str]:
+    """Where the world differs from what should be."""
+    templates = {
+        raw["metadata"]["name"]: ApplicationTemplate.model_validate(raw) for raw in api.list("ApplicationTemplate")
+    }
+    tasks = [ApplicationTask.model_validate(raw) for raw in api.list("ApplicationTask")]
+    instances = {
+        raw["metadata"]["name"]: ApplicationInstance.model_validate(raw) for raw in api.list("ApplicationInstance")
+    }
+    objects = {(raw["kind"], raw["metadata"]["name"]): raw for kind in KINDS for raw in api.list(kind, labels=MANAGED)}
+    outcome = demand(templates.values(), tasks, instances.values(), leases, time.time())
+    expected: set[tuple[str, str]] = set()
+    for name, instance in instances.items():
+        decision = outcome.instances[name]
+        if decision.wanted:
+            if instance.spec.parameters != decision.parameters:
+                yield f"{name}: parameters {instance.spec.parameters}, not {decision.parameters}"
+        elif is_managed(instance):
+            if instance.status is None or instance.status.release_time is None:
+                yield f"{name}: nobody demands it, and it does not linger"
+            elif decision.release_time is not None and decision.release_time < time.time():
+                yield f"{name}: nobody demands it, and its linger is over"
+        expected |= yield from _objects(instance, templates.get(instance.spec.template), objects)
+    for name in outcome.instances.keys() - instances.keys():
+        yield f"{name}: should exist"
+    for leaked in objects.keys() - expected:
+        yield f"{leaked}: bears our label, and belongs to nothing"
+    yield from _tasks(tasks, outcome)
+
+
+def _objects(
+    instance: ApplicationInstance, template: ApplicationTemplate | None, objects: Mapping[tuple[str, str], Object]
+) -> Iterator[Any]:
+    expected: set[tuple[str, str]] = set()
+    status = instance.status
+    recorded = {(each.kind, each.name): each.uid for each in status.objects} if status else {}
+    try:
+        rendering = Renderer(template, Policy()).render(instance) if template is not None else None
+    except RenderError:
+        rendering = None
+    if rendering is None:  # the last good state stays
+        return set(recorded)
+    for manifest in rendering.manifests:
+        key = (manifest["kind"], manifest["metadata"]["name"])
+        expected.add(key)
+        live = objects.get(key)
+        if live is None:
+            yield f"{instance.name}: {key} is missing"
+            continue
+        owners = [each["uid"] for each in live["metadata"].get("ownerReferences", [])]
+        if owners != [instance.metadata.uid]:
+            yield f"{instance.name}: {key} is owned by {owners}"
+        if recorded.get(key) != live["metadata"]["uid"]:
+            yield f"{instance.name}: the status knows {recorded.get(key)} as the uid of {key}"
+        yield from (f"{instance.name}: {key} {problem}" for problem in _unlike(manifest, live, ""))
+    if status is None or status.spec_hash != rendering.digest:
+        yield f"{instance.name}: specHash is not that of its manifests"
+    if recorded.keys() != expected:
+        yield f"{instance.name}: the status lists {sorted(recorded)}"
+    return expected
+
+
+def _unlike(wanted: Any, live: Any, path: str) -> Iterator[str]:
+    """Where the live object lacks what the manifest says; it may have more."""
+    if isinstance(wanted, dict) and isinstance(live, dict):
+        for key, value in wanted.items():
+            yield from _unlike(value, live.get(key), f"{path}.{key}")
+    elif isinstance(wanted, list) and isinstance(live, list) and len(wanted) == len(live):
+        for index, (one, other) in enumerate(zip(wanted, live, strict=True)):
+            yield from _unlike(one, other, f"{path}[{index}]")
+    elif wanted != live:
+        yield f"has {live!r} at {path}, not {wanted!r}"
+
+
+def _tasks(tasks: list[ApplicationTask], outcome: Outcome) -> Iterator[str]:
+    for task in tasks:
+        verdict = outcome.verdicts[task.name]
+        if task.status is None:
+            yield f"task {task.name}: has no status"
+            continue
+        should = task_status(task, verdict, None, time.time())
+        if task.status.instance != should.instance:
+            yield f"task {task.name}: instance {task.status.instance}, not {should.instance}"
+        if verdict.standing is not Standing.COUNTS and task.status.phase != should.phase:
+            yield f"task {task.name}: phase {task.status.phase}, not {should.phase}"
+        said = {each.type: (each.status, each.reason) for each in task.status.conditions}
+        for each in should.conditions:
+            if said.get(each.type) != (each.status, each.reason):
+                yield f"task {task.name}: {each.type} is {said.get(each.type)}, not {(each.status, each.reason)}"
+
+
+# --- What the tests make
+
+
+def template(name: str = "app", *, image: str = "app:1", linger: str = "1s", **spec: Any) -> Object:
+    """A template of one Deployment for each region."""
+    keyed = {"parameters": {"region": {"type": "string", "required": True}}, "key": "${parameters.region}"}
+    return {
+        "apiVersion": "wayside.dev/v1alpha1",
+        "kind": "ApplicationTemplate",
+        "metadata": {"name": name},
+        "spec": {**keyed, "lifecycle": {"linger": linger}, "manifests": [deployment(image)], **spec},
+    }
+
+
+def deployment(image: str = "app:1", name: str = "${instance.name}") -> Object:
+    labels = {"app": name}
+    containers = [{"name": "main", "image": image}]
+    pod = {"metadata": {"labels": labels}, "spec": {"containers": containers}}
+    return {
+        "apiVersion": "apps/v1",
+        "kind": "Deployment",
+        "metadata": {"name": name},
+        "spec": {"replicas": 1, "selector": {"matchLabels": labels}, "template": pod},
+    }
+
+
+def config(data: Mapping[str, str], name: str = "${instance.name}-config") -> Object:
+    return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": name}, "data": dict(data)}
+
+
+def task(name: str, *, of: str = "app", holder: str | None = None, **parameters: Any) -> Object:
+    """A task for a region, by default that of its own name."""
+    spec: Object = {"template": of, "parameters": {"region": name} | parameters}
+    if holder is not None:
+        spec["requester"] = {"holder": holder}
+    return {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask", "metadata": {"name": name}, "spec": spec}
+
+
+def end(api: Api, name: str) -> None:
+    """End a task's demand, as its holder does."""
+    now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    api.patch("ApplicationTask", name, {"spec": {"endTime": now}})
+
+
+def condition(raw: Object, type_: str) -> Object:
+    """The object's condition of the type; empty where it has none."""
+    conditions = raw.get("status", {}).get("conditions", [])
+    found: Object = next((each for each in conditions if each["type"] == type_), {})
+    return found
+
+
+def only_instance(api: Api) -> Object:
+    """The one instance that there is."""
+    (found,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="there is one instance")
+    return found
