@@ -7,19 +7,18 @@ What counts is the order in the file, not the order of the times.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import zstandard
-from mcap.exceptions import EndOfFile, InvalidMagic, RecordLengthLimitExceeded
+from mcap.exceptions import McapError
 from mcap.records import Channel, DataEnd, Header, McapRecord, Message
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.stream_reader import StreamReader
 
 from detector.engine.sample import Arrival
-from detector.replay.errors import RecordingError
+from detector.replay.errors import DAMAGE, RecordingError
 
 LIBRARY = "wayside intake 1"
 """By this text in the header, an intake file is known; the number is the version of what follows."""
@@ -28,16 +27,7 @@ STREAM = "stream"
 CONTROL_TOPIC = "wayside/intake"
 _MAX_RECORD = 1 << 30
 
-_DAMAGE = (
-    EndOfFile,
-    InvalidMagic,
-    RecordLengthLimitExceeded,
-    CRCValidationError,
-    struct.error,
-    UnicodeDecodeError,
-    zstandard.ZstdError,
-    msgspec.DecodeError,
-)
+_DAMAGE = (*DAMAGE, McapError, zstandard.ZstdError)
 """All that the reader raises where a file is cut or damaged."""
 
 

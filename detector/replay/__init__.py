@@ -1,0 +1,1 @@
+"""Recordings: written live, read from many formats, and played through the engine."""

@@ -1,0 +1,54 @@
+"""Recordings of any kind as one series of messages in the order of their times."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from operator import attrgetter
+from pathlib import Path
+
+from detector.replay.errors import RecordingError
+from detector.replay.json_lines import read_json_lines
+from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
+from detector.replay.mcap_file import read_mcap
+from detector.replay.message import Message, Wanted
+from detector.replay.rosbag2 import SQLITE_MAGIC, read_rosbag2
+
+_Read = Callable[[Path, Wanted], Iterator[Message]]
+
+_KINDS = "rosbag2 folders, .mcap, .db3, and JSON lines"
+
+
+def open_recordings(paths: Sequence[Path], wanted: Wanted = lambda key: True) -> Iterator[Message]:
+    """The messages of all recordings on the wanted keys, merged by time; of equal times, the recording given first.
+
+    The kinds are told by what the files hold. Raises RecordingError at once for one that is missing or of no known
+    kind, later where one turns out to be damaged.
+    """
+    readers = [(_reader(path), path) for path in paths]
+    return heapq.merge(*(read(path, wanted) for read, path in readers), key=attrgetter("time"))
+
+
+def _reader(path: Path) -> _Read:
+    if not path.exists():
+        raise RecordingError(f"{path}: there is no such file or folder")
+    if path.is_dir():
+        if not (path / "metadata.yaml").is_file():
+            raise RecordingError(f"{path}: a folder without metadata.yaml is no rosbag2: give the recordings in it")
+        return read_rosbag2
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise RecordingError(f"{path}: it cannot be read: {error.strerror}") from error
+    if head.startswith(MCAP_MAGIC):
+        return read_mcap
+    if head.startswith(SQLITE_MAGIC):
+        if path.suffix != ".db3":
+            raise RecordingError(f"{path}: an SQLite file is read as a rosbag2 if its name ends in .db3")
+        return read_rosbag2
+    if head.lstrip().startswith(b"{") or (not head and path.suffix in (".jsonl", ".ndjson")):
+        return read_json_lines
+    if not head:
+        raise RecordingError(f"{path}: the file is empty")
+    raise RecordingError(f"{path}: no kind of recording that is known: {_KINDS} are")

@@ -1,0 +1,34 @@
+"""rosbag2: a folder with metadata.yaml and files in MCAP or SQLite, or one SQLite file, read through rosbags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import apsw
+from backports.zstd import ZstdError
+from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.rosbag2 import Reader, ReaderError
+
+from detector.replay.errors import DAMAGE, RecordingError
+from detector.replay.message import Message, Wanted, key_of
+
+SQLITE_MAGIC = b"SQLite format 3\0"
+
+
+def read_rosbag2(path: Path, wanted: Wanted) -> Iterator[Message]:
+    """The bag's messages in the order of their times. Raises RecordingError if it is damaged or of an unknown kind."""
+    try:
+        with Reader(path) as reader:
+            connections = [connection for connection in reader.connections if wanted(key_of(connection.topic))]
+            if not connections:  # rosbags would read none as all
+                return
+            for connection, time, payload in reader.messages(connections):
+                extra = connection.ext
+                encoding = extra.serialization_format if isinstance(extra, ConnectionExtRosbag2) else "cdr"
+                yield Message(time, key_of(connection.topic), bytes(payload), encoding, connection.msgtype)
+    except (*DAMAGE, ReaderError, apsw.Error, ZstdError) as error:
+        reason = str(error) or type(error).__name__
+        raise RecordingError(
+            f"{path}: the rosbag2 cannot be read, it is damaged or of a kind that is not known: {reason}"
+        ) from error

@@ -1,0 +1,73 @@
+"""Which streams a recorded message belongs to, as the subscriptions decide it live."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from detector.engine.sample import Arrival
+from detector.replay.errors import RecordingError
+from detector.replay.message import Message
+from detector.streams.keys import KeyPattern
+from wayside.api.detector import Encoding, Stream
+
+_SHOWN = 20
+
+
+class Router:
+    """Sends recorded messages into the Detector's streams."""
+
+    def __init__(self, streams: Sequence[Stream]) -> None:
+        """Raises KeyPatternError."""
+        self._streams = [(stream, KeyPattern.parse(stream.key)) for stream in streams]
+        self._routes: dict[str, tuple[Stream, ...]] = {}
+        self._fits: set[tuple[str, str, str | None]] = set()
+
+    def wanted(self, key: str) -> bool:
+        """Whether the key belongs to any stream."""
+        return bool(self._route(key))
+
+    def route(self, key: str) -> tuple[str, ...]:
+        """The names of all streams that the key belongs to, in the Detector's order."""
+        return tuple(stream.name for stream in self._route(key))
+
+    @property
+    def unrouted(self) -> list[str]:
+        """Keys that were looked at and belong to no stream, at most twenty, sorted."""
+        return sorted(key for key, streams in self._routes.items() if not streams)[:_SHOWN]
+
+    def arrivals(self, messages: Iterable[Message]) -> Iterator[Arrival]:
+        """The messages as the live intake would have queued them, each once for every stream of its key.
+
+        The receive time is the recorded one, or a nanosecond after the last if that is not later. Raises
+        RecordingError where a message is recorded in another encoding or type than its stream's.
+        """
+        last = 0
+        for message in messages:
+            for stream in self._route(message.key):
+                self._check(message, stream)
+                last = max(last + 1, message.time)
+                yield Arrival(last, stream.name, message.key, message.payload)
+
+    def _route(self, key: str) -> tuple[Stream, ...]:
+        streams = self._routes.get(key)
+        if streams is None:
+            streams = tuple(stream for stream, pattern in self._streams if pattern.match(key) is not None)
+            self._routes[key] = streams
+        return streams
+
+    def _check(self, message: Message, stream: Stream) -> None:
+        """Raises RecordingError unless the stream can read the message; each combination is looked at once."""
+        recorded = (stream.name, message.encoding, message.type)
+        if recorded in self._fits:
+            return
+        if message.encoding != stream.encoding.value:
+            raise RecordingError(
+                f"{message.key} is recorded as {message.encoding}, but streams[{stream.name}].encoding is "
+                f"{stream.encoding.value}: correct it, or the stream's key"
+            )
+        if stream.encoding is Encoding.CDR and message.type not in (None, "", stream.type):
+            raise RecordingError(
+                f"{message.key} is recorded as {message.type}, but streams[{stream.name}].type is {stream.type}: "
+                "correct it, or the stream's key"
+            )
+        self._fits.add(recorded)
