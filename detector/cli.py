@@ -1,0 +1,232 @@
+"""The command `detector`: run, replay, check."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from detector.actions.file_store import write_tasks_yaml
+from detector.assembly import DetectorError, Inlets, compile_rules, inlets
+from detector.cluster.connection import NoClusterError
+from detector.replay.errors import RecordingError
+from detector.replay.intake_file import is_intake_file, read_intake
+from detector.replay.recordings import open_recordings
+from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
+from detector.replay.routing import Router
+from detector.rules.files import load_rules
+from detector.service import Files, Named, Options
+from detector.service import run as run_service
+from detector.streams.zenoh import NetworkError
+from wayside.api import Detector, EventRule
+from wayside.api.documents import Document, DocumentError, Problem, load_documents
+
+app = typer.Typer(
+    help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+_EXPECTED = (DocumentError, DetectorError, RecordingError, NetworkError, NoClusterError, OSError)
+"""Errors of the input: said in one line, without a trace."""
+
+DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
+RuleFiles = Annotated[
+    list[Path] | None, typer.Option("--rules", help="YAML files or folders with EventRules; may be repeated.")
+]
+
+
+@app.callback()
+def _main(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the trace of an error, and log more.")] = False,
+) -> None:
+    logging.basicConfig(
+        level=logging.DEBUG if debug else logging.INFO,
+        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
+        stream=sys.stderr,
+    )
+    if not debug:
+        logging.getLogger("kubernetes").setLevel(logging.WARNING)
+
+
+@app.command()
+def run(
+    detector: DetectorFile = None,
+    rules: RuleFiles = None,
+    name: Annotated[
+        str | None, typer.Option(help="The Detector to run: it and its EventRules are read from the API server.")
+    ] = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="With --name: the namespace. Default: the kubeconfig's, or the pod's.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(help="A folder for events.jsonl and, without a cluster, the tasks. Default there: out."),
+    ] = None,
+    record_intake: Annotated[
+        Path | None, typer.Option(help="Write all that the engine consumes into this file, for an exact replay.")
+    ] = None,
+) -> None:
+    """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
+    if (name is None) == (detector is None):
+        _refuse("give either --detector FILE and --rules FILE, or --name NAME")
+    if name is not None:
+        if rules:
+            _refuse("--rules goes with --detector; with --name the rules are read from the API server")
+        options = Options(Named(name, namespace, output), record_intake)
+    else:
+        assert detector is not None  # noqa: S101  one of both is given
+        if namespace is not None:
+            _refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
+        options = Options(Files(detector, tuple(rules or ()), output or Path("out")), record_intake)
+    asyncio.run(run_service(options))
+
+
+@app.command()
+def replay(
+    recordings: Annotated[list[Path], typer.Argument(help="Intake files, MCAP files, rosbag2 folders, JSON lines.")],
+    output: Annotated[Path, typer.Option(help="The folder for events.jsonl and tasks.yaml.")],
+    detector: DetectorFile = None,
+    rules: RuleFiles = None,
+) -> None:
+    """Run the same engine over recordings. An intake file brings its Detector and rules along."""
+    outcome = _replayed(recordings, detector, rules)
+    output.mkdir(parents=True, exist_ok=True)
+    with (output / "events.jsonl").open("w", encoding="utf-8") as file:
+        file.writelines(event.to_json() + "\n" for event in outcome.events)
+    write_tasks_yaml(output / "tasks.yaml", outcome.tasks.values())
+    for refusal in outcome.refusals:
+        for problem in refusal.problems:
+            typer.echo(f"EventRule {refusal.rule.name} is refused: {problem}", err=True)
+    if outcome.cut:
+        typer.echo("the intake file ends in the middle: its detector was killed", err=True)
+    if outcome.lost:
+        typer.echo(
+            f"the intake file lacks {outcome.lost} samples, the disk being too slow: events may differ", err=True
+        )
+    started = sum(event.started for event in outcome.events)
+    typer.echo(
+        f"{outcome.samples} samples, {started} episodes started, {len(outcome.events) - started} ended, "
+        f"{len(outcome.tasks)} tasks: {output}",
+        err=True,
+    )
+    if outcome.refusals:
+        raise typer.Exit(1)
+
+
+@app.command()
+def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")]) -> None:
+    """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong."""
+    try:
+        documents = load_documents(files)
+    except DocumentError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from None
+    problems = check_documents(documents)
+    for problem in problems:
+        typer.echo(str(problem), err=True)
+    if problems:
+        raise typer.Exit(1)
+    counted = ", ".join(
+        f"{sum(isinstance(document.object, kind) for document in documents)} {kind.__name__}s"
+        for kind in (Detector, EventRule)
+    )
+    typer.echo(f"{counted}: nothing wrong", err=True)
+
+
+def check_documents(documents: Sequence[Document]) -> list[Problem]:
+    """Every problem of the Detectors, and of the rules against each Detector that selects them."""
+    problems: list[Problem] = []
+    detectors: list[tuple[Detector, Inlets]] = []
+    selected: set[str] = set()
+    for document in documents:
+        if isinstance(document.object, Detector):
+            try:
+                detectors.append((document.object, inlets(document.object)))
+            except DetectorError as error:
+                problems += [document.problem(each.path, each.message) for each in error.problems]
+    for document in documents:
+        rule = document.object
+        if not isinstance(rule, EventRule):
+            continue
+        for detector, entries in detectors:
+            if detector.spec.rules.matches(rule.metadata.labels):
+                selected.add(rule.name)
+                _, refused = compile_rules([rule], detector, entries.fields)
+                problems += [
+                    document.problem(each.path, each.message) for refusal in refused for each in refusal.problems
+                ]
+        if detectors and rule.name not in selected:
+            names = ", ".join(detector.name for detector, _ in detectors)
+            problems.append(
+                document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
+            )
+    rules = [document for document in documents if isinstance(document.object, EventRule)]
+    if rules and not any(isinstance(document.object, Detector) for document in documents):
+        problems.append(
+            rules[0].problem((), "a rule is checked against its Detector: give the Detector's file as well")
+        )
+    return list(dict.fromkeys(problems))
+
+
+def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] | None) -> Outcome:
+    if recordings[0].exists() and is_intake_file(recordings[0]):
+        if len(recordings) > 1:
+            _refuse("an intake file is replayed alone: give one recording")
+        if detector is None and rules:
+            _refuse("give --detector as well: rules are compiled against their Detector")
+        given = None if detector is None else load_rules(detector, rules or ()).rule_set
+        return replay_intake(
+            read_intake(recordings[0]),
+            None if given is None else given.detector,
+            given.rules if given is not None and rules else None,
+        )
+    if detector is None:
+        _refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
+    loaded = load_rules(detector, rules or ())
+    for warning in loaded.warnings:
+        typer.echo(warning, err=True)
+    rule_set = loaded.rule_set
+    router = Router(rule_set.detector.spec.streams)
+    arrivals = router.arrivals(open_recordings(recordings, router.wanted))
+    outcome = replay_arrivals(arrivals, rule_set.detector, rule_set.rules)
+    if not outcome.samples:
+        keys = ", ".join(router.unrouted) or "none"
+        typer.echo(f"no message belongs to a stream of the Detector; keys in the recording: {keys}", err=True)
+    return outcome
+
+
+def _refuse(message: str) -> NoReturn:
+    raise typer.BadParameter(message)
+
+
+def main() -> None:
+    """The console script: errors of the input are one clear line and exit code 2."""
+    debug = "--debug" in sys.argv
+    try:
+        app()
+    except* _EXPECTED as group:
+        if debug:
+            raise
+        for error in _leaves(group):
+            typer.echo(f"detector: {error}", err=True)
+        sys.exit(2)
+
+
+def _leaves(group: BaseExceptionGroup[BaseException]) -> list[BaseException]:
+    """The errors of a group, however nested."""
+    return [
+        leaf
+        for error in group.exceptions
+        for leaf in (_leaves(error) if isinstance(error, BaseExceptionGroup) else [error])
+    ]
+
+
+if __name__ == "__main__":
+    main()

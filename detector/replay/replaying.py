@@ -1,0 +1,215 @@
+"""The replay of recordings through the very engine that runs live.
+
+An intake file holds what a live engine consumed, controls included: its replay makes the same calls and gives the same
+events, byte by byte. Any other recording is a series of messages; its replay gives the same events each time.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from operator import itemgetter
+from typing import Any
+
+from detector.assembly import Inlets, Refusal, compile_rules, inlets, make_engine
+from detector.engine.demands import Demand, from_task, to_task
+from detector.engine.engine import Engine
+from detector.engine.events import Event
+from detector.engine.sample import Arrival
+from detector.replay.errors import RecordingError
+from detector.replay.intake_file import Control
+from wayside.api import ApplicationTask, Detector, EventRule
+
+_BATCH = 4096
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a replay came to."""
+
+    events: list[Event] = field(default_factory=list)
+    tasks: dict[str, ApplicationTask] = field(default_factory=dict)
+    refusals: list[Refusal] = field(default_factory=list)
+    samples: int = 0
+    cut: bool = False
+    """The intake file ends in the middle: its writer was killed."""
+    lost: int = 0
+    """Arrivals that the intake file does not hold: the disk was too slow for them."""
+
+
+class Replay:
+    """An engine, and the bookkeeping of what it says."""
+
+    def __init__(
+        self, detector: Detector, rules: Sequence[EventRule], *, holder: str, start: int, outcome: Outcome
+    ) -> None:
+        """`start` is when the detector started, in nanoseconds since the epoch.
+
+        Raises:
+            DetectorError: the Detector cannot run.
+        """
+        self.outcome = outcome
+        self._entries: Inlets = inlets(detector)
+        self._detector = detector
+        self._engine: Engine = make_engine(detector, self._entries, holder=holder, start=start)
+        self._demands: dict[str, Demand] = {}
+        self._version: tuple[int, int] | None = None
+        self.set_rules(rules)
+
+    def take(self, arrivals: Sequence[Arrival], until: int) -> None:
+        """Samples, and how far time has come."""
+        self.outcome.samples += len(arrivals)
+        for part, time in self._tick_by_tick(arrivals, until):
+            self._note(self._engine.advance(part, time))
+
+    def gap(self, time: int) -> None:
+        """Time went on without ticks."""
+        self._note(self._engine.gap(time))
+
+    def set_detector(self, detector: Detector) -> None:
+        """Go on with a changed Detector; `set_rules` follows."""
+        self._entries = inlets(detector)
+        self._detector = detector
+        self._engine.set_detector(detector, self._entries.decoders, self._entries.read_key)
+
+    def set_rules(self, rules: Sequence[EventRule]) -> None:
+        """Go on with these rules."""
+        compiled, refused = compile_rules(rules, self._detector, self._entries.fields)
+        self.outcome.refusals += refused
+        self._note(self._engine.set_rules(compiled))
+
+    def restore(self, demands: Sequence[Demand], time: int) -> None:
+        """Take up the episodes that were open before the recording."""
+        for demand in demands:
+            self._demands[demand.name] = demand
+            self.outcome.tasks[demand.name] = to_task(demand)
+        self._note(self._engine.restore(demands, time))
+
+    def _tick_by_tick(self, arrivals: Sequence[Arrival], until: int) -> Iterator[tuple[Sequence[Arrival], int]]:
+        """In steps so small that no episode starts and ends in one: its tasks would not be seen."""
+        if not self._engine.on_wall_clock:
+            yield from (((arrival,), until) for arrival in arrivals)
+            return
+        first = 0
+        while (tick := self._engine.next_tick()) <= until:
+            last = bisect_right(arrivals, tick, first, key=itemgetter(0))
+            yield arrivals[first:last], tick
+            first = last
+        yield arrivals[first:], until
+
+    def _note(self, events: list[Event]) -> None:
+        self.outcome.events += events
+        if self._engine.demands_version == self._version:
+            return
+        self._version = self._engine.demands_version
+        demands = self._engine.demands()
+        ends = {event.episode: event.end_time for event in events if event.end_time is not None}
+        for name in self._demands.keys() - demands.keys():
+            demand = self._demands[name]
+            self.outcome.tasks[name] = to_task(demand, ends.get(demand.episode, self._engine.now))
+        for name in demands.keys() - self._demands.keys():
+            self.outcome.tasks[name] = to_task(demands[name])
+        self._demands = demands
+
+
+def replay_intake(
+    records: Iterable[Arrival | Control], detector: Detector | None, rules: Sequence[EventRule] | None
+) -> Outcome:
+    """Replay an intake file: with what it holds, or with another Detector or other rules where given.
+
+    Raises:
+        RecordingError: it does not begin with a start.
+        DetectorError: the Detector cannot run.
+    """
+    outcome = Outcome()
+    replay: Replay | None = None
+    batch: list[Arrival] = []
+    for record in records:
+        if isinstance(record, Arrival):
+            batch.append(record)
+            if len(batch) >= _BATCH and replay is not None:
+                # A tick at the very time of the last sample must wait for what else was received before its end.
+                replay.take(batch, batch[-1].received - 1)
+                batch = []
+            continue
+        if replay is None:
+            replay = _begin(record, detector, rules, outcome)
+            continue
+        replay.take(batch, _until(record, batch))
+        batch = []
+        _control(replay, record, detector, rules, outcome)
+    if replay is None:
+        raise RecordingError("the intake file holds nothing: its writer was killed before it began; record again")
+    return outcome
+
+
+def _until(control: Control, batch: Sequence[Arrival]) -> int:
+    """How far the ticks had run when the engine was told."""
+    if control.kind in ("cut", "lost"):
+        return batch[-1].received if batch else 0
+    return int(control.document.get("until", control.time))
+
+
+def _begin(record: Control, detector: Detector | None, rules: Sequence[EventRule] | None, outcome: Outcome) -> Replay:
+    document = record.document
+    if record.kind != "start":
+        raise RecordingError(f"the intake file begins with {record.kind!r}, not with a start: record again")
+    return Replay(
+        detector or Detector.model_validate(document["detector"]),
+        _rules(document) if rules is None else rules,
+        holder=document["holder"],
+        start=record.time,
+        outcome=outcome,
+    )
+
+
+def _control(
+    replay: Replay, record: Control, detector: Detector | None, rules: Sequence[EventRule] | None, outcome: Outcome
+) -> None:
+    document = record.document
+    match record.kind:
+        case "restore":
+            tasks = [ApplicationTask.model_validate(task) for task in document["tasks"]]
+            replay.restore([demand for task in tasks if (demand := from_task(task)) is not None], record.time)
+        case "rules":
+            if detector is None and "detector" in document:
+                replay.set_detector(Detector.model_validate(document["detector"]))
+            if rules is None:
+                replay.set_rules(_rules(document))
+        case "gap":
+            replay.gap(record.time)
+        case "cut":
+            outcome.cut = True
+        case "lost":
+            outcome.lost += int(document["arrivals"])
+        case _:
+            pass  # end: what came before has been taken in
+
+
+def _rules(document: Mapping[str, Any]) -> list[EventRule]:
+    return [EventRule.model_validate(rule) for rule in document["rules"]]
+
+
+def replay_arrivals(arrivals: Iterable[Arrival], detector: Detector, rules: Sequence[EventRule]) -> Outcome:
+    """Replay what any other recording holds, as the live intake would have queued it.
+
+    Raises:
+        DetectorError: the Detector cannot run.
+    """
+    outcome = Outcome()
+    replay: Replay | None = None
+    batch: list[Arrival] = []
+    last = 0
+    for arrival in arrivals:
+        if replay is None:
+            replay = Replay(detector, rules, holder=detector.name, start=arrival.received - 1, outcome=outcome)
+        batch.append(arrival)
+        last = arrival.received
+        if len(batch) >= _BATCH:
+            replay.take(batch, last - 1)
+            batch = []
+    if replay is None:
+        replay = Replay(detector, rules, holder=detector.name, start=0, outcome=outcome)
+    replay.take(batch, last)
+    return outcome
