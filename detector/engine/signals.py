@@ -189,8 +189,9 @@ def _aggregated(aggregate: Aggregate, numbers: list[float]) -> float | Unknown:
 
 def _mean(numbers: list[float]) -> float:
     """The mean to the last digit; infinite where one of the numbers is, NaN where they are infinite both ways."""
-    if not all(map(math.isfinite, numbers)):
-        return sum(numbers)
+    infinite = [number for number in numbers if math.isinf(number)]
+    if infinite:
+        return sum(infinite)
     try:
         return math.fsum(numbers) / len(numbers)
     except OverflowError:  # the sum is beyond what a double holds, the mean is not

@@ -120,6 +120,7 @@ class _Row:
     client: str
     first: int
     last: int
+    received: int
     several: bool = False
     """Whether they are of more than one client."""
 
@@ -130,8 +131,8 @@ class DataTimeline:
     A sample waits until the tick that comes after it, and then enters in the order of the stamps: so the order in which
     samples arrive does not matter as long as `lateness` covers it. One that is later than that enters at once.
 
-    A stamp more than `max_ahead` ahead of the rest, or so far behind that the buffer has no room for it, is dropped and
-    counted. Time that really jumped (a pause in a recording, a simulation that began again) shows in what follows: when
+    A stamp more than `max_ahead` ahead of where the newest one would be by now (the receive times tell how long nothing
+    came), or so far behind that the buffer has no room for it, is dropped and counted. Time that really jumped (a pause in a recording, a simulation that began again) shows in what follows: when
     samples in a row agree on another time, that time holds from then on. Two are enough, if they are of two clients or
     there is only one; one client among several must keep it up for `alone_after` while nobody contradicts.
     """
@@ -162,6 +163,7 @@ class DataTimeline:
         self._stamp_of = stamp_of
         self._client_of = client_of
         self._newest: int | None = None
+        self._newest_received = 0
         self._ticked = False
         self._waiting: list[tuple[int, int, Arrival]] = []
         """A heap by stamp and order of arrival."""
@@ -189,19 +191,20 @@ class DataTimeline:
             if newest is None:
                 newest = stamp
                 yield self._begin(stamp, backwards=False)
-            elif newest - self.max_behind <= stamp <= newest + self._max_ahead:
+            elif newest - self.max_behind <= stamp <= newest + self._reach(arrival, self._newest_received):
                 self._row = None
                 if not self._ticked and newest - self._lateness <= stamp <= self.now:
                     yield self._begin(stamp, backwards=False)  # the first to arrive was not the first
                 newest = max(newest, stamp)
-            elif self._jumped(client, stamp, newest):
+            elif self._jumped(arrival, client, stamp, newest):
                 self.jumps += 1
                 yield from self.rest()
                 backwards, newest = stamp < newest, stamp
                 yield self._begin(stamp, backwards)
             else:
                 continue
-            self._newest = newest
+            if newest != self._newest:
+                self._newest, self._newest_received = newest, arrival.received
             if stamp <= self.now:
                 yield Insert((arrival,), (stamp,))
             else:
@@ -249,17 +252,21 @@ class DataTimeline:
         elif client != self._some_client:
             self._several_clients = True
 
-    def _jumped(self, client: str, stamp: int, newest: int) -> bool:
+    def _reach(self, arrival: Arrival, since: int) -> int:
+        """How far ahead of a stamp that was received then the arrival's may be."""
+        return self._max_ahead + max(0, arrival.received - since)
+
+    def _jumped(self, arrival: Arrival, client: str, stamp: int, newest: int) -> bool:
         """Whether this sample, which does not fit, shows that time jumped; else it is dropped."""
         row = self._row
-        if row is not None and abs(stamp - row.last) <= self._max_ahead:
+        if row is not None and -self._max_ahead <= stamp - row.last <= self._reach(arrival, row.received):
             row.several = row.several or client != row.client
-            row.last = stamp
+            row.last, row.received = stamp, arrival.received
             if row.several or not self._several_clients or abs(stamp - row.first) >= self._alone_after:
                 self._row = None
                 return True
         else:
-            self._row = _Row(client, stamp, stamp)
+            self._row = _Row(client, stamp, stamp, arrival.received)
         if stamp > newest:
             self.dropped_ahead += 1
         else:
