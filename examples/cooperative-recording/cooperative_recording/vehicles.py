@@ -1,4 +1,4 @@
-"""Fifteen vehicles that drive routes through the network: the same seed gives the same drive, to the last bit.
+"""Fifteen vehicles that drive routes through the network: the same seed gives the same drive.
 
 Two shuttles circle the old town on the ring, one each way; four taxis and nine cars wander. Shuttles and taxis carry a
 lidar. The seed sets where everybody starts, how briskly they drive and which way they turn. They keep to their lane,
