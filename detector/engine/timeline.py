@@ -132,9 +132,10 @@ class DataTimeline:
     samples arrive does not matter as long as `lateness` covers it. One that is later than that enters at once.
 
     A stamp more than `max_ahead` ahead of where the newest one would be by now (the receive times tell how long nothing
-    came), or so far behind that the buffer has no room for it, is dropped and counted. Time that really jumped (a pause in a recording, a simulation that began again) shows in what follows: when
-    samples in a row agree on another time, that time holds from then on. Two are enough, if they are of two clients or
-    there is only one; one client among several must keep it up for `alone_after` while nobody contradicts.
+    came), or so far behind that the buffer has no room for it, is dropped and counted. Time that really jumped (a pause
+    in a recording, a simulation that began again) shows in what follows: when samples in a row agree on another time,
+    that time holds from then on. Two are enough, if they are of two clients or there is only one; one client among
+    several must keep it up for `alone_after` while nobody contradicts.
     """
 
     def __init__(
