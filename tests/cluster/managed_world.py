@@ -7,9 +7,12 @@ through, after a while the world must equal this pure function of it, and nothin
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+from pydantic import ValidationError
+
+from application_manager.claims import InvalidTemplate
 from application_manager.demand import Outcome, Standing, demand, is_managed
 from application_manager.leases import LeaseView
 from application_manager.policy import Policy
@@ -24,28 +27,36 @@ KINDS = ("Deployment", "ConfigMap", "Service")  # those that the tests' template
 MANAGED = "app.kubernetes.io/managed-by=wayside"
 
 
-def start_manager(processes: Processes, namespace: str, *options: str) -> Process:
-    """Start `application-manager run` for the namespace and wait until it watches."""
-    manager = processes.start("application-manager", "run", "--namespace", namespace, "--resync", "5s", *options)
+def start_manager(processes: Processes, namespace: str | None = None, *options: str) -> Process:
+    """Start `application-manager run` for the namespace (default: all) and wait until it watches."""
+    where = ["--namespace", namespace] if namespace is not None else []
+    manager = processes.start("application-manager", "run", *where, "--resync", "5s", *options)
     manager.wait_for_output("watching")
     return manager
 
 
-def wait_settled(api: Api, *, timeout: float = 30, lost: Mapping[str, LeaseView] | None = None) -> None:
-    """Wait until the namespace is as what is live in it demands; `lost` are holders that are to count as lost."""
+def wait_settled(
+    api: Api, *, timeout: float = 30, lost: Mapping[str, LeaseView] | None = None, refused: Collection[str] = ()
+) -> None:
+    """Wait until the namespace is as what is live in it demands.
+
+    Args:
+        api: for the namespace.
+        timeout: seconds.
+        lost: holders that are to count as lost.
+        refused: instances whose objects the API server refuses; these are not looked at.
+    """
     wait_until(
-        lambda: list(differences(api, lost or {})),
+        lambda: list(differences(api, lost or {}, refused)),
         lambda found: not found,
         timeout=timeout,
         what="the world equals the pure function of what is live",
     )
 
 
-def differences(api: Api, leases: Mapping[str, LeaseView]) -> Iterator[str]:
+def differences(api: Api, leases: Mapping[str, LeaseView], refused: Collection[str]) -> Iterator[str]:
     """Where the world differs from what should be."""
-    templates = {
-        raw["metadata"]["name"]: ApplicationTemplate.model_validate(raw) for raw in api.list("ApplicationTemplate")
-    }
+    templates = {raw["metadata"]["name"]: _template(raw) for raw in api.list("ApplicationTemplate")}
     tasks = [ApplicationTask.model_validate(raw) for raw in api.list("ApplicationTask")]
     instances = {
         raw["metadata"]["name"]: ApplicationInstance.model_validate(raw) for raw in api.list("ApplicationInstance")
@@ -63,7 +74,10 @@ def differences(api: Api, leases: Mapping[str, LeaseView]) -> Iterator[str]:
                 yield f"{name}: nobody demands it, and it does not linger"
             elif decision.release_time is not None and decision.release_time < time.time():
                 yield f"{name}: nobody demands it, and its linger is over"
-        expected |= yield from _objects(instance, templates.get(instance.spec.template), objects)
+        if name in refused:
+            expected |= {key for key, raw in objects.items() if name in raw["metadata"]["labels"].values()}
+        else:
+            expected |= yield from _objects(instance, templates.get(instance.spec.template), objects)
     for name in outcome.instances.keys() - instances.keys():
         yield f"{name}: should exist"
     for leaked in objects.keys() - expected:
@@ -71,14 +85,23 @@ def differences(api: Api, leases: Mapping[str, LeaseView]) -> Iterator[str]:
     yield from _tasks(tasks, outcome)
 
 
+def _template(raw: Object) -> ApplicationTemplate | InvalidTemplate:
+    try:
+        return ApplicationTemplate.model_validate(raw)
+    except ValidationError as error:
+        return InvalidTemplate(raw["metadata"]["name"], str(error))
+
+
 def _objects(
-    instance: ApplicationInstance, template: ApplicationTemplate | None, objects: Mapping[tuple[str, str], Object]
+    instance: ApplicationInstance,
+    template: ApplicationTemplate | InvalidTemplate | None,
+    objects: Mapping[tuple[str, str], Object],
 ) -> Iterator[Any]:
     expected: set[tuple[str, str]] = set()
     status = instance.status
     recorded = {(each.kind, each.name): each.uid for each in status.objects} if status else {}
     try:
-        rendering = Renderer(template, Policy()).render(instance) if template is not None else None
+        rendering = Renderer(template, Policy()).render(instance) if isinstance(template, ApplicationTemplate) else None
     except RenderError:
         rendering = None
     if rendering is None:  # the last good state stays

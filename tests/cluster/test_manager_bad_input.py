@@ -1,0 +1,198 @@
+"""What is wrong is said where it is wrong, with field, value and remedy, and everything else goes on unharmed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from application_manager.claims import instance_name
+from tests.cluster.api import Api, ApiError, Object
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.managed_world import condition, config, deployment, start_manager, task, template, wait_settled
+from tests.cluster.processes import Process, Processes
+
+BAD = instance_name("bad", "north")
+
+
+@pytest.fixture(scope="module")
+def manager(control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
+    """One for all these tests and their namespaces: that it survives each of them is part of what they show."""
+    processes = Processes(tmp_path_factory.mktemp("logs"), {"KUBECONFIG": str(control_plane.kubeconfig)})
+    yield start_manager(processes)
+    processes.kill_all()
+
+
+@pytest.fixture
+def unharmed(api: Api, manager: Process) -> Iterator[None]:
+    """Something runs beside, and is as it was in the end; a task that comes later is served as well."""
+    api.create(template("good"))
+    api.create(task("before", of="good"))
+    name = instance_name("good", "before")
+    first = api.wait_for("Deployment", name, lambda _: True, what="the good one runs")["metadata"]
+    yield
+    api.create(task("after", of="good"))
+    api.wait_for("Deployment", instance_name("good", "after"), lambda _: True, what="a later one runs")
+    wait_settled(api, refused=[BAD])
+    last = api.get("Deployment", name)["metadata"]
+    assert (last["uid"], last["generation"]) == (first["uid"], first["generation"])
+    assert manager.alive
+
+
+def changed(container: Object) -> Object:
+    made = deployment()
+    made["spec"]["template"]["spec"]["containers"][0] |= container
+    return made
+
+
+@pytest.mark.parametrize(
+    ("spec", "reason", "parts"),
+    [
+        ({"template": "nowhere"}, "TemplateNotFound", ["spec.template", "'nowhere'", "create it"]),
+        (
+            {"template": "good", "parameters": {"region": 7}},
+            "InvalidParameters",
+            ["spec.parameters.region: 7", "not of type string", "give a value of type string"],
+        ),
+        (
+            {"template": "good", "parameters": {"region": "x", "regoin": "y"}},
+            "InvalidParameters",
+            ["spec.parameters.regoin", "did you mean region?"],
+        ),
+        ({"template": "good"}, "InvalidParameters", ["spec.parameters.region: is missing"]),
+        (
+            {"template": "good", "parameters": {"region": "x" * 70_000}},
+            "InvalidParameters",
+            ["spec.parameters: takes", "65536"],
+        ),
+    ],
+    ids=["unknown template", "wrong type", "misspelt", "missing", "too large"],
+)
+@pytest.mark.usefixtures("unharmed")
+def test_a_task_that_cannot_be_served_is_told_why(api: Api, spec: Object, reason: str, parts: list[str]) -> None:
+    api.create({**task("wrong"), "spec": spec})
+    refused = api.wait_for(
+        "ApplicationTask", "wrong", lambda raw: raw.get("status", {}).get("phase") == "Refused", what="it is refused"
+    )
+    accepted = condition(refused, "Accepted")
+    assert (accepted["status"], accepted["reason"]) == ("False", reason)
+    for part in parts:
+        assert part in accepted["message"]
+
+
+@pytest.mark.parametrize(
+    ("manifest", "parts"),
+    [
+        (
+            changed({"image": "app:${parameters.version}"}),
+            ["spec.manifests[0].spec.template.spec.containers[0].image", "`parameters.version` is not known", "region"],
+        ),
+        (changed({"image": "app:${version}"}), ["containers[0].image", "version"]),
+        (
+            changed({"command": ["sh", "-c", 'cd "${HOME}" && run']}),
+            ["containers[0].command[2]", "HOME", "write `$${` for a literal `${`"],
+        ),
+        (
+            {**config({}), "kind": "ServiceAccount"},
+            ["spec.manifests[0].kind", "v1/ServiceAccount is not of the kinds that the administrator allows"],
+        ),
+        (
+            {**config({}), "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role"},
+            ["spec.manifests[0].kind", "rbac.authorization.k8s.io/v1/Role"],
+        ),
+    ],
+    ids=["unknown parameter", "unknown variable", "shell script", "forbidden kind", "forbidden group"],
+)
+@pytest.mark.usefixtures("unharmed")
+def test_a_template_that_cannot_be_rendered_is_told_why(api: Api, manifest: Object, parts: list[str]) -> None:
+    api.create(template("bad", manifests=[manifest]))
+    api.create(task("north", of="bad"))
+    told = [
+        condition(
+            api.wait_for("ApplicationTemplate", "bad", lambda raw: condition(raw, "Accepted"), what="it is judged"),
+            "Accepted",
+        ),
+        condition(
+            api.wait_for("ApplicationInstance", BAD, lambda raw: condition(raw, "Applied"), what="it is judged"),
+            "Applied",
+        ),
+        condition(
+            api.wait_for("ApplicationTask", "north", lambda raw: condition(raw, "Applied"), what="it is judged"),
+            "Applied",
+        ),
+    ]
+    for each in told:
+        assert each["status"] == "False"
+        for part in parts:
+            assert part in each["message"]
+
+
+@pytest.mark.parametrize(
+    ("manifest", "parts"),
+    [
+        (
+            {**config({}), "metadata": {"name": "${instance.name}", "namespace": "kube-system"}},
+            ["spec.manifests[0].metadata.namespace: 'kube-system'", "remove the field"],
+        ),
+        (config({}, name="fixed"), ["spec.manifests[0].metadata.name: 'fixed'", "must contain ${instance.name}"]),
+        (changed({"image": 7}), ["image: expected string, got 7", "correct the template"]),
+        (changed({"imagee": "x"}), ["imagee", "field not declared in schema"]),
+        (config({"x" * 300: "y"}), ["ConfigMap", "must be no more than 253"]),
+    ],
+    ids=["another namespace", "a name for all", "wrong type", "unknown field", "refused by the API server"],
+)
+@pytest.mark.usefixtures("unharmed")
+def test_an_instance_that_cannot_be_applied_is_told_why(api: Api, manifest: Object, parts: list[str]) -> None:
+    api.create(template("bad", manifests=[manifest]))
+    api.create(task("north", of="bad"))
+    told = api.wait_for(
+        "ApplicationInstance",
+        BAD,
+        lambda raw: condition(raw, "Applied").get("status") == "False",
+        what="the instance is judged",
+    )
+    for part in parts:
+        assert part in condition(told, "Applied")["message"]
+    assert not api.find("ConfigMap", BAD, namespace="kube-system")
+
+
+def test_an_escaped_brace_reaches_the_shell_as_it_is(api: Api, manager: Process) -> None:
+    api.create(
+        template("bad", manifests=[changed({"command": ["sh", "-c", 'cd "$${HOME}" && run ${parameters.region}']})])
+    )
+    api.create(task("north", of="bad"))
+    made = api.wait_for("Deployment", BAD, lambda _: True, what="the Deployment exists")
+    assert made["spec"]["template"]["spec"]["containers"][0]["command"][2] == 'cd "${HOME}" && run north'
+
+
+@pytest.mark.usefixtures("unharmed")
+def test_a_template_that_makes_no_sense_keeps_what_runs_until_it_does(api: Api) -> None:
+    api.create(template("bad"))
+    api.create(task("north", of="bad"))
+    first = api.wait_for("Deployment", BAD, lambda _: True, what="the Deployment exists")["metadata"]
+    wait_settled(api)
+    # To the API server any default is fine, the manager knows better.
+    wrong = {"parameters": {"region": {"type": "string", "required": True}, "rate": {"type": "number", "default": "x"}}}
+    api.patch("ApplicationTemplate", "bad", {"spec": wrong})
+    refused = api.wait_for(
+        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Refused", what="the task is told"
+    )
+    assert condition(refused, "Accepted")["reason"] == "TemplateInvalid"
+    assert "'x' is not of type number" in condition(refused, "Accepted")["message"]
+    api.wait_for(
+        "ApplicationTemplate",
+        "bad",
+        lambda raw: condition(raw, "Accepted").get("reason") == "TemplateInvalid",
+        what="the template is told",
+    )
+    assert "releaseTime" not in api.get("ApplicationInstance", BAD)["status"]
+    api.patch("ApplicationTemplate", "bad", {"spec": {"parameters": {"rate": None}}})
+    api.wait_for("ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Active", what="it counts again")
+    assert api.get("Deployment", BAD)["metadata"]["uid"] == first["uid"]
+
+
+def test_a_wrong_object_never_reaches_the_manager(api: Api) -> None:
+    wrong: dict[str, Any] = template("bad", manifests=[])
+    with pytest.raises(ApiError, match=r"spec\.manifests"):
+        api.create(wrong)

@@ -1,0 +1,286 @@
+"""Whatever happens to the manager, the API server or the objects: afterwards the world is what is demanded."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+
+from application_manager.claims import instance_name
+from tests.cluster.api import Api, Object
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.managed_world import (
+    condition,
+    config,
+    deployment,
+    end,
+    start_manager,
+    task,
+    template,
+    wait_settled,
+)
+from tests.cluster.processes import Process, Processes
+from tests.cluster.waiting import wait_until
+
+NORTH = instance_name("app", "north")
+SOUTH = instance_name("app", "south")
+EVERY_KIND = ("ApplicationTemplate", "ApplicationTask", "ApplicationInstance", "Deployment", "ConfigMap")
+
+
+@pytest.fixture
+def manager(processes: Processes, namespace: str) -> Process:
+    return start_manager(processes, namespace)
+
+
+def versions(api: Api) -> dict[tuple[str, str], str]:
+    """The resourceVersion of every object, which any write changes."""
+    return {
+        (kind, raw["metadata"]["name"]): raw["metadata"]["resourceVersion"]
+        for kind in EVERY_KIND
+        for raw in api.list(kind)
+    }
+
+
+def quiet(api: Api) -> dict[tuple[str, str], str]:
+    """Wait until nobody writes any more, and return the versions."""
+    last: dict[str, Any] = {"versions": {}, "since": time.monotonic()}
+
+    def seconds() -> float:
+        now = versions(api)
+        if now != last["versions"]:
+            last.update(versions=now, since=time.monotonic())
+        return time.monotonic() - float(last["since"])
+
+    wait_until(seconds, lambda quiet_for: quiet_for > 1.5, timeout=30, what="all writes are done")
+    found: dict[tuple[str, str], str] = last["versions"]
+    return found
+
+
+def there(api: Api, name: str) -> Object:
+    return api.wait_for("Deployment", name, lambda _: True, what=f"Deployment {name} exists")
+
+
+def test_a_manager_killed_amid_a_hundred_tasks_finishes_when_it_is_back(api: Api, manager: Process) -> None:
+    api.create(template())
+    regions = [f"r{index}" for index in range(50)]
+    tasks = [task(f"{region}-{twin}", region=region) for region in regions for twin in ("a", "b")]
+    with ThreadPoolExecutor(4) as pool:
+        creating = [pool.submit(api.create, each) for each in tasks[:60]]
+        api.wait_list("Deployment", lambda found: len(found) >= 10, what="the manager is in the middle of it")
+        manager.kill9()
+        for each in creating:
+            each.result()
+    assert len(api.list("Deployment")) < len(regions)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(api.create, tasks[60:]))
+        list(pool.map(lambda region: end(api, f"{region}-a"), regions[::2]))
+        list(pool.map(lambda region: end(api, f"{region}-b"), regions[:20:2]))
+    manager.start()
+    wait_settled(api, timeout=60)
+    api.wait_list("Deployment", lambda found: len(found) == 40, what="the demanded 40 are there and no more")
+
+
+def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process, control_plane: ControlPlane) -> None:
+    api.create(template())
+    # The holder's Lease lapses after 15 s; the outage takes 20, in which it cannot be renewed.
+    api.create(template("held", lifecycle={"linger": "1s", "onDetectorLoss": {"policy": "Release", "after": "1s"}}))
+    lease: Object = {
+        "apiVersion": "coordination.k8s.io/v1",
+        "kind": "Lease",
+        "metadata": {"name": "wayside-det"},
+        "spec": {"holderIdentity": "det", "leaseDurationSeconds": 14, "renewTime": "2026-01-01T00:00:00.000000Z"},
+    }
+    api.create(lease)
+    api.create(task("north"))
+    api.create(task("held", of="held", holder="det"))
+    held = instance_name("held", "held")
+    before = [there(api, name)["metadata"]["uid"] for name in (NORTH, held)]
+    control_plane.stop_api_server()
+    try:
+        time.sleep(20)  # the outage itself is what is tested
+    finally:
+        control_plane.start_api_server()
+    api.create(task("south"))
+    there(api, SOUTH)  # the manager looks again, and has looked at the Lease before the holder renews it
+    api.patch("Lease", "wayside-det", {"spec": {"renewTime": "2026-01-01T00:00:20.000000Z"}})
+    wait_settled(api)
+    assert [api.get("Deployment", name)["metadata"]["uid"] for name in (NORTH, held)] == before
+    assert manager.alive
+
+
+def test_a_deployment_deleted_by_hand_comes_back(api: Api, manager: Process) -> None:
+    api.create(template())
+    api.create(task("north"))
+    there(api, NORTH)
+    wait_settled(api)
+    uid = api.get("Deployment", NORTH)["metadata"]["uid"]
+    api.delete("Deployment", NORTH)
+    api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, timeout=3, what="it is back")
+    wait_settled(api)
+
+
+def test_a_field_changed_by_hand_is_set_right(api: Api, manager: Process) -> None:
+    api.create(template())
+    api.create(task("north"))
+    there(api, NORTH)
+    wait_settled(api)
+    api.patch("Deployment", NORTH, {"spec": {"replicas": 5}})
+    api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, timeout=3, what="it is set right")
+
+
+def test_an_object_of_somebody_else_is_left_alone(api: Api, manager: Process) -> None:
+    api.create({**deployment("theirs:1", NORTH), "metadata": {"name": NORTH, "labels": {"theirs": "yes"}}})
+    before = api.get("Deployment", NORTH)
+    api.create(template())
+    api.create(task("north"))
+    api.create(task("south"))
+    there(api, SOUTH)
+    told = api.wait_for(
+        "ApplicationInstance",
+        NORTH,
+        lambda raw: condition(raw, "Applied").get("reason") == "ObjectExists",
+        what="the instance says what stands in its way",
+    )
+    message = condition(told, "Applied")["message"]
+    assert f"Deployment {NORTH} exists already" in message
+    assert "delete or rename it" in message
+    pending = api.wait_for(
+        "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("phase") == "Pending", what="the task waits"
+    )
+    assert "exists already" in condition(pending, "Applied")["message"]
+    now = api.get("Deployment", NORTH)
+    assert now["metadata"]["generation"] == before["metadata"]["generation"]
+    assert "ownerReferences" not in now["metadata"]
+    # The end of the demand does not touch it either, and once it is gone the manager's own takes its place.
+    api.delete("Deployment", NORTH)
+    api.wait_for("Deployment", NORTH, lambda raw: "ownerReferences" in raw["metadata"], what="ours is there instead")
+    wait_settled(api)
+
+
+def test_a_change_of_the_template_reaches_what_runs_and_nothing_else(api: Api, manager: Process) -> None:
+    api.create(template())
+    api.create(template("other"))
+    api.create(task("north"))
+    api.create(task("south"))
+    api.create(task("bystander", of="other"))
+    bystander = instance_name("other", "bystander")
+    for name in (NORTH, SOUTH, bystander):
+        there(api, name)
+    before = quiet(api)
+    changed = template(manifests=[deployment("app:2"), config({"a": "b"})])
+    api.patch("ApplicationTemplate", "app", {"spec": changed["spec"]})
+    for name in (NORTH, SOUTH):
+        api.wait_for(
+            "Deployment",
+            name,
+            lambda raw: raw["spec"]["template"]["spec"]["containers"][0]["image"] == "app:2",
+            what="the new image is there",
+        )
+    wait_settled(api)
+    after = quiet(api)
+    for key in (("Deployment", bystander), ("ApplicationInstance", bystander), ("ApplicationTask", "bystander")):
+        assert after[key] == before[key]
+    # What the template no longer has is pruned, and the Deployments stay as they are.
+    generation = api.get("Deployment", NORTH)["metadata"]["generation"]
+    api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [deployment("app:2")]}})
+    api.wait_gone("ConfigMap", f"{NORTH}-config")
+    api.wait_gone("ConfigMap", f"{SOUTH}-config")
+    wait_settled(api)
+    assert api.get("Deployment", NORTH)["metadata"]["generation"] == generation
+
+
+def test_a_template_that_breaks_leaves_what_runs_as_it_was(api: Api, manager: Process) -> None:
+    api.create(template(manifests=[deployment(), config({"a": "b"})]))
+    api.create(task("north"))
+    there(api, NORTH)
+    wait_settled(api)
+    before = {key: value for key, value in quiet(api).items() if key[0] in ("Deployment", "ConfigMap")}
+    api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [deployment("app:${parameters.version}")]}})
+    told = api.wait_for(
+        "ApplicationInstance",
+        NORTH,
+        lambda raw: condition(raw, "Applied").get("reason") == "RenderFailed",
+        what="the instance says what is wrong",
+    )
+    assert "`parameters.version` is not known" in condition(told, "Applied")["message"]
+    wait_settled(api)
+    after = quiet(api)
+    assert {key: after[key] for key in before} == before
+    api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [deployment("app:2")]}})
+    api.wait_gone("ConfigMap", f"{NORTH}-config")
+    wait_settled(api)
+
+
+def test_without_its_template_an_instance_lingers_and_goes(api: Api, manager: Process) -> None:
+    api.create(template(linger="2s"))
+    api.create(task("north"))
+    there(api, NORTH)
+    wait_settled(api)
+    api.delete("ApplicationTemplate", "app")
+    api.wait_for("ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw["status"], what="it lingers")
+    refused = api.wait_for(
+        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Refused", what="the task is refused"
+    )
+    assert condition(refused, "Accepted")["reason"] == "TemplateNotFound"
+    api.wait_gone("ApplicationInstance", NORTH)
+    api.wait_gone("Deployment", NORTH)
+    wait_settled(api)
+    api.create(template())
+    there(api, NORTH)
+    wait_settled(api)
+
+
+def test_a_linger_goes_on_through_a_restart(api: Api, manager: Process) -> None:
+    api.create(template(linger="6s"))
+    api.create(task("north"))
+    there(api, NORTH)
+    end(api, "north")
+    lingering = api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw["status"], what="the deadline is noted"
+    )
+    manager.kill9()
+    manager.start()
+    manager.wait_for_output("watching")
+    assert api.get("ApplicationInstance", NORTH)["status"]["releaseTime"] == lingering["status"]["releaseTime"]
+    wait_settled(api)
+    api.wait_gone("Deployment", NORTH)
+    assert not api.list("ApplicationInstance")
+
+
+def test_an_instance_deleted_by_hand_comes_back_after_its_objects_are_gone(api: Api, manager: Process) -> None:
+    api.create(template())
+    api.create(task("north"))
+    uid = there(api, NORTH)["metadata"]["uid"]
+    wait_settled(api)
+    api.delete("ApplicationInstance", NORTH)
+    api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, what="another Deployment is there")
+    wait_settled(api)
+
+
+def test_a_restart_and_a_resync_write_nothing(api: Api, manager: Process) -> None:
+    api.create(template(manifests=[deployment(), config({"a": "b"})]))
+    api.create(task("north"))
+    api.create(task("twin", region="north"))
+    api.create(task("wrong", of="nowhere"))
+    there(api, NORTH)
+    wait_settled(api)
+    before = quiet(api)
+    manager.restart()
+    manager.wait_for_output("watching")
+    time.sleep(7)  # the first resync, and one of every five seconds
+    assert versions(api) == before
+
+
+def test_a_namespace_that_goes_is_left_quietly(api: Api, manager: Process, namespace: str) -> None:
+    api.create(template())
+    for index in range(5):
+        api.create(task(f"r{index}"))
+    api.wait_list("Deployment", lambda found: len(found) == 5, what="all is there")
+    api.delete("Namespace", namespace)
+    api.wait_list("ApplicationTask", lambda found: not found, what="the tasks are gone")
+    api.wait_list("Deployment", lambda found: not found, what="the Deployments are gone")
+    assert manager.terminate(patience=2) == 0
+    assert "Traceback" not in manager.output()
+    assert "WARNING" not in manager.output()
