@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from wayside.api.documents import FieldPath, field_text
 from wayside.api.eventrule import PairsScope, Signal
 from wayside.expressions import (
     CompiledTemplate,
+    Embedded,
     Environment,
     Expression,
     ExpressionError,
@@ -38,6 +40,7 @@ from wayside.rules.variables import (
     SAMPLE_MEMBERS,
     client_environment,
     condition_environment,
+    is_taken,
     pairs_environment,
     sample_environment,
     stamp_environment,
@@ -174,6 +177,8 @@ class _RuleCompiler:
         at: FieldPath = ("spec", "signals", index)
         if signal.name in RESERVED:
             self._problem((*at, "name"), f"{signal.name} is a name that every scope gives itself: choose another")
+        elif is_taken(signal.name):
+            self._problem((*at, "name"), f"{signal.name} is a word of CEL itself: choose another name")
         stream = self._stream((*at, "stream"), signal.stream)
         value = self._sample((*at, "value"), signal.value, stream, Kind.DYN)
         where = self._sample((*at, "where"), signal.where, stream, Kind.BOOL)
@@ -196,9 +201,10 @@ class _RuleCompiler:
             parameters = compile_template(dict(deploy.parameters), environment)
         except InterpolationError as error:
             for each in (error, *error.others):
-                self._problem(at, str(each))
+                self._problem((*at, _parameter_of(each)), str(each))
             return None
-        self._members(at, parameters.paths)
+        for embedded in parameters.embedded:
+            self._members((*at, _parameter_of(embedded)), embedded.expression.paths)
         return CompiledDeploy(action, deploy.template, deploy.priority, _canonical(deploy.parameters), parameters)
 
     def _stream(self, path: FieldPath, name: str) -> Stream | None:
@@ -251,6 +257,11 @@ class _RuleCompiler:
 
     def _problem(self, path: FieldPath, message: str) -> None:
         self.problems.append(RuleProblem(path, message))
+
+
+def _parameter_of(located: InterpolationError | Embedded) -> str:
+    """The parameter in which it stands, of a path such as `sources[0].name`."""
+    return re.split(r"[.\[]", located.path, maxsplit=1)[0]
 
 
 def _digest(rule: EventRule) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 
 from wayside.api.eventrule import EventRuleSpec
-from wayside.expressions import Environment, Kind
+from wayside.expressions import Environment, ExpressionError, Kind
 
 RESERVED = frozenset({"client", "labels", "streams", "position", "a", "b", "distance"})
 """Names that the scopes give; no signal may take them."""
@@ -31,7 +31,17 @@ def stamp_environment() -> Environment:
     return Environment({"msg": Kind.DYN})
 
 
-@cache
+@lru_cache(maxsize=1024)
+def is_taken(name: str) -> bool:
+    """Whether the name means something to CEL itself, so that no signal can have it."""
+    try:
+        Environment({name: Kind.DYN}).compile(name)
+    except (ValueError, ExpressionError):
+        return True
+    return False
+
+
+@lru_cache(maxsize=256)
 def client_environment(signals: tuple[str, ...] = ()) -> Environment:
     """For a client scope: client, labels, streams (those that are not stale) and the signals."""
     fixed = {"client": Kind.STRING, "labels": Kind.MAP, "streams": Kind.LIST}
@@ -48,4 +58,4 @@ def condition_environment(spec: EventRuleSpec) -> Environment:
     """For `when`, `until` and the actions of a rule."""
     if spec.scope.pairs is not None:
         return pairs_environment()
-    return client_environment(tuple(signal.name for signal in spec.signals))
+    return client_environment(tuple(signal.name for signal in spec.signals if not is_taken(signal.name)))
