@@ -12,8 +12,18 @@ from pydantic import ValidationError
 
 from wayside.api import API_VERSION, KINDS
 from wayside.api.base import Kind
+from wayside.api.wording import FieldPath, field_text, messages
 
-FieldPath = tuple[str | int, ...]
+__all__ = ["Document", "DocumentError", "FieldPath", "Problem", "field_text", "load_documents", "parse_object"]
+
+_MEANINGFUL = frozenset("\"'![]{}&*%@`|>#,?")
+"""What begins with one of these means something to YAML."""
+
+_DEEPEST = 100
+_MOST_FIELDS = 200_000
+"""No object comes near; aliases that multiply themselves do."""
+
+_TOO_DEEP = f"is nested more than {_DEEPEST} deep: an alias may hold itself"
 
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -60,14 +70,6 @@ class Document:
         return Problem(self.file, line, column, field_text(path), message)
 
 
-def field_text(path: FieldPath) -> str:
-    """A field's path as people write it, e.g. spec.signals[0].value."""
-    text = ""
-    for part in path:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
-
-
 def load_documents(paths: Iterable[str | Path]) -> list[Document]:
     """Read all objects of the files (a folder stands for its *.yaml, *.yml and *.json files).
 
@@ -104,7 +106,7 @@ def parse_object(raw: dict[str, Any]) -> Kind:
         return kind.model_validate(raw)
     except ValidationError as error:
         raise ValueError(
-            "; ".join(f"{field_text(path)}: {message}" for path, message in _messages(error, raw))
+            "; ".join(f"{field_text(path)}: {message}" for path, message in messages(error, raw))
         ) from None
 
 
@@ -127,22 +129,34 @@ def _nodes(text: str, file: str, problems: list[Problem]) -> Iterator[yaml.Node]
             if node is not None and not (isinstance(node, yaml.ScalarNode) and node.value == ""):
                 yield node
     except yaml.MarkedYAMLError as error:
+        lines = text.splitlines()
         mark = error.problem_mark or error.context_mark
+        if error.context_mark and mark and mark.line >= len(lines):
+            mark = error.context_mark  # found out at the end of the file: tell where what is not closed began
         line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
-        source = text.splitlines()[line - 1] if 0 < line <= len(text.splitlines()) else ""
-        problems.append(Problem(file, line, column, "", f"is not YAML: {error.problem}{_quote_hint(source)}"))
+        source = lines[line - 1] if 0 < line <= len(lines) else ""
+        problems.append(Problem(file, line, column, "", f"is not YAML: {error.problem}; {_remedy(source, column)}"))
+    except yaml.reader.ReaderError as error:
+        before = text[: error.position]
+        line, column = before.count("\n") + 1, error.position - before.rfind("\n")
+        reason = f"holds the character {text[error.position]!r}, which YAML does not allow: remove it"
+        problems.append(Problem(file, line, column, "", reason))
+    except RecursionError:
+        problems.append(Problem(file, 0, 0, "", _TOO_DEEP))
 
 
-def _quote_hint(line: str) -> str:
-    """An expression that starts with a quote or a `!` means something else to YAML."""
+def _remedy(line: str, column: int) -> str:
+    """What to do about a line that is not YAML: mostly, an expression means something else to it and needs quotes."""
     _, _, value = line.partition(": ")
-    if value.lstrip()[:1] in ('"', "'", "!", "[", "{", "&", "*"):
-        return (
-            "; an expression that begins like this must be quoted as a whole: '"
-            + value.strip().replace("'", "''")
-            + "'"
-        )
-    return ""
+    value = value.strip()
+    if line[: column + 1].strip(" ").startswith("\t"):
+        return "indent with spaces, not with tabs"
+    if line.lstrip(" -").startswith("{") or value.startswith("{"):
+        return "inside {…} and […], quote each text that holds a bracket, a brace, a comma, or `: `"
+    if value[:1] in _MEANINGFUL or ": " in value:
+        quoted = value.replace("'", "''")
+        return f"an expression that means something to YAML must be quoted as a whole: '{quoted}'"
+    return "check the indentation and the quotes here and on the line above"
 
 
 def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document | None:
@@ -162,7 +176,7 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
     try:
         return Document(kind.model_validate(raw), file, marks)
     except ValidationError as error:
-        for path, message in _messages(error, raw):
+        for path, message in messages(error, raw):
             problems.append(Problem(file, *_mark(marks, path), field_text(path), message))
         return None
 
@@ -187,6 +201,10 @@ def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, i
     """The node as plain Python; notes where each field stands."""
     mark = (node.start_mark.line + 1, node.start_mark.column + 1)
     marks[path] = mark
+    if len(path) > _DEEPEST:
+        raise _TagError(path[:3], mark, _TOO_DEEP)
+    if len(marks) > _MOST_FIELDS:
+        raise _TagError(path[:3], mark, f"the object has more than {_MOST_FIELDS} fields: aliases may multiply them")
     if node.tag.startswith("!"):
         written = f"{node.tag} {node.value}".strip() if isinstance(node, yaml.ScalarNode) else node.tag
         raise _TagError(path, mark, f"YAML takes {node.tag} for a tag: quote the expression, '{written}'")
@@ -203,48 +221,14 @@ def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, i
         return [_value(child, (*path, index), marks) for index, child in enumerate(node.value)]
     if node.tag == "tag:yaml.org,2002:timestamp":
         return node.value  # times stay text
-    return yaml.SafeLoader("").construct_object(node)
+    try:
+        return yaml.SafeLoader("").construct_object(node)
+    except (ValueError, yaml.YAMLError):
+        name = node.tag.removeprefix("tag:yaml.org,2002:")
+        raise _TagError(path, mark, f"YAML cannot read {node.value!r} as {name}: put it in quotes") from None
 
 
 def _mark(marks: dict[FieldPath, tuple[int, int]], path: FieldPath) -> tuple[int, int]:
     while path and path not in marks:
         path = path[:-1]
     return marks.get(path, (1, 1))
-
-
-def _messages(error: ValidationError, raw: Any) -> Iterator[tuple[FieldPath, str]]:
-    """Pydantic's errors in our words, with the paths as the author wrote them."""
-    for item in error.errors(include_url=False):
-        path = _written(item["loc"], raw)
-        match item["type"]:
-            case "missing":
-                yield path, "is missing: give it"
-            case "extra_forbidden":
-                yield path, "there is no such field: check its spelling and its place"
-            case "value_error":
-                yield path, str(item["ctx"]["error"])
-            case _:
-                yield path, f"{item['msg'][0].lower()}{item['msg'][1:]}; given: {_short(item['input'])}"
-
-
-def _written(location: tuple[int | str, ...], raw: Any) -> FieldPath:
-    """Drop the parts of a location that pydantic adds and that stand in no file (function and union tags)."""
-    path: list[str | int] = []
-    here = raw
-    for index, part in enumerate(location):
-        last = index == len(location) - 1
-        if isinstance(here, dict) and (part in here or last):
-            here = here.get(part)
-        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
-            here = here[part]
-        elif not last:
-            continue
-        else:
-            break
-        path.append(part)
-    return tuple(path)
-
-
-def _short(value: Any, limit: int = 80) -> str:
-    text = repr(value)
-    return text if len(text) <= limit else text[: limit - 1] + "…"

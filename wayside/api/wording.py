@@ -1,0 +1,90 @@
+"""What pydantic finds wrong with an object, in words for the one who wrote it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+FieldPath = tuple[str | int, ...]
+
+_PATTERNS = {
+    r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": "lower-case letters, digits and -, with a letter or digit at both ends",
+    r"^[A-Za-z0-9._:-]+$": "letters, digits and . _ : -",
+    r"^[A-Za-z_][A-Za-z0-9_]*$": "letters, digits and _, not beginning with a digit",
+    r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$": "package/msg/Type, e.g. geometry_msgs/msg/PoseStamped",
+    r"^[a-z]+/.+$": "protocol/address:port, e.g. tcp/zenoh:7447",
+}
+"""The models' patterns in words."""
+
+
+def field_text(path: FieldPath) -> str:
+    """A field's path as people write it, e.g. spec.signals[0].value."""
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def messages(error: ValidationError, raw: Any) -> Iterator[tuple[FieldPath, str]]:
+    """Pydantic's errors in our words, with the paths as the author wrote them, each once."""
+    told = set()
+    for item in error.errors(include_url=False):
+        found = _written(item["loc"], raw), _message(item)
+        if found not in told:
+            told.add(found)
+            yield found
+
+
+def _message(item: ErrorDetails) -> str:
+    given = item["input"]
+    match item["type"]:
+        case "missing":
+            return "is missing: give it"
+        case "extra_forbidden":
+            return "there is no such field: check its spelling and its place"
+        case "value_error":
+            return str(item["ctx"]["error"])
+        case _ if given is None:
+            return "is empty: give it a value, or remove it"
+        case "string_type" if isinstance(given, bool | int | float):
+            written = str(given).lower() if isinstance(given, bool) else str(given)
+            return f"must be a text, is {written}: put what you mean in quotes, e.g. '{written}'"
+        case "string_type":
+            return f"must be a text; given: {_short(given)}: quote it as a whole"
+        case "bool_type" | "bool_parsing":
+            return f"must be true or false; given: {_short(given)}"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            return f"must be a map of fields; given: {_short(given)}"
+        case "string_pattern_mismatch":
+            pattern = item["ctx"]["pattern"]
+            return f"must be {_PATTERNS.get(pattern, f'text like {pattern}')}; given: {_short(given)}"
+        case _:
+            wanted = re.sub(r"^(Input|String|List|Dictionary|Value) should ", "must ", item["msg"])
+            return f"{wanted}; given: {_short(given)}"
+
+
+def _written(location: tuple[int | str, ...], raw: Any) -> FieldPath:
+    """Drop the parts of a location that pydantic adds and that stand in no file (function and union tags)."""
+    path: list[str | int] = []
+    here = raw
+    for index, part in enumerate(location):
+        last = index == len(location) - 1
+        if isinstance(here, dict) and (part in here or last):
+            here = here.get(part)
+        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+            here = here[part]
+        elif not last:
+            continue
+        else:
+            break
+        path.append(part)
+    return tuple(path)
+
+
+def _short(value: Any, limit: int = 80) -> str:
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 1] + "…"
