@@ -46,8 +46,15 @@ from cooperative_recording.seeds import (  # noqa: E402
     clear_seed,
     unclear,
 )
-from cooperative_recording.vehicles import ACCELERATION, FASTEST, LIDAR_VEHICLES, VEHICLES, simulate  # noqa: E402
-
+from cooperative_recording.vehicles import (  # noqa: E402
+    ACCELERATION,
+    FASTEST,
+    LIDAR_VEHICLES,
+    VEHICLES,
+    Drive,
+    Track,
+    simulate,
+)
 
 NUMBER = r"-?\d+(?:\.\d+)?"
 
@@ -203,6 +210,38 @@ def test_the_listed_seeds_are_clear_and_eventful(seed: int, duration: float) -> 
 
 def test_not_every_seed_is_clear() -> None:
     assert 0 < sum(clear_seed(seed) for seed in range(12)) < 12
+
+
+def approaching(nearest: float, speed: float = 20.0) -> Drive:
+    """shuttle_1 passes shuttle_2 after 10 s, `nearest` metres away; the other lidar vehicles stand far apart."""
+    times, ones = np.array([0.0, 30.0]), np.ones(2)
+    tracks = {
+        vehicle.name: Track(times, ones, np.column_stack([1e6 * number * ones, 0 * ones, 0 * ones]))
+        for number, vehicle in enumerate(LIDAR_VEHICLES, start=1)
+    }
+    tracks["shuttle_1"] = Track(times, speed * ones, np.column_stack([speed * (times - 10) - 500, 0 * ones, 0 * ones]))
+    tracks["shuttle_2"] = Track(times, ones, np.column_stack([-500 * ones, nearest * ones, 0 * ones]))
+    return Drive(0, 30.0, tracks)
+
+
+@pytest.mark.parametrize(
+    ("drive", "doubt"),
+    [
+        (approaching(148.0), "148.0 m grazes 150 m"),
+        (approaching(152.0), "152.0 m grazes 150 m"),
+        (approaching(197.0), "197.0 m grazes 200 m"),
+        (approaching(20.0, speed=20.2), "at 0.0 s: 203.0 m grazes 200 m"),  # at the outset
+        (approaching(144.0, speed=60.0), "beyond 150 m for only 1.4 s"),
+        (approaching(140.0, speed=6.0), "crosses 150 m at only 2.2 m/s"),
+    ],
+)
+def test_a_drive_that_grazes_a_threshold_is_not_clear(drive: Drive, doubt: str) -> None:
+    assert doubt in " ".join(unclear(drive, 20.0))
+
+
+@pytest.mark.parametrize("nearest", [0.0, 100.0, 140.0, 160.0, 190.0, 210.0])
+def test_a_drive_that_keeps_away_from_the_thresholds_is_clear(nearest: float) -> None:
+    assert unclear(approaching(nearest, speed=30.0), 20.0) == []
 
 
 def test_a_recorder_lingers_and_one_that_is_wanted_again_meanwhile_stays() -> None:
