@@ -76,6 +76,9 @@ def run(
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s", stream=sys.stderr)
     for noisy in ("asyncio", "aiohttp", "kopf"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+    if not debug:  # each watch tells of each attempt to come back; that the API server is away is said once, by us
+        for handler in logging.getLogger().handlers:
+            handler.addFilter(lambda record: not record.getMessage().startswith("Request attempt"))
     options = Options(
         policy=_policy(allowed_kinds, service_accounts),
         namespaces=tuple(namespace or ()),

@@ -15,11 +15,14 @@ from application_manager.leases import LEASE_PREFIX
 from application_manager.policy import KindKey
 from application_manager.readiness import not_ready
 from application_manager.rendering import INSTANCE_LABEL
+from application_manager.rulework import RuleKey
 from application_manager.store import Entry, Name
-from application_manager.world import INSTANCE, LEASE, TASK, TEMPLATE, World
+from application_manager.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, TASK, TEMPLATE, World
 from wayside.api import ApplicationInstance
 
 Ask = Callable[[Name], None]
+
+_RULES = (DETECTOR, EVENT_RULE)
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +32,7 @@ class Router:
     """Takes news.
 
     Attributes:
-        instance, task, template: ask for one of these to be reconciled.
+        instance, task, template, rule: ask for one of these to be reconciled; `rule` is for Detectors as well.
     """
 
     world: World
@@ -37,6 +40,7 @@ class Router:
     instance: Ask
     task: Ask
     template: Ask
+    rule: Callable[[RuleKey], None]
 
     def observe(self, raw: Object) -> None:
         """Take an object as it was read."""
@@ -56,6 +60,9 @@ class Router:
             self._template(name, old, entry)
         elif kind == INSTANCE:
             self._instance(name, old, entry)
+        elif kind in _RULES:
+            if old is None or _written(old) != _written(entry):
+                self._rules(name[0])
         else:
             self._child(old, entry)
 
@@ -77,6 +84,8 @@ class Router:
             self.instance(name)
             if isinstance(entry.model, ApplicationInstance):
                 self.template((name[0], entry.model.spec.template))
+        elif kind in _RULES:
+            self._rules(name[0])
         else:
             self.applier.forget(raw)
             self._ask_for_owner(raw)
@@ -89,6 +98,9 @@ class Router:
         self._ask_all(instances | set(self.world.claims.instances()))
         for name, _ in self.world.store.all(TASK):
             self.task(name)
+        for kind in _RULES:
+            for name, _ in self.world.store.all(kind):
+                self.rule((kind, name))
 
     def _task(self, name: Name, entry: Entry) -> None:
         of = entry.raw["spec"].get("template", "")
@@ -146,9 +158,21 @@ class Router:
             log.info("holder %s/%s renews its Lease", *key)
             self._ask_all(self.world.claims.holders().get(key, ()))
 
+    def _rules(self, namespace: str) -> None:
+        """Rules and detectors of a namespace are judged together: either may be what is wrong with the other."""
+        for kind in _RULES:
+            for name, _ in self.world.store.all(kind):
+                if name[0] == namespace:
+                    self.rule((kind, name))
+
     def _ask_all(self, instances: Iterable[Name]) -> None:
         for name in instances:
             self.instance(name)
+
+
+def _written(entry: Entry) -> tuple[object, object]:
+    """What people write of a rule or a detector."""
+    return entry.raw["spec"], entry.raw["metadata"].get("labels")
 
 
 def _kind(raw: Object) -> KindKey:

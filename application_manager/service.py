@@ -10,31 +10,30 @@ import asyncio
 import logging
 import signal
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 
 import kopf
 
 from application_manager.apply import Applier
-from application_manager.client import LEASES, ApiError, Client, ConfigurationError, Resource, Unreachable
+from application_manager.client import Client, ConfigurationError, Resource, Unreachable
 from application_manager.client import load_configuration as load
 from application_manager.instances import InstanceWork
 from application_manager.instancestatus import InstanceStatusWork
-from application_manager.leases import lease_name
+from application_manager.leasewatch import LeaseWatch
+from application_manager.listing import Listing
 from application_manager.operator import watch
 from application_manager.policy import KindKey, Policy, kind_text
 from application_manager.recorder import Recorder
-from application_manager.rendering import INSTANCE_LABEL
 from application_manager.router import Router
+from application_manager.rulework import RuleKey, RuleWork
 from application_manager.store import Name
 from application_manager.tasks import TaskWork
 from application_manager.templates import TemplateWork
-from application_manager.workqueue import WorkQueue
+from application_manager.workqueue import Key, WorkQueue
 from application_manager.world import INSTANCE, OWN_KINDS, TASK, TEMPLATE, World
 
-LOOK_EVERY = 1.0  # s between two looks at the API server's health and at Leases that seem to have lapsed
-FIRST_RESYNC = 3.0  # s after the watches began: what vanished between our first list and theirs
-TEMPLATE_PAUSE = 0.3  # s from news of a template or of its instances to its status
+JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
 _INSTANCE_WORKERS = 16
 _STATUS_WORKERS = 2  # few: what runs goes before what is said of it
 _START_PAUSE = 1.0  # s between attempts to reach the API server at the start
@@ -79,8 +78,6 @@ class Manager:
     def __init__(self, client: Client, options: Options, resources: dict[KindKey, Resource]) -> None:
         self._client = client
         self._options = options
-        self._own = [resources[kind] for kind in OWN_KINDS]
-        self._children = [resources[kind] for kind in sorted(options.policy.kinds) if kind in resources]
         self._world = World(options.policy)
         self._recorder = Recorder(client)
         applier = Applier(client, self._world.store, resources)
@@ -90,7 +87,10 @@ class Manager:
         )
         self._tasks: WorkQueue[Name] = WorkQueue("task", self._reconcile_task, _STATUS_WORKERS, self._instances)
         self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances)
-        self._router = Router(self._world, applier, self._instances.add, self._tasks.add, self._soon)
+        self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances)
+        self._router = Router(
+            self._world, applier, self._instances.add, self._tasks.add, _soon(self._templates), _soon(self._rules)
+        )
         self._status_work = InstanceStatusWork(
             world=self._world,
             client=client,
@@ -128,13 +128,32 @@ class Manager:
             templates=resources[TEMPLATE],
             observe=self._router.observe,
         )
+        own = [resources[kind] for kind in OWN_KINDS]
+        children = [resources[kind] for kind in sorted(options.policy.kinds) if kind in resources]
+        self._listing = Listing(
+            world=self._world,
+            client=client,
+            router=self._router,
+            own=own,
+            children=children,
+            namespaces=options.namespaces,
+            every=options.resync,
+        )
+        self._leases = LeaseWatch(self._world, client, own[0], options.namespaces, self._instances.add)
+        self._rule_work = RuleWork(
+            world=self._world,
+            client=client,
+            recorder=self._recorder,
+            resources=resources,
+            observe=self._router.observe,
+        )
 
     async def run(self) -> None:
         """Run until SIGTERM or SIGINT."""
         stop = asyncio.Event()
         watching = asyncio.Event()
         _on_signals(stop)
-        if not await _until(stop, self._first_list()):
+        if not await _until(stop, self._listing.first()):
             return
         tasks = [
             asyncio.create_task(self._watch(watching), name="watches"),
@@ -142,9 +161,10 @@ class Manager:
             asyncio.create_task(self._statuses.run(), name="instance statuses"),
             asyncio.create_task(self._tasks.run(), name="tasks"),
             asyncio.create_task(self._templates.run(), name="templates"),
+            asyncio.create_task(self._rules.run(), name="rules"),
             asyncio.create_task(self._recorder.run(), name="events"),
-            asyncio.create_task(self._look_at_leases(), name="leases"),
-            asyncio.create_task(self._resync(watching), name="resync"),
+            asyncio.create_task(self._leases.run(), name="leases"),
+            asyncio.create_task(self._listing.resync(watching), name="resync"),
             asyncio.create_task(self._announce(watching, stop), name="signals"),
         ]
         try:
@@ -163,15 +183,14 @@ class Manager:
     async def _say_instance(self, name: Name) -> None:
         await self._status_work.reconcile(name)
 
-    def _soon(self, template: Name) -> None:
-        """Templates count their instances: once for many that come together."""
-        self._templates.add_at(template, time.time() + TEMPLATE_PAUSE)
-
     async def _reconcile_task(self, name: Name) -> None:
         await self._task_work.reconcile(name)
 
     async def _reconcile_template(self, name: Name) -> None:
         await self._template_work.reconcile(name)
+
+    async def _reconcile_rule(self, key: RuleKey) -> None:
+        await self._rule_work.reconcile(key)
 
     async def _announce(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         await watching.wait()
@@ -182,8 +201,8 @@ class Manager:
 
     async def _watch(self, watching: asyncio.Event) -> None:
         await watch(
-            self._own,
-            self._children,
+            self._listing.own,
+            self._listing.children,
             observe=self._router.observe,
             vanished=self._router.vanished,
             connect=self._connection,
@@ -206,75 +225,6 @@ class Manager:
             private_key_path=configuration.key_file,
         )
 
-    async def _first_list(self) -> None:
-        while True:
-            try:
-                await self._list_all()
-            except Unreachable as error:
-                log.warning("%s; again in %g s", error, _START_PAUSE)
-                await asyncio.sleep(_START_PAUSE)
-            else:
-                return
-
-    async def _list_all(self) -> None:
-        """List everything and take what is news; templates first, so that tasks find theirs."""
-        for resource in self._own:
-            await self._list(resource, "")
-        await asyncio.gather(*(self._list(resource, INSTANCE_LABEL) for resource in self._children))
-        self._router.everything()
-
-    async def _list(self, resource: Resource, labels: str) -> None:
-        for namespace in self._options.namespaces or (None,):
-            listed, version = await self._client.list(resource, namespace, labels=labels)
-            for raw in listed:
-                self._router.observe(raw)
-            kind = (resource.api_version, resource.kind)
-            for entry in self._world.store.missing(kind, listed, version, namespace):
-                self._router.vanished(entry.raw)
-
-    async def _resync(self, watching: asyncio.Event) -> None:
-        await watching.wait()
-        await asyncio.sleep(min(FIRST_RESYNC, self._options.resync))
-        while True:
-            began = time.monotonic()
-            try:
-                await self._list_all()
-            except (ApiError, Unreachable) as error:
-                log.warning("resync: %s", error)
-            self._world.leases.forget_except(self._world.claims.holders())
-            await asyncio.sleep(max(0.0, self._options.resync - (time.monotonic() - began)))
-
-    async def _look_at_leases(self) -> None:
-        """Measure the time in which we reach the API server, and read the Leases that seem to have lapsed."""
-        while True:
-            reached = await self._reached()
-            self._world.healthy.look(time.monotonic(), succeeded=reached)
-            if reached:
-                try:
-                    await self._read_due_leases()
-                except (ApiError, Unreachable) as error:
-                    log.warning("leases: %s", error)
-            await asyncio.sleep(LOOK_EVERY)
-
-    async def _reached(self) -> bool:
-        try:
-            await self._client.list(self._own[-1], next(iter(self._options.namespaces), None), limit=1)
-        except Unreachable:
-            return False
-        except ApiError as error:
-            return error.code < 500
-        return True
-
-    async def _read_due_leases(self) -> None:
-        at = self._world.healthy.elapsed
-        for (namespace, holder), instances in self._world.claims.holders().items():
-            if not self._world.leases.due((namespace, holder), at):
-                continue
-            raw = await self._client.get(LEASES, namespace, lease_name(holder))
-            self._world.leases.observe((namespace, holder), raw, self._world.healthy.elapsed)
-            for instance in instances:
-                self._instances.add(instance)
-
 
 async def _discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
     """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and said."""
@@ -296,6 +246,10 @@ async def _discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]
         elif not found[kind].namespaced:
             raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
     return found
+
+
+def _soon(queue: WorkQueue[Key]) -> Callable[[Key], None]:
+    return lambda key: queue.add_at(key, time.time() + JUDGING_PAUSE)
 
 
 def _on_signals(stop: asyncio.Event) -> None:

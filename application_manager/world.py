@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeVar
 
 from application_manager.apply import Applied
 from application_manager.claimbook import ClaimBook
@@ -15,12 +15,16 @@ from application_manager.policy import KindKey, Policy
 from application_manager.rendering import Renderer, RenderError
 from application_manager.status import Service
 from application_manager.store import Name, Store
-from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate
+from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
+
+Model = TypeVar("Model", bound=Kind)
 
 TEMPLATE: Final[KindKey] = (API_VERSION, "ApplicationTemplate")
 TASK: Final[KindKey] = (API_VERSION, "ApplicationTask")
 INSTANCE: Final[KindKey] = (API_VERSION, "ApplicationInstance")
-OWN_KINDS: Final = (TEMPLATE, INSTANCE, TASK)
+EVENT_RULE: Final[KindKey] = (API_VERSION, "EventRule")
+DETECTOR: Final[KindKey] = (API_VERSION, "Detector")
+OWN_KINDS: Final = (TEMPLATE, INSTANCE, TASK, DETECTOR, EVENT_RULE)
 LEASE: Final[KindKey] = ("coordination.k8s.io/v1", "Lease")
 
 
@@ -83,6 +87,14 @@ class World:
         """The task, or None where there is none, or none that is valid."""
         entry = self.store.get(TASK, name)
         return entry.model if entry is not None and isinstance(entry.model, ApplicationTask) else None
+
+    def models(self, kind: KindKey, model: type[Model], namespace: str) -> list[Model]:
+        """The objects of a kind in a namespace, as far as they are valid."""
+        return [
+            entry.model
+            for name, entry in self.store.all(kind)
+            if name[0] == namespace and isinstance(entry.model, model)
+        ]
 
     def instances_of(self, template: Name) -> list[Name]:
         """The instances of a template."""

@@ -1,0 +1,76 @@
+"""Statuses of EventRules and Detectors: whether a detector can evaluate them, and if not, what is wrong where. Pure.
+
+The same compiler that the detector runs judges here. It does not know the message types of ROS, which are the
+detector's to know, so a misspelt field of a message is told by the detector alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from application_manager.conditions import Aspect, updated
+from wayside.api import Detector, EventRule
+from wayside.api.detector import DetectorStatus
+from wayside.api.eventrule import EventRuleStatus
+from wayside.rules import RuleError, compile_rule, stream_problems
+
+
+def rule_status(rule: EventRule, detectors: Sequence[Detector], now: float) -> EventRuleStatus:
+    """The rule's status; `detectors` are those of its namespace, `now` is in seconds since 1970."""
+    selecting = sorted((each for each in detectors if selects(each, rule)), key=lambda each: each.name)
+    old = rule.status or EventRuleStatus()
+    generation = rule.metadata.generation
+    return EventRuleStatus(
+        observed_generation=generation,
+        detectors=[each.name for each in selecting],
+        conditions=list(updated(old.conditions, (_rule_aspect(rule, selecting, detectors),), generation, now)),
+    )
+
+
+def detector_status(detector: Detector, rules: Sequence[EventRule], now: float) -> DetectorStatus:
+    """The detector's status; `rules` are those of its namespace, `now` is in seconds since 1970."""
+    old = detector.status or DetectorStatus()
+    problems = [
+        str(problem) for index, stream in enumerate(detector.spec.streams) for problem in stream_problems(stream, index)
+    ]
+    if problems:
+        aspect = Aspect("Accepted", False, "DetectorInvalid", "; ".join(problems))
+    else:
+        aspect = Aspect("Accepted", True, "Accepted", "the detector can run")
+    generation = detector.metadata.generation
+    return DetectorStatus(
+        observed_generation=generation,
+        rules=sum(1 for each in rules if selects(detector, each)),
+        conditions=list(updated(old.conditions, (aspect,), generation, now)),
+    )
+
+
+def selects(detector: Detector, rule: EventRule) -> bool:
+    """Whether the detector evaluates the rule, which is in its namespace."""
+    return detector.spec.rules.matches(rule.metadata.labels)
+
+
+def _rule_aspect(rule: EventRule, selecting: Sequence[Detector], detectors: Sequence[Detector]) -> Aspect:
+    if not selecting:
+        wanted = [f"{each.name} selects {_labels(each)}" for each in sorted(detectors, key=lambda each: each.name)]
+        remedy = f"add labels to metadata.labels: {'; '.join(wanted)}" if wanted else "create a Detector"
+        message = f"no Detector in namespace {rule.namespace} selects the rule: {remedy}"
+        return Aspect("Accepted", False, "NotSelected", message)
+    problems: dict[str, list[str]] = {}  # problem → detectors that have it
+    for detector in selecting:
+        try:
+            compile_rule(rule, detector)
+        except RuleError as error:
+            for problem in error.problems:
+                problems.setdefault(str(problem), []).append(detector.name)
+    if not problems:
+        return Aspect("Accepted", True, "Accepted", "the rule can be evaluated")
+    told = [
+        problem if len(names) == len(selecting) else f"with Detector {', '.join(names)}: {problem}"
+        for problem, names in problems.items()
+    ]
+    return Aspect("Accepted", False, "RuleInvalid", "; ".join(told))
+
+
+def _labels(detector: Detector) -> str:
+    return ", ".join(f"{key}={value}" for key, value in sorted(detector.spec.rules.match_labels.items())) or "all"

@@ -1,0 +1,101 @@
+"""`application-manager render` tells what would run, from files alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from application_manager.cli import app
+from tests.unit.manager_objects import DEPLOYMENT
+
+TEMPLATE: dict[str, Any] = {
+    "apiVersion": "wayside.dev/v1alpha1",
+    "kind": "ApplicationTemplate",
+    "metadata": {"name": "fusion"},
+    "spec": {
+        "parameters": {"region": {"type": "string"}, "sources": {"type": "array", "merge": "Union"}},
+        "key": "${parameters.region}",
+        "manifests": [DEPLOYMENT],
+    },
+}
+
+
+def task(name: str, **spec: Any) -> dict[str, Any]:
+    spec = {"template": "fusion", **spec}
+    return {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask", "metadata": {"name": name}, "spec": spec}
+
+
+@pytest.fixture
+def render(tmp_path: Path) -> Any:
+    def render(template: dict[str, Any], *tasks: dict[str, Any], options: tuple[str, ...] = ()) -> Result:
+        (tmp_path / "template.yaml").write_text(yaml.safe_dump(template))
+        folder = tmp_path / "tasks"
+        folder.mkdir()
+        (folder / "tasks.yaml").write_text(yaml.safe_dump_all(tasks))
+        files = ["--templates", str(tmp_path / "template.yaml"), "--tasks", str(folder)]
+        return CliRunner().invoke(app, ["render", *files, *options])
+
+    return render
+
+
+def test_merged_instances_and_their_manifests_are_printed(render: Any) -> None:
+    pairs = [task(n, parameters={"region": "n", "sources": s}) for n, s in (("a", ["x"]), ("b", ["y", "x"]))]
+    result = render(TEMPLATE, *pairs)
+    assert result.exit_code == 0, result.output
+    instance, deployment = yaml.safe_load_all(result.stdout)
+    assert instance["kind"] == "ApplicationInstance"
+    assert instance["spec"] == {"template": "fusion", "key": "n", "parameters": {"region": "n", "sources": ["x", "y"]}}
+    assert deployment["kind"] == "Deployment"
+    assert deployment["metadata"]["name"] == instance["metadata"]["name"]
+
+
+def test_refusals_go_to_stderr_and_the_rest_is_printed(render: Any) -> None:
+    result = render(
+        TEMPLATE,
+        task("good", parameters={"region": "n"}),
+        task("bad", parameters={"region": 1}),
+        task("x", template="y"),
+    )
+    assert result.exit_code == 1
+    assert len(list(yaml.safe_load_all(result.stdout))) == 2
+    bad, unknown = result.stderr.splitlines()
+    assert bad.startswith("ApplicationTask default/bad: InvalidParameters: spec.parameters.region: 1 is not of type")
+    assert unknown.startswith("ApplicationTask default/x: TemplateNotFound")
+
+
+def test_a_template_that_cannot_be_rendered_is_told_with_its_place(render: Any) -> None:
+    broken = {**TEMPLATE, "spec": {**TEMPLATE["spec"], "manifests": [{**DEPLOYMENT, "metadata": {"name": "${nam}"}}]}}
+    result = render(broken, task("a", parameters={"region": "n"}))
+    assert result.exit_code == 1
+    assert result.stderr.startswith("ApplicationTemplate default/fusion: spec.manifests[0].metadata.name, line 1")
+
+
+def test_a_kind_that_is_not_allowed_is_refused(render: Any) -> None:
+    result = render(TEMPLATE, task("a", parameters={"region": "n"}), options=("--allowed-kinds", "v1/ConfigMap"))
+    assert result.exit_code == 1
+    assert "allowed are v1/ConfigMap" in result.stderr
+
+
+def test_bad_files_and_bad_options_are_one_clear_line_and_exit_code_2(render: Any, tmp_path: Path) -> None:
+    wrong = render({**TEMPLATE, "spec": {"manifests": "x"}})
+    assert wrong.exit_code == 2
+    assert f"{tmp_path / 'template.yaml'}:" in wrong.stderr
+    assert "spec.manifests" in wrong.stderr
+    missing = CliRunner().invoke(app, ["render", "--templates", "nowhere.yaml", "--tasks", "nowhere.yaml"])
+    assert missing.exit_code == 2
+    assert "nowhere.yaml: there is no such file" in missing.stderr
+    option = CliRunner().invoke(app, ["run", "--resync", "soon"])
+    assert option.exit_code == 2
+    assert "'soon' is not a duration" in option.stderr.replace("\n", " ")
+
+
+def test_without_a_cluster_run_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
+    result = CliRunner().invoke(app, ["run"])
+    assert result.exit_code == 2
+    assert "set KUBECONFIG" in result.stderr

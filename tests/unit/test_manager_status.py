@@ -1,0 +1,103 @@
+"""Statuses are honest and quiet: conditions keep their time, Applied and Ready of a task latch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from application_manager.conditions import Aspect, changed, updated
+from application_manager.demand import Standing, Verdict
+from application_manager.readiness import not_ready
+from application_manager.status import Service, difference, finished_since, task_status
+from application_manager.times import format_time, parse_time
+from tests.unit.manager_objects import NOW, task
+from wayside.api.applicationtask import TaskPhase
+
+COUNTS = Verdict(Standing.COUNTS, "Accepted", "counts", "app")
+
+
+def said(status: Any) -> dict[str, str]:
+    return {each.type: each.status for each in status.conditions}
+
+
+def test_a_condition_keeps_its_time_while_its_status_stays() -> None:
+    first = updated((), [Aspect("Ready", False, "NotReady", "0 of 1")], 1, NOW)
+    second = updated(first, [Aspect("Ready", False, "NotReady", "0 of 2")], 2, NOW + 5)
+    third = updated(second, [Aspect("Ready", True, "Ready")], 2, NOW + 9)
+    assert second[0].last_transition_time == format_time(NOW)
+    assert (second[0].message, second[0].observed_generation) == ("0 of 2", 2)
+    assert third[0].last_transition_time == format_time(NOW + 9)
+
+
+def test_only_a_change_of_status_or_reason_is_worth_an_event() -> None:
+    first = updated((), [Aspect("Ready", False, "NotReady", "0 of 1")], 1, NOW)
+    assert changed((), first) == list(first)
+    assert changed(first, updated(first, [Aspect("Ready", False, "NotReady", "0 of 2")], 2, NOW)) == []
+
+
+def test_a_tasks_phases_follow_its_instance() -> None:
+    phases = [
+        task_status(task("a"), COUNTS, service, NOW).phase
+        for service in (None, Service("app", False, False), Service("app", True, False), Service("app", True, True))
+    ]
+    assert phases == [TaskPhase.PENDING, TaskPhase.PENDING, TaskPhase.ACTIVE, TaskPhase.READY]
+
+
+def test_applied_and_ready_of_a_task_stay_true_once_they_were() -> None:
+    ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
+    served = task("a").model_copy(update={"status": ready})
+    later = task_status(served, COUNTS, Service("app", False, False, "broken"), NOW + 1)
+    assert said(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
+    assert later.phase is TaskPhase.PENDING
+
+
+def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
+    served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, None, NOW)})
+    done = task_status(served, Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 7)
+    assert (done.phase, done.instance) == (TaskPhase.FINISHED, "app")
+    assert finished_since(served.model_copy(update={"status": done})) == NOW + 7
+    assert finished_since(served) is None
+
+
+def test_a_holder_that_returns_takes_back_that_its_task_is_finished() -> None:
+    lost = task_status(task("a"), Verdict(Standing.FINISHED, "DetectorLost", "lost"), None, NOW)
+    back = task_status(task("a").model_copy(update={"status": lost}), COUNTS, None, NOW + 1)
+    assert said(back)["Finished"] == "False"
+    assert finished_since(task("a").model_copy(update={"status": back})) is None
+
+
+def test_the_difference_is_a_merge_patch() -> None:
+    assert difference({"a": 1, "b": 2, "c": 3}, {"a": 1, "b": 5, "d": 6}) == {"b": 5, "c": None, "d": 6}
+    assert difference({"a": [1]}, {"a": [1]}) == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["2026-05-04T10:20:30Z", "2026-05-04T10:20:30.123Z", "2026-05-04T10:20:30.123456789Z", "2026-05-04T12:20:30+02:00"],
+)
+def test_times_of_all_precisions_are_read(text: str) -> None:
+    assert int(parse_time(text)) == 1777890030
+
+
+@pytest.mark.parametrize(
+    ("live", "expected"),
+    [
+        ({"kind": "ConfigMap"}, None),
+        ({"kind": "Deployment", "spec": {"replicas": 2}}, "has 0 of 2 pods available"),
+        ({"kind": "Deployment", "spec": {"replicas": 2}, "status": {"availableReplicas": 2}}, None),
+        ({"kind": "Deployment", "metadata": {"generation": 2}, "spec": {}}, "has not been looked at"),
+        ({"kind": "Deployment", "spec": {"replicas": 0}}, None),
+        ({"kind": "StatefulSet", "status": {"availableReplicas": 1}}, None),
+        ({"kind": "DaemonSet"}, "is not scheduled yet"),
+        ({"kind": "DaemonSet", "status": {"desiredNumberScheduled": 3, "numberAvailable": 1}}, "has 1 of 3"),
+        ({"kind": "Pod", "status": {"conditions": [{"type": "Ready", "status": "True"}]}}, None),
+        ({"kind": "Pod", "status": {"phase": "Pending"}}, "is not ready"),
+        ({"kind": "Job", "status": {"ready": 1}}, None),
+        ({"kind": "Job", "status": {"conditions": [{"type": "Failed", "status": "True"}]}}, "has failed"),
+        ({"kind": "Job"}, "has no pod that runs"),
+    ],
+)
+def test_ready_means_that_the_workload_is(live: dict[str, Any], expected: str | None) -> None:
+    problem = not_ready({"metadata": {}, **live})
+    assert problem == expected if expected is None else expected in str(problem)

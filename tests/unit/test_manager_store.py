@@ -1,0 +1,67 @@
+"""The store holds the newest version of each object, whatever the order in which news come."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from application_manager.store import Store
+
+KIND = ("v1", "ConfigMap")
+NAME = ("site", "x")
+
+
+def raw(version: int, uid: str = "u", name: str = "x", namespace: str = "site") -> dict[str, Any]:
+    metadata = {"name": name, "namespace": namespace, "uid": uid, "resourceVersion": str(version)}
+    return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata}
+
+
+@given(st.permutations([1, 2, 3, 4]))
+def test_the_newest_version_wins_in_any_order(order: list[int]) -> None:
+    store = Store([])
+    for version in order:
+        store.put(raw(version))
+    entry = store.get(KIND, NAME)
+    assert entry is not None
+    assert entry.version == 4
+
+
+def test_the_same_version_again_is_no_news() -> None:
+    store = Store([])
+    assert store.put(raw(1)) is not None
+    assert store.put(raw(1)) is None
+
+
+def test_what_was_deleted_does_not_come_back_from_an_old_list() -> None:
+    store = Store([])
+    store.put(raw(1))
+    assert store.remove(raw(5)) is not None
+    assert store.put(raw(3)) is None
+    assert store.put(raw(7, uid="another")) is not None
+
+
+def test_the_end_of_a_predecessor_leaves_the_successor() -> None:
+    store = Store([])
+    store.put(raw(7, uid="successor"))
+    assert store.remove(raw(8, uid="predecessor")) is None
+    assert store.get(KIND, NAME) is not None
+
+
+def test_a_list_shows_what_is_gone_but_nothing_that_is_newer_than_itself() -> None:
+    store = Store([])
+    for each in (raw(1, "a", "gone"), raw(2, "b", "kept"), raw(9, "c", "newer"), raw(1, "d", "other", "elsewhere")):
+        store.put(each)
+    missing = store.missing(KIND, [raw(2, "b", "kept")], "5", "site")
+    assert [entry.raw["metadata"]["name"] for entry in missing] == ["gone"]
+
+
+def test_an_object_that_is_no_model_is_kept_with_the_reason() -> None:
+    kind = ("wayside.dev/v1alpha1", "ApplicationTask")
+    store = Store([kind])
+    task = {**raw(1), "apiVersion": kind[0], "kind": kind[1], "spec": {"template": 7}}
+    entry = store.put(task)
+    assert entry is not None
+    assert entry.model is None
+    assert "spec.template" in entry.problem

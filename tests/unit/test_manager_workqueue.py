@@ -1,0 +1,162 @@
+"""The queue works on each key at most once at a time, and again where that is asked for or failed."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+
+import pytest
+
+from application_manager import workqueue
+from application_manager.client import ApiError, Unreachable
+from application_manager.workqueue import WorkQueue
+
+
+@asynccontextmanager
+async def running(*queues: WorkQueue[str]) -> AsyncIterator[None]:
+    tasks = [asyncio.create_task(queue.run()) for queue in queues]
+    try:
+        async with asyncio.timeout(5):
+            yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def in_a_loop(test: Callable[[], Coroutine[None, None, None]]) -> Callable[[], None]:
+    def run() -> None:
+        asyncio.run(test())
+
+    run.__name__ = test.__name__
+    return run
+
+
+@in_a_loop
+async def test_a_key_asked_for_while_it_waits_is_worked_on_once() -> None:
+    done: list[str] = []
+    idle = asyncio.Event()
+
+    async def work(key: str) -> None:
+        done.append(key)
+        if key == "last":
+            idle.set()
+
+    queue = WorkQueue("q", work, 1)
+    for key in ("a", "a", "b", "a", "last"):
+        queue.add(key)
+    async with running(queue):
+        await idle.wait()
+    assert done == ["a", "b", "last"]
+
+
+@in_a_loop
+async def test_a_key_asked_for_while_it_runs_is_worked_on_once_more_and_never_twice_at_once() -> None:
+    started = 0
+    at_once = 0
+    once, twice, more = asyncio.Event(), asyncio.Event(), asyncio.Event()
+
+    async def work(key: str) -> None:
+        nonlocal started, at_once
+        started, at_once = started + 1, at_once + 1
+        assert at_once == 1
+        (once if started == 1 else twice).set()
+        await more.wait()
+        at_once -= 1
+
+    queue = WorkQueue("q", work, 4)
+    async with running(queue):
+        queue.add("a")
+        await once.wait()
+        queue.add("a")
+        queue.add("a")
+        more.set()
+        await twice.wait()
+    assert started == 2
+
+
+@pytest.mark.parametrize("error", [Unreachable("gone"), ApiError(503, "busy"), ValueError("a defect")])
+def test_a_failure_is_tried_again_and_stops_nobody_else(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workqueue, "FIRST_PAUSE", 0.01)
+    done: list[str] = []
+
+    async def scenario() -> None:
+        finished = asyncio.Event()
+
+        async def work(key: str) -> None:
+            done.append(key)
+            if key == "bad" and done.count("bad") < 3:
+                raise error
+            if key == "bad":
+                finished.set()
+
+        queue = WorkQueue("q", work, 1)
+        queue.add("bad")
+        queue.add("good")
+        async with running(queue):
+            await finished.wait()
+
+    asyncio.run(scenario())
+    assert done == ["bad", "good", "bad", "bad"]
+
+
+def test_what_the_api_server_asks_for_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workqueue, "FIRST_PAUSE", 0.01)
+    at: list[float] = []
+
+    async def scenario() -> None:
+        finished = asyncio.Event()
+
+        async def work(key: str) -> None:
+            at.append(time.monotonic())
+            if len(at) == 1:
+                raise ApiError(429, "too many", retry_after=0.3)
+            finished.set()
+
+        queue = WorkQueue("q", work, 1)
+        queue.add("a")
+        async with running(queue):
+            await finished.wait()
+
+    asyncio.run(scenario())
+    assert at[1] - at[0] >= 0.3
+
+
+@in_a_loop
+async def test_the_earliest_time_asked_for_counts() -> None:
+    done = asyncio.Event()
+
+    async def work(key: str) -> None:
+        done.set()
+
+    queue = WorkQueue("q", work, 1)
+    async with running(queue):
+        queue.add_at("a", time.time() + 100)
+        queue.add_at("a", time.time() - 100)
+        queue.add_at("a", time.time() + 200)
+        await done.wait()
+
+
+@in_a_loop
+async def test_a_queue_that_comes_after_another_waits_while_that_has_work() -> None:
+    done: list[str] = []
+    finished = asyncio.Event()
+
+    async def first(key: str) -> None:
+        await asyncio.sleep(0.02)
+        done.append(key)
+
+    async def second(key: str) -> None:
+        done.append(key)
+        finished.set()
+
+    before = WorkQueue("first", first, 1)
+    after = WorkQueue("second", second, 1, before)
+    for key in ("a", "b", "c"):
+        before.add(key)
+    after.add("words")
+    async with running(before, after):
+        await finished.wait()
+    assert done.index("words") >= 2
