@@ -12,7 +12,7 @@ import logging
 import signal
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,7 +21,7 @@ from detector.actions.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.kubernetes_store import KubernetesTaskStore
 from detector.actions.lease import HolderLease
 from detector.actions.stores import TaskStore, restore
-from detector.assembly import inlets, make_engine
+from detector.assembly import DetectorError, inlets, make_engine
 from detector.cluster.connection import connect
 from detector.engine.demands import Demand
 from detector.engine.events import Event
@@ -33,6 +33,7 @@ from detector.rules.files import load_rules
 from detector.rules.kubernetes import ClusterRules
 from detector.rules.selection import RuleSet
 from detector.streams.zenoh import Network, NetworkError, Put
+from wayside.api import Detector
 from wayside.api.detector import Stream, Zenoh
 
 _log = logging.getLogger(__name__)
@@ -103,6 +104,11 @@ class LiveOutlet:
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """Hand the demands over."""
         self._reconciler.update(demands, ended)
+
+
+def _keys(streams: Iterable[Stream]) -> list[tuple[str, str]]:
+    """What the network has to know of the streams."""
+    return [(stream.name, stream.key) for stream in streams]
 
 
 async def run(options: Options) -> None:
@@ -193,6 +199,15 @@ async def _unless(stopping: asyncio.Event, work: Awaitable[Result]) -> Result | 
     return working.result() if working in done else None
 
 
+def _unused(path: Path) -> Path:
+    """The path, or where there is a file already, one beside it: a restart must not destroy what was recorded."""
+    candidates = (path, *(path.with_name(f"{path.stem}.{number}{path.suffix}") for number in range(2, 1_000_000)))
+    free = next(candidate for candidate in candidates if not candidate.exists())
+    if free != path:
+        _log.warning("%s exists already: recording into %s", path, free)
+    return free
+
+
 class _Running:
     """A detector at work: inside the `with`, its threads run."""
 
@@ -214,7 +229,7 @@ class _Running:
         entries = inlets(detector)
         self._intake = Intake(time.time_ns)
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns())
-        self._writer = None if record is None else IntakeWriter(record, detector.spec.streams)
+        self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams)
         self._log = None if output is None else EventLog(output / "events.jsonl")
         network = Network(detector.spec.zenoh, detector.spec.streams, self._intake.putter)
         self._outlet = LiveOutlet(network, self._log, reconciler)
@@ -258,12 +273,22 @@ class _Running:
 
     async def follow(self, changes: AsyncIterator[RuleSet]) -> None:
         """Take over each change of the Detector and its rules."""
-        async for rule_set in changes:
-            before, self._rule_set = self._rule_set.detector.spec, rule_set
-            spec = rule_set.detector.spec
-            self._evaluator.configure(rule_set)
-            if spec.zenoh != before.zenoh or spec.streams != before.streams:
+        async for wanted in changes:
+            detector, before = self._good(wanted.detector), self._rule_set.detector.spec
+            self._rule_set = replace(wanted, detector=detector)
+            self._evaluator.configure(self._rule_set)
+            spec = detector.spec
+            if spec.zenoh != before.zenoh or _keys(spec.streams) != _keys(before.streams):
                 await asyncio.to_thread(self._outlet.reconnect, spec.zenoh, spec.streams, self._intake.putter)
+
+    def _good(self, wanted: Detector) -> Detector:
+        """The changed Detector; the last one where it cannot run."""
+        try:
+            inlets(wanted)
+        except DetectorError as error:
+            _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.name, error)
+            return self._rule_set.detector
+        return wanted
 
     def _fail(self, error: BaseException) -> None:
         def tell() -> None:

@@ -28,7 +28,7 @@ from cooperative_recording.vehicles import simulate
 from foresight import Foresight, TaskFolder
 from rich.console import Console
 
-from wayside.api import ApplicationTemplate
+from wayside.api import ApplicationTask, ApplicationTemplate
 from wayside.api.documents import load_documents
 
 HERE = Path(__file__).resolve().parent
@@ -128,12 +128,13 @@ class Timeline:
         for name, task in sorted(tasks.items()):
             if name not in self._tasks:
                 self._tasks.add(name)
-                self._line("task", "cyan", f"{name} demands {task.spec.template}")
+                self._line("task", "cyan", f"for {_subject(task)}: {task.spec.template} ({name})")
             if task.spec.end_time is not None and name not in self._ended:
                 self._ended.add(name)
-                self._line("task", "cyan", f"{name} has ended")
+                self._line("task", "cyan", f"for {_subject(task)}: {task.spec.template} has ended")
         for change in self._foresight.look(tasks, time.time()):
-            self._line("instance", "green", f"{change.instance} [bold]{change.what}[/]: {change.detail}")
+            detail = f": {change.detail}" if change.detail else ""
+            self._line("instance", "green", f"{change.instance} [bold]{change.what}[/]{detail}")
 
     def write_manifests(self, path: Path) -> None:
         """The manifests of every instance that there was, as they were last."""
@@ -151,12 +152,16 @@ class Timeline:
         distance = data["values"].get("distance")
         at = "" if distance is None else f" at {distance:.0f} m"
         if event["type"].endswith("started"):
-            self._line("event", "yellow", f"{who} came close{at}: episode {data['episode']} of {data['rule']} starts")
+            self._line("event", "yellow", f"{who} came close{at}: episode {data['episode']} starts")
         else:
             self._line("event", "yellow", f"{who} parted{at}: episode {data['episode']} ends ({data['reason']})")
 
     def _line(self, kind: str, colour: str, text: str) -> None:
         self._console.print(f"{time.monotonic() - self._begin:5.1f} s  [{colour}]{kind:8}[/]  {text}")
+
+
+def _subject(task: ApplicationTask) -> str:
+    return task.spec.event.subject if task.spec.event else "nobody"
 
 
 def _verdict(console: Console, output: Path, running: list[str], drive_ended: int) -> int:
@@ -166,7 +171,7 @@ def _verdict(console: Console, output: Path, running: list[str], drive_ended: in
     found = sorted(event["subject"] for event in map(json.loads, lines) if event["type"].endswith("started"))
     console.print(
         f"[bold]{len(found)} episodes; the vehicles' positions alone say {len(expected)}."
-        f" {len(running)} applications would still run.[/]"
+        f" {len(running) or 'No'} application{'s' if len(running) > 1 else ''} would still run.[/]"
     )
     console.print(f"See {output}/events.jsonl, {output}/tasks.yaml, {output}/manifests.yaml (and detector.log).")
     if found != expected or running or drive_ended:

@@ -20,7 +20,7 @@ from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Something that happens to an instance: created, changed, lingering, kept or removed."""
+    """Something that happens to an instance: it starts, is reconfigured, lingers, stays after all, or is removed."""
 
     what: str
     instance: str
@@ -46,7 +46,7 @@ class Foresight:
         before = self.instances.get(name)
         if decision.release_time is not None and decision.release_time <= now:
             del self.instances[name]
-            yield Change("removed", name, self._objects(name))
+            yield Change("is removed", name, "")
             return
         after = _instance(decision, before)
         self.instances[name] = after
@@ -55,16 +55,16 @@ class Foresight:
         lingering = decision.release_time is not None
         lingered = before is not None and before.status is not None and before.status.release_time is not None
         if before is None:
-            yield Change("created", name, f"{self._objects(name)} {_text(after.spec.parameters)}")
+            yield Change("starts", name, f"{_text(after.spec.parameters)}  ({self._objects(name)})")
         elif before.spec.parameters != after.spec.parameters:
-            yield Change("changed", name, _text(after.spec.parameters))
+            yield Change("is reconfigured", name, _text(after.spec.parameters))
         elif lingering and not lingered:
             yield Change("lingers", name, f"no demand is left; it goes in {template.spec.lifecycle.linger}")
         elif lingered and not lingering:
-            yield Change("kept", name, "demanded again while it lingered: it never stopped")
+            yield Change("stays", name, "demanded again while it lingered: it never stopped")
 
     def _objects(self, name: str) -> str:
-        return ", ".join(f"{each['kind']}/{each['metadata']['name']}" for each in self.ever[name].manifests)
+        return ", ".join(sorted(each["kind"] for each in self.ever[name].manifests))
 
 
 class TaskFolder:

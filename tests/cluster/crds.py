@@ -42,5 +42,5 @@ def apply_crds(api: Api, folder: Path = CRDS, timeout: float = 20) -> Mapping[st
 
 def is_established(crd: Object) -> bool:
     """Whether the API server accepted the names and the schema, and serves the kind."""
-    conditions = {each["type"]: each["status"] for each in crd.get("status", {}).get("conditions", [])}
+    conditions = {each["type"]: each["status"] for each in (crd.get("status") or {}).get("conditions") or []}
     return conditions.get("Established") == "True" and conditions.get("NamesAccepted") == "True"
