@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
-from detector.assembly import DetectorError, compile_rules, inlets
+from detector.assembly import compile_rules, inlets
 from detector.engine.demands import Demand, to_task
 from detector.engine.engine import Engine
 from detector.engine.events import Event
@@ -102,7 +102,7 @@ class Evaluator:
         self._thread.start()
 
     def configure(self, rule_set: RuleSet) -> None:
-        """Go on with another Detector or other rules, from the next look on; thread-safe."""
+        """Go on with other rules, or another Detector that can run, from the next look on; thread-safe."""
         with self._wake:
             self._wanted = rule_set
             self._wake.notify()
@@ -166,14 +166,10 @@ class Evaluator:
         return self._engine.gap(now)
 
     def _configure(self, wanted: RuleSet) -> list[Event]:
-        """Take over a changed Detector or rules; one that cannot run leaves everything as it is."""
+        """Take over a changed Detector or rules."""
         changed = wanted.detector.spec != self._engine.detector.spec
         if changed:
-            try:
-                entries = inlets(wanted.detector)
-            except DetectorError as error:
-                _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.detector.name, error)
-                return []
+            entries = inlets(wanted.detector)
             self._engine.set_detector(wanted.detector, entries.decoders, entries.read_key)
             if self._recorder is not None:
                 self._recorder.follow(wanted.detector.spec.streams)

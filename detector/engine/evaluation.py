@@ -41,6 +41,8 @@ class Episode:
     """What the conditions saw at the start; None in a restored episode until its next evaluation."""
     demands: dict[str, Demand] = field(default_factory=dict)
     """By action; an action whose parameters cannot be rendered yet has none."""
+    outdated: set[str] = field(default_factory=set)
+    """Actions that changed since: their demands hold until they can be rendered anew."""
 
 
 class RuleRun:
@@ -90,7 +92,7 @@ class RuleRun:
     def restore(self, demands: list[Demand]) -> None:
         """Take up an episode that was open before a restart, from the demands of its actions.
 
-        Where an action is not what it was, its demand is rendered anew at the next evaluation.
+        Where an action is not what it was, its demand holds until it is rendered anew, at the next evaluation.
         """
         first = demands[0]
         deploys = {deploy.action: (deploy.template, deploy.priority) for deploy in self.rule.deploys}
@@ -102,17 +104,23 @@ class RuleRun:
             first.start_time,
             first.values,
             None,
-            {d.action: d for d in demands if deploys.get(d.action) == (d.template, d.priority)},
+            {d.action: d for d in demands if d.action in deploys},
+            {d.action for d in demands if d.action in deploys and deploys[d.action] != (d.template, d.priority)},
         )
 
     def change_actions(self, rule: CompiledRule) -> None:
-        """Go on with a rule that differs in nothing that decides which episodes there are."""
+        """Go on with a rule that differs in nothing that decides which episodes there are.
+
+        The demands of actions that are gone go at once, those of changed ones hold until they are rendered anew.
+        """
         changed = {deploy.action for deploy in {*rule.deploys} ^ {*self.rule.deploys}}
+        gone = changed - {deploy.action for deploy in rule.deploys}
         self.rule = rule
         self._timing = _timing(rule)
         for episode in self._open.values():
-            for action in changed:
+            for action in gone:
                 episode.demands.pop(action, None)
+            episode.outdated = (episode.outdated | changed) - gone
             self._render(episode)
 
     def end_all(self, now: int, reason: Reason) -> Iterator[Event]:
@@ -159,7 +167,7 @@ class RuleRun:
                 yield self._ended(now, self._open.pop(candidate.members), reason, snapshot(self.rule, candidate))
             case None:
                 episode = self._open.get(candidate.members)
-                if episode is not None and len(episode.demands) < len(self.rule.deploys):
+                if episode is not None and (episode.outdated or len(episode.demands) < len(self.rule.deploys)):
                     episode.variables = variables
                     self._render(episode)
 
@@ -198,11 +206,11 @@ class RuleRun:
         )
 
     def _render(self, episode: Episode) -> None:
-        """Render the demands that the episode does not have yet; what cannot be rendered is tried at the next tick."""
+        """Render what the episode does not have as the rule says; what cannot be rendered is tried at the next tick."""
         if episode.variables is None:
             return
         for deploy in self.rule.deploys:
-            if deploy.action not in episode.demands:
+            if deploy.action not in episode.demands or deploy.action in episode.outdated:
                 try:
                     parameters = deploy.parameters.render(episode.variables)
                 except InterpolationError as error:
@@ -210,6 +218,7 @@ class RuleRun:
                     self.counters.last_error = f"action {deploy.action}: {error}"
                     continue
                 episode.demands[deploy.action] = self._demand(episode, deploy, parameters)
+                episode.outdated.discard(deploy.action)
                 self.version += 1
 
     def _demand(self, episode: Episode, deploy: CompiledDeploy, parameters: Any) -> Demand:

@@ -432,10 +432,20 @@ def test_actions_that_changed_while_the_detector_was_away_are_applied_at_the_nex
     )
     drive = Drive(a_detector(), new)
     assert drive.note(drive.engine.restore(held, at(0))) == []
-    assert demanded(drive) == {"same": ("app", {})}
+    assert demanded(drive) == {"same": ("app", {}), "moved": ("old", {})}
     drive.take(speed(0.5, 15), until=1)
     assert demanded(drive) == {"same": ("app", {}), "moved": ("new", {}), "added": ("app", {"v": 15})}
     assert {demand.start_time for demand in drive.engine.demands().values()} == {at(-999)}
+
+
+def test_actions_that_change_after_a_restart_let_no_demand_go_before_it_is_rendered_anew() -> None:
+    drive = Drive(a_detector(), RECORD)
+    drive.engine.restore([held_by(RECORD)], at(0))
+    drive.take(speed(0.5, 15), until=1)
+    assert change(drive, speeding(actions=[a_deploy("x", parameters={"v": "${speed}", "w": 1})])) == []
+    assert demanded(drive) == {"x": ("app", {"v": 20})}
+    drive.take(speed(1.5, 16), until=2)
+    assert demanded(drive) == {"x": ("app", {"v": 16, "w": 1})}
 
 
 @pytest.mark.parametrize("subjects", [(), ("a", "b"), ("a", "a", "b")])

@@ -1,0 +1,285 @@
+"""The whole chain for a test: vehicles that stand where the test puts them, both programs, and what comes of it.
+
+The rule starts an episode for two vehicles closer than 150 m and ends it beyond 200 m, so at 175 m only an episode that
+is open already keeps its demand. The template makes one Deployment for each pair.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from detector.streams.zenoh import open_session
+from tests.cluster.api import Api, Object
+from tests.cluster.managed_world import start_manager, wait_settled
+from tests.cluster.processes import Process, Processes
+from tests.cluster.waiting import wait_until
+from tests.unit.ros_messages import cdr, pose_stamped
+from wayside.api.detector import Zenoh, ZenohMode
+
+NEAR, BETWEEN, FAR = 100.0, 175.0, 250.0
+"""Metres: starts an episode; keeps an open one and starts none; ends it."""
+
+HOLDER = "town"
+LINGER = 2.0  # s
+PERIOD = 0.1  # s between two poses of a vehicle
+
+Pair = tuple[str, str]
+CARS: Pair = ("car1", "car2")
+VANS: Pair = ("van1", "van2")
+BUSES: Pair = ("bus1", "bus2")
+TRAMS: Pair = ("tram1", "tram2")
+LANES = {CARS: 0.0, VANS: 10_000.0, BUSES: 20_000.0, TRAMS: 30_000.0}
+"""Where each pair drives, as y in metres: the pairs never meet."""
+
+
+def json_pose(x: float, y: float) -> bytes:
+    return json.dumps({"x": x, "y": y}).encode()
+
+
+def cdr_pose(x: float, y: float) -> bytes:
+    now = time.time_ns()
+    return cdr(pose_stamped(x, y, seconds=now // 10**9, nanoseconds=now % 10**9))
+
+
+class Vehicles:
+    """Publishes each vehicle's pose ten times a second, from where the test has put it last."""
+
+    def __init__(self, endpoint: str, encode: Callable[[float, float], bytes] = json_pose) -> None:
+        self._encode = encode
+        self._where: dict[str, tuple[float, float]] = {}
+        self._instead: dict[str, Callable[[], bytes]] = {}
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._failure: BaseException | None = None
+        self._session = open_session(Zenoh(mode=ZenohMode.PEER, connect=[endpoint]))
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def place(self, pair: Pair, distance: float) -> None:
+        """From now on, the two are this far apart (metres)."""
+        with self._lock:
+            self._where[pair[0]] = (0.0, LANES[pair])
+            self._where[pair[1]] = (distance, LANES[pair])
+
+    def instead(self, vehicle: str, payload: Callable[[], bytes] | None) -> None:
+        """From now on, the vehicle sends these payloads; None: its pose again."""
+        with self._lock:
+            if payload is None:
+                self._instead.pop(vehicle, None)
+            else:
+                self._instead[vehicle] = payload
+
+    def send(self, key: str, payload: bytes) -> None:
+        """Publish one message."""
+        self._session.put(key, payload)
+
+    def __enter__(self) -> Vehicles:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._session.close()  # type: ignore[no-untyped-call]
+        if self._failure is not None:
+            raise self._failure
+
+    def _run(self) -> None:
+        try:
+            while not self._ended.wait(PERIOD):
+                with self._lock:
+                    for vehicle, (x, y) in self._where.items():
+                        own = self._instead.get(vehicle)
+                        self.send(f"vehicles/{vehicle}/pose", self._encode(x, y) if own is None else own())
+        except BaseException as failure:  # noqa: BLE001  told to the test at the end of its block
+            self._failure = failure
+
+
+class Chain:
+    """Both programs on a namespace with a Detector, a rule and a template."""
+
+    def __init__(self, api: Api, namespace: str, processes: Processes, folder: Path) -> None:
+        self.api = api
+        self.namespace = namespace
+        self.processes = processes
+        self.folder = folder
+        self.endpoint = _free_endpoint()
+        self.detector: Process | None = None
+        self.manager: Process | None = None
+
+    def apply(self, *manifests: Object) -> None:
+        """Apply them in the test's namespace."""
+        for manifest in manifests:
+            metadata = {**manifest["metadata"], "namespace": self.namespace}
+            self.api.apply({**manifest, "metadata": metadata})
+
+    def start(self, *options: str, rules: int = 1) -> Process:
+        """Start both programs; returns once they are at work. `options` are the detector's."""
+        self.manager = start_manager(self.processes, self.namespace)
+        self.detector = self.processes.start(
+            "detector", "run", "--name", HOLDER, "--namespace", self.namespace, "--output", str(self.folder), *options
+        )
+        self.detector.wait_for_output(f"Detector {HOLDER} runs with {rules} rules")
+        return self.detector
+
+    def task(self, pair: Pair) -> Object | None:
+        """The pair's task that is in force, if there is one; AssertionError if there are several."""
+        found = [task for task in self.api.list("ApplicationTask") if _is_of(task, pair) and _live(task)]
+        assert len(found) < 2, f"one demand has several tasks: {found}"
+        return found[0] if found else None
+
+    def wait_task(self, pair: Pair, *, timeout: float = 10) -> Object:
+        """Wait for the pair's task."""
+        found = wait_until(
+            lambda: self.task(pair), lambda task: task is not None, timeout=timeout, what=f"{pair} has a task"
+        )
+        assert found is not None
+        return found
+
+    def deployment(self, pair: Pair) -> Object | None:
+        """The pair's Deployment, if there is one."""
+        found = self.api.list("Deployment", labels=f"pair={'-'.join(pair)}")
+        assert len(found) < 2, f"{pair} has several Deployments"
+        return found[0] if found else None
+
+    def wait_deployed(self, pair: Pair, *, timeout: float = 10) -> Object:
+        """Wait for the pair's Deployment."""
+        found = wait_until(
+            lambda: self.deployment(pair), lambda it: it is not None, timeout=timeout, what=f"{pair} has a Deployment"
+        )
+        assert found is not None
+        return found
+
+    def wait_removed(self, pair: Pair, *, timeout: float = 10) -> None:
+        """Wait until the pair's Deployment is gone."""
+        wait_until(
+            lambda: self.deployment(pair), lambda it: it is None, timeout=timeout, what=f"{pair} has no Deployment"
+        )
+
+    def live(self) -> set[str]:
+        """The subjects of all tasks that are in force."""
+        return {str(task["spec"]["event"]["subject"]) for task in self.api.list("ApplicationTask") if _live(task)}
+
+    def events(self, *subject: str) -> list[Object]:
+        """The events of a client or pair so far, as the detector wrote them."""
+        file = self.folder / "events.jsonl"
+        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        return [event for event in map(json.loads, lines) if event["subject"] == "+".join(subject)]
+
+    def wait_events(self, pair: Pair, *kinds: str, timeout: float = 10) -> list[Object]:
+        """Wait until the pair's events are of these kinds (`started`, or the reason of an end)."""
+        return wait_until(
+            lambda: self.events(*pair),
+            lambda events: [kind_of(event) for event in events] == list(kinds),
+            timeout=timeout,
+            what=f"the events of {pair} are {kinds}",
+        )
+
+    def settled(self) -> None:
+        """Wait until the cluster is as its live tasks demand, and nothing else is there."""
+        wait_settled(self.api)
+
+
+def detector(endpoint: str, **spec: Any) -> Object:
+    pose = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "staleAfter": "2s"}
+    full = {
+        "zenoh": {"mode": "peer", "listen": [endpoint]},
+        "streams": [pose],
+        "rules": {"matchLabels": {"site": HOLDER}},
+        **spec,
+    }
+    return _object("Detector", HOLDER, full)
+
+
+def cdr_stream() -> Object:
+    return {
+        "name": "pose",
+        "key": "vehicles/${client:*}/pose",
+        "encoding": "cdr",
+        "type": "geometry_msgs/msg/PoseStamped",
+        "staleAfter": "2s",
+    }
+
+
+def rule(name: str = "close", *, position: str = "msg", **spec: Any) -> Object:
+    deploy = {"template": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}}
+    full = {
+        "scope": {"pairs": {"position": {"stream": "pose", "x": f"{position}.x", "y": f"{position}.y"}, "within": 400}},
+        "evaluation": {"every": "200ms"},
+        "when": "distance < 150",
+        "until": "distance > 200",
+        "actions": [{"name": "record", "deploy": deploy}],
+        **spec,
+    }
+    made = _object("EventRule", name, full)
+    made["metadata"]["labels"] = {"site": HOLDER}
+    return made
+
+
+def recording(**parameters: Any) -> list[Object]:
+    """The rule's actions, with more parameters for the template."""
+    given = {"vehicles": "${[a.client, b.client]}", **parameters}
+    return [{"name": "record", "deploy": {"template": "recorder", "parameters": given}}]
+
+
+def template() -> Object:
+    labels = {"pair": "${parameters.vehicles[0]}-${parameters.vehicles[1]}"}
+    container = {"name": "main", "image": "app:1", "args": ["--rate=${parameters.rate}"]}
+    deployment = {
+        "apiVersion": "apps/v1",
+        "kind": "Deployment",
+        "metadata": {"name": "${instance.name}", "labels": labels},
+        "spec": {
+            "replicas": 1,
+            "selector": {"matchLabels": labels},
+            "template": {"metadata": {"labels": labels}, "spec": {"containers": [container]}},
+        },
+    }
+    spec = {
+        "parameters": {
+            "vehicles": {"type": "array", "items": "string", "required": True, "merge": "Same"},
+            "rate": {"type": "number", "default": 1, "minimum": 1, "maximum": 50, "merge": "Max"},
+        },
+        "key": "${parameters.vehicles}",
+        "lifecycle": {"linger": f"{LINGER:g}s", "onDetectorLoss": {"policy": "Release", "after": "1s"}},
+        "manifests": [deployment],
+    }
+    return _object("ApplicationTemplate", "recorder", spec)
+
+
+def untouched(before: Object, after: Object | None) -> bool:
+    """Whether it is the same object, and nobody has changed its spec."""
+    return after is not None and all(
+        after["metadata"][field] == before["metadata"][field] for field in ("uid", "generation")
+    )
+
+
+def _object(kind: str, name: str, spec: Object) -> Object:
+    return {"apiVersion": "wayside.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec}
+
+
+def _is_of(task: Object, pair: Pair) -> bool:
+    return bool(task["spec"]["event"]["subject"] == "+".join(pair))
+
+
+def _live(task: Object) -> bool:
+    return "endTime" not in task["spec"]
+
+
+def kind_of(event: Object) -> str:
+    """`started`, or the reason for which the episode ended."""
+    return "started" if event["type"].endswith(".started") else str(event["data"]["reason"])
+
+
+def _free_endpoint() -> str:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{found.getsockname()[1]}"

@@ -1,0 +1,295 @@
+"""Whatever happens to the detector, its rules or the API server: open episodes go on, and so does what they demand."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.cluster.api import Api
+from tests.cluster.chain import (
+    BETWEEN,
+    BUSES,
+    CARS,
+    FAR,
+    HOLDER,
+    NEAR,
+    TRAMS,
+    VANS,
+    Chain,
+    Vehicles,
+    detector,
+    kind_of,
+    recording,
+    rule,
+    template,
+    untouched,
+)
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.processes import Processes
+from tests.cluster.waiting import wait_until
+
+RUNS = f"Detector {HOLDER} runs with"
+
+
+@pytest.fixture
+def chain(api: Api, namespace: str, processes: Processes, tmp_path: Path) -> Chain:
+    """Applied, not yet started."""
+    made = Chain(api, namespace, processes, tmp_path / "out")
+    made.apply(template(), rule(), detector(made.endpoint))
+    return made
+
+
+@pytest.fixture
+def vehicles(chain: Chain) -> Iterator[Vehicles]:
+    with Vehicles(chain.endpoint) as driving:
+        yield driving
+
+
+def test_a_detector_killed_during_an_episode_takes_it_up_again(chain: Chain, vehicles: Vehicles) -> None:
+    running = chain.start()
+    vehicles.place(CARS, NEAR)
+    deployed = chain.wait_deployed(CARS)
+    task = chain.wait_task(CARS)
+    (started,) = chain.wait_events(CARS, "started")
+    running.kill9()
+    vehicles.place(CARS, BETWEEN)
+    running.start()
+    running.wait_for_output(f"{RUNS} 1 rules and 1 restored demands")
+    vehicles.place(VANS, NEAR)  # once theirs is there, the restored episode has been evaluated many times
+    chain.wait_deployed(VANS)
+    again = chain.wait_task(CARS)
+    assert again["metadata"]["uid"] == task["metadata"]["uid"]
+    assert again["spec"] == task["spec"]
+    assert untouched(deployed, chain.deployment(CARS))
+
+    vehicles.place(CARS, FAR)
+    _, ended = chain.wait_events(CARS, "started", "Until")
+    for field in ("episode", "onsetTime", "startTime"):
+        assert ended["data"][field] == started["data"][field]
+    chain.wait_removed(CARS)
+    assert chain.live() == {"+".join(VANS)}
+    chain.settled()
+
+
+def test_after_its_lease_a_killed_detectors_demand_is_released_and_counts_again_when_it_is_back(
+    chain: Chain, vehicles: Vehicles
+) -> None:
+    running = chain.start()
+    vehicles.place(CARS, NEAR)
+    deployed = chain.wait_deployed(CARS)
+    task = chain.wait_task(CARS)
+    running.kill9()
+    vehicles.place(CARS, BETWEEN)
+    chain.wait_removed(CARS, timeout=40)
+    assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"], "only its holder ends a task"
+    running.start()
+    again = chain.wait_deployed(CARS)
+    assert again["metadata"]["uid"] != deployed["metadata"]["uid"]
+    assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
+    chain.settled()
+
+
+def test_an_outage_of_the_api_server_releases_nothing_and_loses_nothing(
+    chain: Chain, vehicles: Vehicles, control_plane: ControlPlane
+) -> None:
+    running = chain.start()
+    for pair in (CARS, VANS):
+        vehicles.place(pair, NEAR)
+    before = {pair: chain.wait_deployed(pair) for pair in (CARS, VANS)}
+    with control_plane.outage():
+        began = time.monotonic()
+        vehicles.place(VANS, FAR)
+        vehicles.place(BUSES, NEAR)
+        vehicles.place(TRAMS, NEAR)
+        chain.wait_events(VANS, "started", "Until")
+        chain.wait_events(BUSES, "started")
+        chain.wait_events(TRAMS, "started")
+        vehicles.place(TRAMS, FAR)
+        chain.wait_events(TRAMS, "started", "Until")
+        time.sleep(20 - (time.monotonic() - began))  # longer than the Lease holds: the outage is what is tested
+    chain.wait_deployed(BUSES, timeout=20)
+    chain.wait_removed(VANS)
+    assert untouched(before[CARS], chain.deployment(CARS))
+    assert chain.live() == {"+".join(CARS), "+".join(BUSES)}
+    chain.settled()
+    assert untouched(before[CARS], chain.deployment(CARS))
+    assert chain.deployment(TRAMS) is None
+    assert running.starts == 1
+    assert running.alive
+
+
+def test_a_task_deleted_by_hand_comes_back_and_its_deployment_does_not_notice(chain: Chain, vehicles: Vehicles) -> None:
+    chain.start()
+    vehicles.place(CARS, NEAR)
+    deployed = chain.wait_deployed(CARS)
+    task = chain.wait_task(CARS)
+    chain.api.delete("ApplicationTask", task["metadata"]["name"])
+    again = chain.api.wait_for(
+        "ApplicationTask",
+        task["metadata"]["name"],
+        lambda found: found["metadata"]["uid"] != task["metadata"]["uid"],
+        what="the task is back",
+    )
+    assert again["spec"] == task["spec"]
+    chain.settled()
+    assert untouched(deployed, chain.deployment(CARS))
+
+
+def test_a_rule_that_means_something_else_ends_its_episodes_and_begins_anew(chain: Chain, vehicles: Vehicles) -> None:
+    chain.start()
+    vehicles.place(CARS, NEAR)
+    vehicles.place(VANS, 140.0)
+    deployed = chain.wait_deployed(CARS)
+    chain.wait_deployed(VANS)
+    chain.apply(rule(when="distance < 120"))
+    chain.wait_events(VANS, "started", "RuleChanged")
+    first, _, second = chain.wait_events(CARS, "started", "RuleChanged", "started")
+    assert first["data"]["episode"] != second["data"]["episode"]
+    chain.wait_removed(VANS)
+    assert chain.live() == {"+".join(CARS)}
+    chain.settled()
+    assert untouched(deployed, chain.deployment(CARS)), "the new demand came within the linger"
+
+
+@pytest.mark.parametrize("restarted", [False, True], ids=["", "after-a-restart"])
+def test_changed_parameters_of_an_action_reach_the_instance_of_an_open_episode(
+    chain: Chain, vehicles: Vehicles, restarted: bool
+) -> None:
+    running = chain.start()
+    vehicles.place(CARS, NEAR)
+    deployed = chain.wait_deployed(CARS)
+    task = chain.wait_task(CARS)
+    if restarted:
+        running.restart()
+        running.wait_for_output(f"{RUNS} 1 rules and 1 restored demands")
+    chain.apply(rule(actions=recording(rate=5)))
+    changed = chain.api.wait_for(
+        "Deployment",
+        deployed["metadata"]["name"],
+        lambda found: found["spec"]["template"]["spec"]["containers"][0]["args"] == ["--rate=5"],
+        what="the instance follows",
+    )
+    assert changed["metadata"]["uid"] == deployed["metadata"]["uid"]
+    patched = chain.wait_task(CARS)
+    assert patched["metadata"]["uid"] == task["metadata"]["uid"]
+    assert patched["spec"]["parameters"] == {"vehicles": list(CARS), "rate": 5}
+    chain.wait_events(CARS, "started")
+    chain.settled()
+
+
+def test_a_detector_is_changed_while_it_runs(chain: Chain, vehicles: Vehicles) -> None:
+    running = chain.start()
+    pid = running.pid
+    vehicles.place(CARS, NEAR)
+    deployed = chain.wait_deployed(CARS)
+    task = chain.wait_task(CARS)
+    vehicles.place(CARS, BETWEEN)
+    changed = detector(chain.endpoint)
+    changed["spec"]["streams"][0]["staleAfter"] = "3s"
+    mood = {"name": "mood", "key": "vehicles/${client:*}/mood", "encoding": "json", "staleAfter": "Never"}
+    changed["spec"]["streams"].append(mood)
+    happy = rule(
+        "happy",
+        scope={"client": {}},
+        signals=[{"name": "mood", "stream": "mood", "value": "msg.mood"}],
+        when='mood == "happy"',
+        until='mood == "sad"',
+        actions=[],
+    )
+    chain.apply(changed, happy)
+    for feeling, kinds in (("happy", ["started"]), ("sad", ["started", "Until"])):
+
+        def heard(message: bytes = f'{{"mood": "{feeling}"}}'.encode()) -> list[str]:
+            vehicles.send("vehicles/car1/mood", message)  # again and again: the detector may just be subscribing
+            return [kind_of(event) for event in chain.events("car1")]
+
+        wait_until(heard, kinds.__eq__, timeout=10, what="the new stream is followed")
+    assert untouched(deployed, chain.deployment(CARS))
+    assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
+    chain.wait_events(CARS, "started")
+    assert (running.pid, running.alive) == (pid, True)
+    vehicles.place(CARS, FAR)
+    chain.wait_events(CARS, "started", "Until")
+    chain.wait_removed(CARS)
+    chain.settled()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("key", "vehicles/${client:*}/po$*${se/pose", "spec.streams[0].key"),
+        ("type", "geometry_msgs/msg/PoseStampd", "spec.streams[0].type"),
+        ("stamp", "msg.t +", "spec.streams[0].stamp"),
+    ],
+    ids=["key", "type", "stamp"],
+)
+def test_a_detector_that_is_changed_to_a_wrong_one_goes_on_as_before(
+    chain: Chain, vehicles: Vehicles, field: str, value: str, said: str
+) -> None:
+    running = chain.start()
+    vehicles.place(CARS, NEAR)
+    deployed = chain.wait_deployed(CARS)
+    wrong = detector(chain.endpoint)
+    wrong["spec"]["streams"][0][field] = value
+    if field == "type":
+        wrong["spec"]["streams"][0]["encoding"] = "cdr"
+    chain.apply(wrong)
+    line = running.wait_for_output(r"^.*is not followed.*$").group()
+    assert said in line
+    vehicles.place(VANS, NEAR)
+    chain.wait_deployed(VANS)
+    assert untouched(deployed, chain.deployment(CARS))
+    chain.apply(detector(chain.endpoint, clientTimeout="20s"))
+    vehicles.place(BUSES, NEAR)
+    chain.wait_deployed(BUSES)
+    assert running.alive
+    chain.settled()
+
+
+def test_a_detector_told_to_end_does_so_promptly_and_its_tasks_stay(chain: Chain, vehicles: Vehicles) -> None:
+    running = chain.start()
+    vehicles.place(CARS, NEAR)
+    deployed = chain.wait_deployed(CARS)
+    task = chain.wait_task(CARS)
+    assert running.terminate(patience=5) == 0
+    assert chain.wait_task(CARS)["spec"] == task["spec"]
+    lease = chain.api.get("Lease", f"wayside-{HOLDER}")
+    assert not lease["spec"].get("holderIdentity"), "a successor need not wait"
+    vehicles.place(CARS, BETWEEN)
+    running.start()
+    running.wait_for_output(f"{RUNS} 1 rules and 1 restored demands")
+    vehicles.place(VANS, NEAR)
+    chain.wait_deployed(VANS)
+    assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
+    assert untouched(deployed, chain.deployment(CARS))
+    chain.wait_events(CARS, "started")
+
+
+def test_the_intake_of_a_killed_detector_can_be_replayed_up_to_the_cut(
+    chain: Chain, vehicles: Vehicles, tmp_path: Path
+) -> None:
+    intake = tmp_path / "intake.mcap"
+    running = chain.start("--record-intake", str(intake))
+    vehicles.place(CARS, NEAR)
+    chain.wait_events(CARS, "started")
+    vehicles.place(CARS, FAR)
+    chain.wait_events(CARS, "started", "Until")
+    time.sleep(1.5)  # a kill costs what was written in about the last second
+    running.kill9()
+    replayed = tmp_path / "replayed"
+    done = subprocess.run(
+        [sys.executable, "-m", "detector.cli", "replay", str(intake), "--output", str(replayed)],
+        check=True,
+        timeout=60,
+        capture_output=True,
+        text=True,
+    )
+    assert "its detector was killed" in done.stderr
+    live = (chain.folder / "events.jsonl").read_bytes()
+    assert (replayed / "events.jsonl").read_bytes() == live
+    assert live.count(b"\n") == 2
