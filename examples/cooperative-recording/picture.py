@@ -78,7 +78,7 @@ def _timeline(drive: Drive, found: list[Episode], duration_s: float) -> Iterator
         for number, episode in enumerate(found, start=1):
             if episode.pair == pair:
                 yield _bar(row, episode.start_s, episode.end_s or duration_s, "#333", str(number))
-    for row, (place, states) in enumerate(fusions(found).items(), start=len(pairs)):
+    for row, (place, states) in enumerate(fusions(found, linger_s=0.0).items(), start=len(pairs)):
         yield _label(row, f"fusion {place}")
         for state in states:
             end = state.end_s or duration_s

@@ -32,7 +32,18 @@ from wayside.rules import compile_rule
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no package of ours
 
-from cooperative_recording.expected import Episode, Fusion, Span, episodes, fusions, place_at, recorders  # noqa: E402
+from cooperative_recording.expected import (  # noqa: E402
+    APART,
+    CLOSE,
+    LINGER,
+    Episode,
+    Fusion,
+    Span,
+    episodes,
+    fusions,
+    place_at,
+    recorders,
+)
 from cooperative_recording.messages import POINTS_TYPE, POSE_TYPE, TYPESTORE, keys, messages  # noqa: E402
 from cooperative_recording.network import choices, connection, lanes  # noqa: E402
 from cooperative_recording.publish import UnreachableError, publish  # noqa: E402
@@ -44,6 +55,7 @@ from cooperative_recording.seeds import (  # noqa: E402
     DEMO_SEED,
     PLACE_LOOK,
     clear_seed,
+    doubtful_pauses,
     unclear,
 )
 from cooperative_recording.vehicles import (  # noqa: E402
@@ -244,10 +256,18 @@ def test_a_drive_that_keeps_away_from_the_thresholds_is_clear(nearest: float) ->
     assert unclear(approaching(nearest, speed=30.0), 20.0) == []
 
 
+@pytest.mark.parametrize(("linger", "doubtful"), [(5.0, 0), (3.0, 2), (1.0, 0)])
+def test_a_pause_about_as_long_as_the_linger_is_doubtful(linger: float, doubtful: int) -> None:
+    found = [Episode(("a", "b"), start, end, "west") for start, end in ((1, 4), (7.2, 9), (40, None))]
+    doubts = doubtful_pauses(found, linger)
+    assert len(doubts) == doubtful, "one for the recorder, one for the fusion"
+    assert all("at 4.0 s: a pause of 3.2 s is about the linger" in doubt for doubt in doubts)
+
+
 def test_a_recorder_lingers_and_one_that_is_wanted_again_meanwhile_stays() -> None:
     pair, other = ("a", "b"), ("a", "c")
     found = [Episode(pair, 1, 4, "west"), Episode(pair, 5, 8, "west"), Episode(other, 2, None, "west")]
-    assert recorders(found) == {pair: [Span(1, 4), Span(5, 8)], other: [Span(2, None)]}
+    assert recorders(found, linger_s=0) == {pair: [Span(1, 4), Span(5, 8)], other: [Span(2, None)]}
     assert recorders(found, linger_s=2) == {pair: [Span(1, 10)], other: [Span(2, None)]}
 
 
@@ -258,7 +278,7 @@ def test_a_fusion_has_the_vehicles_of_all_open_episodes_and_keeps_its_last_sourc
         Episode(("a", "b"), 7, 9, "west"),
         Episode(("c", "d"), 3, None, "east"),
     ]
-    assert fusions(found) == {
+    assert fusions(found, linger_s=0) == {
         "west": [
             Fusion("west", 1, 2, ("a", "b")),
             Fusion("west", 2, 4, ("a", "b", "c")),
@@ -363,6 +383,13 @@ def test_the_rule_compiles_against_the_detector_and_the_detector_selects_it() ->
     assert detector.spec.rules.matches(rule.metadata.labels)
     compiled = compile_rule(rule, detector)
     assert [deploy.template for deploy in compiled.deploys] == ["scene-recorder", "scene-fusion"]
+
+
+def test_the_expectation_has_the_numbers_of_the_files() -> None:
+    rule = only(EventRule, "lidar-vehicles-close").spec
+    assert (rule.when, rule.until) == (f"distance < {CLOSE:g}", f"distance > {APART:g}")
+    for name in ("scene-recorder", "scene-fusion"):
+        assert only(ApplicationTemplate, name).spec.lifecycle.linger.seconds == LINGER
 
 
 @pytest.mark.parametrize("x", [-300.0, -1.0, 1.0, 300.0])

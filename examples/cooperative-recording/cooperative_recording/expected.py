@@ -21,6 +21,8 @@ CLOSE = 150.0
 """Metres: nearer than this, a pair's episode starts."""
 APART = 200.0
 """Metres: farther than this, it ends."""
+LINGER = 3.0
+"""Seconds that both templates let an instance stay after its last demand."""
 STEP = 0.02
 """Seconds between the looks for crossings; two vehicles move at most 1.2 m relative to each other in it."""
 
@@ -77,7 +79,7 @@ def episodes(drive: Drive, duration_s: float) -> list[Episode]:
     return sorted(found, key=lambda episode: (episode.start_s, episode.pair))
 
 
-def recorders(episodes: Iterable[Episode], linger_s: float = 0.0) -> dict[Pair, list[Span]]:
+def recorders(episodes: Iterable[Episode], linger_s: float = LINGER) -> dict[Pair, list[Span]]:
     """When a recorder should exist for each pair. Meeting again within linger_s seconds keeps the one that is there."""
     spans: dict[Pair, list[Span]] = {}
     for episode in sorted(episodes, key=lambda episode: episode.start_s):
@@ -85,7 +87,7 @@ def recorders(episodes: Iterable[Episode], linger_s: float = 0.0) -> dict[Pair, 
     return {pair: _joined(those) for pair, those in spans.items()}
 
 
-def fusions(episodes: Iterable[Episode], linger_s: float = 0.0) -> dict[str, list[Fusion]]:
+def fusions(episodes: Iterable[Episode], linger_s: float = LINGER) -> dict[str, list[Fusion]]:
     """For each place, the times and sources of its fusion, in order.
 
     The sources are the vehicles of all pairs with an open episode there. While it only lingers they stay as they were.
