@@ -134,7 +134,8 @@ class Client:
     async def get(self, resource: Resource, namespace: str, name: str) -> Object | None:
         """The object, or None."""
         try:
-            return await self._request("GET", resource.path(namespace, name))
+            found = await self._request("GET", resource.path(namespace, name))
+            return {"apiVersion": resource.api_version, "kind": resource.kind, **found}
         except ApiError as error:
             if error.code == 404:
                 return None

@@ -117,6 +117,7 @@ class Manager:
             client=client,
             recorder=self._recorder,
             tasks=resources[TASK],
+            templates=resources[TEMPLATE],
             ttl=options.ttl_after_finished,
             again=self._tasks.add_at,
             observe=self._router.observe,

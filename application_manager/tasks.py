@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from application_manager.claims import Refused
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.demand import Standing, Verdict
 from application_manager.recorder import Recorder
@@ -26,6 +27,7 @@ class TaskWork:
 
     Attributes:
         tasks: where ApplicationTasks live.
+        templates: where ApplicationTemplates live.
         ttl: seconds that a finished task is kept.
         again: asks for a task at a time, in seconds since 1970.
         observe: takes an object that was read.
@@ -35,6 +37,7 @@ class TaskWork:
     client: Client
     recorder: Recorder
     tasks: Resource
+    templates: Resource
     ttl: float
     again: Callable[[Name, float], None]
     observe: Callable[[Object], None]
@@ -49,6 +52,8 @@ class TaskWork:
         if task is None or known is None or task.metadata.deletion_timestamp is not None:
             return
         verdict, service = known
+        if verdict.reason == Refused.TEMPLATE_NOT_FOUND and await self._has_template(name[0], task.spec.template):
+            return  # the watch of templates was behind that of tasks; the template's news bring us back
         now = time.time()
         old = task.status or ApplicationTaskStatus()
         new = task_status(task, verdict, service, now)
@@ -65,6 +70,12 @@ class TaskWork:
             if error.terminating or error.code == 404:  # the task or its namespace is gone
                 return
             raise
+
+    async def _has_template(self, namespace: str, template: str) -> bool:
+        found = await self.client.get(self.templates, namespace, template)
+        if found is not None:
+            self.observe(found)
+        return found is not None
 
     def _verdict(self, name: Name) -> tuple[Verdict, Service | None] | None:
         """What became of the task; None where its instance was not looked at yet."""
