@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from detector.engine.sample import Arrival
+from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
 
 _new_arrival = tuple.__new__
 """Makes an Arrival from a plain tuple at a third of the cost of calling the class: it is made for every message."""
@@ -19,18 +19,15 @@ _new_arrival = tuple.__new__
 class Intake:
     """A bounded queue of arrivals. When it is full, what comes is dropped and counted."""
 
-    __slots__ = ("_bytes", "_last", "_lock", "_maximum_bytes", "_maximum_count", "_now", "_queue", "dropped")
+    __slots__ = ("_last", "_lock", "_maximum_bytes", "_now", "_queue", "_room", "dropped")
 
-    def __init__(
-        self, now: Callable[[], int], *, maximum_count: int = 1_000_000, maximum_bytes: int = 512 * 2**20
-    ) -> None:
-        """`now` gives nanoseconds since the epoch; the limits bound what waits for the engine."""
+    def __init__(self, now: Callable[[], int], *, maximum_bytes: int = 512 * 2**20) -> None:
+        """`now` gives nanoseconds since the epoch; `maximum_bytes` bounds what waits, overhead included."""
         self._now = now
-        self._maximum_count = maximum_count
         self._maximum_bytes = maximum_bytes
         self._lock = threading.Lock()
         self._queue: list[Arrival] = []
-        self._bytes = 0
+        self._room = maximum_bytes
         self._last = 0
         self.dropped = 0
 
@@ -39,18 +36,17 @@ class Intake:
         lock, now = self._lock, self._now
 
         def put(key: str, payload: bytes) -> None:
+            # This runs for every message, on the thread that receives it: each line here costs the vehicle's data rate.
             with lock:
                 time = now()
-                last = self._last
-                if time <= last:
-                    time = last + 1
+                if time <= self._last:
+                    time = self._last + 1
                 self._last = time
-                queue = self._queue
-                if len(queue) >= self._maximum_count or self._bytes >= self._maximum_bytes:
+                if self._room <= 0:
                     self.dropped += 1
                     return
-                self._bytes += len(payload)
-                queue.append(_new_arrival(Arrival, (time, stream, key, payload)))
+                self._room -= len(payload) + SAMPLE_OVERHEAD
+                self._queue.append(_new_arrival(Arrival, (time, stream, key, payload)))
 
         return put
 
@@ -59,7 +55,7 @@ class Intake:
         with self._lock:
             self._last = max(self._last, until)
             queue, self._queue = self._queue, []
-            self._bytes = 0
+            self._room = self._maximum_bytes
         return queue
 
     @property
@@ -71,6 +67,6 @@ class Intake:
         """The wall clock went back: empty the queue and go on from `to`."""
         with self._lock:
             queue, self._queue = self._queue, []
-            self._bytes = 0
+            self._room = self._maximum_bytes
             self._last = to
         return queue

@@ -7,7 +7,7 @@ import threading
 import time
 
 from detector.engine.intake import Intake
-from detector.engine.sample import Arrival
+from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
 
 
 class Clock:
@@ -73,7 +73,7 @@ def test_what_comes_after_a_drain_is_later_than_its_tick() -> None:
 
 
 def test_a_full_queue_drops_what_comes_and_counts_it() -> None:
-    intake = Intake(Clock(0), maximum_count=2)
+    intake = Intake(Clock(0), maximum_bytes=2 * SAMPLE_OVERHEAD)
     put = intake.putter("s")
     for key in "abcd":
         put(key, b"")
@@ -85,7 +85,7 @@ def test_a_full_queue_drops_what_comes_and_counts_it() -> None:
 
 
 def test_the_bytes_that_wait_are_bounded_over_all_streams() -> None:
-    intake = Intake(Clock(0), maximum_bytes=10)
+    intake = Intake(Clock(0), maximum_bytes=10 + 2 * SAMPLE_OVERHEAD)
     first, second = intake.putter("s"), intake.putter("t")
     first("a", b"12345")
     second("b", b"67890")
