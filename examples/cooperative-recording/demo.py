@@ -23,7 +23,7 @@ from typing import Any
 import yaml
 import zenoh
 from cooperative_recording.expected import episodes
-from cooperative_recording.seeds import DEMO_DURATION_S, DEMO_SEED
+from cooperative_recording.seeds import DEMO_SEED
 from cooperative_recording.vehicles import simulate
 from foresight import Foresight, TaskFolder
 from rich.console import Console
@@ -34,8 +34,10 @@ from wayside.api.documents import load_documents
 HERE = Path(__file__).resolve().parent
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where detector.yaml listens."""
-LINGERING_S = 2.5
-"""How long after the drive the last applications are watched going."""
+DURATION_S = 22.5
+"""Of the drive: by then all have parted, and the demo is no longer than it must be."""
+LINGERING_S = 3.5
+"""How long after the drive the last applications are watched going: the templates' linger, and a little."""
 
 
 def main() -> int:
@@ -47,10 +49,10 @@ def main() -> int:
     output.mkdir(parents=True)
     console = Console(highlight=False, soft_wrap=True)
     console.print(
-        "[bold]Fifteen vehicles drive; five carry a lidar. Two of those closer than 150 m: record the scene.[/]"
+        "[bold]Fifteen vehicles drive; six carry a lidar. Two of those closer than 150 m: record the scene.[/]"
     )
     with _detector(output) as detector, _events() as events:
-        drive = _start("drive.py", "--connect", ENDPOINT, "--seed", str(DEMO_SEED), "--duration", str(DEMO_DURATION_S))
+        drive = _start("drive.py", "--connect", ENDPOINT, "--seed", str(DEMO_SEED), "--duration", str(DURATION_S))
         teller = Timeline(console, output / "tasks")
         until = None
         while until is None or time.monotonic() < until:
@@ -166,7 +168,7 @@ def _subject(task: ApplicationTask) -> str:
 
 def _verdict(console: Console, output: Path, running: list[str], drive_ended: int) -> int:
     """Compare the episodes with those that the positions alone give."""
-    expected = sorted("+".join(each.pair) for each in episodes(simulate(DEMO_SEED, DEMO_DURATION_S), DEMO_DURATION_S))
+    expected = sorted("+".join(each.pair) for each in episodes(simulate(DEMO_SEED, DURATION_S), DURATION_S))
     lines = (output / "events.jsonl").read_text(encoding="utf-8").splitlines()
     found = sorted(event["subject"] for event in map(json.loads, lines) if event["type"].endswith("started"))
     console.print(

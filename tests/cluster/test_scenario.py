@@ -27,11 +27,10 @@ from tests.cluster.waiting import wait_until
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))
 
-from cooperative_recording.expected import episodes, fusions, recorders  # noqa: E402  the example is no package
+from cooperative_recording.expected import LINGER, episodes, fusions, recorders  # noqa: E402  the example is no package
 from cooperative_recording.vehicles import simulate  # noqa: E402
 
 SEED, DURATION = 3528, 25.0
-LINGER = 2.0  # s, of the example's templates
 EVALUATION = 0.5  # s, of the example's rule
 ALLOWED = EVALUATION + 2.0
 SAMPLING = 0.2  # s: a pose is up to 0.1 s old, and so is what the observer saw
