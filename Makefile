@@ -1,7 +1,9 @@
 # Wayside: two commands do everything on a fresh machine, `make demo` and `make test`.
 # They need Python 3.11 to 3.13 and make; the tests of the cluster side also build a control plane (see docs/).
 
-PYTHON ?= $(shell command -v python3.13 || command -v python3.12 || command -v python3.11 || command -v python3)
+# The first of these that runs and is of a version that our dependencies have wheels for.
+FITS := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
+PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do $$each $(FITS) 2>/dev/null && echo $$each && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
@@ -12,8 +14,8 @@ help: ## what can be made
 
 # The environment follows pyproject.toml. The stamp is written last, so an installation that was cut off starts again.
 $(BIN)/.installed: pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
-	  { echo "Wayside needs Python 3.11, 3.12 or 3.13; $(PYTHON) is another: make PYTHON=/path/to/python3.12"; exit 1; }
+	@$(or $(PYTHON),false) $(FITS) || \
+	  { echo "Wayside needs Python 3.11, 3.12 or 3.13, and finds none: make PYTHON=/path/to/python3.12"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing Wayside into $(VENV)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
