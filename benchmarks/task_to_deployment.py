@@ -4,7 +4,7 @@ Sequential: one task after the other, alternated with the raw calls: create the 
 Deployment, by the same client library, in a namespace that no manager looks at. Burst: many tasks at once, beside as
 many raw series at once. Existence is told by a watch on Deployments in both cases.
 
-    python -m benchmarks.task_to_deployment [--sequential 100] [--burst 1000]
+    python -m benchmarks.task_to_deployment [--sequential 60] [--burst 1000]
 
 Uses the cluster of KUBECONFIG where that is set, else a control plane of its own.
 """
@@ -42,6 +42,7 @@ DEPLOYMENTS = Resource("apps/v1", "Deployment", "deployments")
 NAMESPACES = Resource("v1", "Namespace", "namespaces", namespaced=False)
 AT_ONCE = 16
 PATIENCE = 300.0  # s
+SETTLING = 0.5  # s after each, so that neither is measured amid what the other has set off: ReplicaSets, statuses
 
 TEMPLATE: dict[str, Any] = {
     "apiVersion": API_VERSION,
@@ -180,11 +181,12 @@ async def measure(sequential: int, burst: int, manager: subprocess.Popen[bytes],
         alone: list[float] = []
         for index in range(sequential):
             alone.append(await raw.series(f"s{index}"))
+            await asyncio.sleep(SETTLING)
             began = time.perf_counter()
             await client.create(TASKS, task(ours, f"s{index}"))
             await seen.wait(6 + index)
             took.append(seen.at[instance_name("app", f"s{index}")] - began)
-            await asyncio.sleep(0.05)  # the statuses that follow are not part of either
+            await asyncio.sleep(SETTLING)
         for name, values in (("task → Deployment", took), ("raw calls alone", alone)):
             cuts = statistics.quantiles(values, n=20)
             print(f"sequential  {name:18} p50 {cuts[9] * 1e3:6.1f} ms   p95 {cuts[18] * 1e3:6.1f} ms")
@@ -224,7 +226,7 @@ async def fresh_namespaces() -> tuple[str, str]:
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--sequential", type=int, default=100, help="tasks one after the other")
+    parser.add_argument("--sequential", type=int, default=60, help="tasks one after the other")
     parser.add_argument("--burst", type=int, default=1000, help="tasks at once")
     options = parser.parse_args()
     given = "KUBECONFIG" in os.environ
