@@ -17,6 +17,7 @@ from detector.engine.engine import Engine
 from detector.engine.events import Event
 from detector.engine.intake import Intake
 from detector.engine.sample import Arrival
+from detector.losses import Losses
 from detector.rules.selection import RuleSet
 from wayside.api.detector import Stream
 
@@ -77,8 +78,8 @@ class Evaluator:
         self._stopping = False
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
-        self._dropped = 0
         self.gaps = 0
+        self.losses = Losses(engine, intake)
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
     def start(self, rule_set: RuleSet, restored: Sequence[Demand]) -> None:
@@ -124,6 +125,7 @@ class Evaluator:
                     wanted, self._wanted = self._wanted, None
                     stopping = self._stopping
                 self._look(wanted)
+                self.losses.say()
             self._record(self._engine.now, {"kind": "end"})
         except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
             self._on_failure(error)
@@ -151,12 +153,6 @@ class Evaluator:
     def _take(self, arrivals: list[Arrival], now: int) -> list[Event]:
         if self._recorder is not None and arrivals:
             self._recorder.arrivals(arrivals)
-        if self._intake.dropped > self._dropped:
-            _log.warning(
-                "the intake was full: %d samples were dropped, more come in than are evaluated",
-                self._intake.dropped - self._dropped,
-            )
-            self._dropped = self._intake.dropped
         return self._engine.advance(arrivals, now)
 
     def _gap(self, now: int, why: str) -> list[Event]:

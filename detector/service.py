@@ -11,7 +11,7 @@ import asyncio
 import logging
 import signal
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -24,17 +24,17 @@ from detector.actions.stores import TaskStore, restore
 from detector.assembly import DetectorError, inlets, make_engine
 from detector.cluster.connection import connect
 from detector.engine.demands import Demand
-from detector.engine.events import Event
 from detector.engine.intake import Intake
 from detector.evaluator import Evaluator
 from detector.event_log import EventLog
+from detector.outlet import LiveOutlet
 from detector.replay.intake_writer import IntakeWriter
 from detector.rules.files import load_rules
 from detector.rules.kubernetes import ClusterRules
 from detector.rules.selection import RuleSet
-from detector.streams.zenoh import Network, NetworkError, Put
+from detector.streams.zenoh import Network
 from wayside.api import Detector
-from wayside.api.detector import Stream, Zenoh
+from wayside.api.detector import Stream
 
 _log = logging.getLogger(__name__)
 
@@ -65,45 +65,6 @@ class Options:
 
     source: Files | Named
     record_intake: Path | None = None
-
-
-class LiveOutlet:
-    """Events go to Zenoh and into the log, demands to the reconciler; nothing here waits."""
-
-    def __init__(self, network: Network, log: EventLog | None, reconciler: DemandReconciler) -> None:
-        self.network = network
-        self._log = log
-        self._reconciler = reconciler
-
-    def events(self, events: Sequence[Event]) -> None:
-        """Publish and log what started and ended."""
-        for event in events:
-            line = event.to_json()
-            self.network.publish(event.key, line.encode())
-            if self._log is not None:
-                self._log.write(line)
-            _log.info(
-                "%s %s %s%s",
-                event.rule,
-                event.subject,
-                "started" if event.started else "ended",
-                "" if event.reason is None else f" ({event.reason})",
-            )
-
-    def reconnect(self, config: Zenoh, streams: Iterable[Stream], putter: Callable[[str], Put]) -> None:
-        """The Detector changed: leave the network and join it anew. Where that fails, it is said."""
-        dropped = self.network.dropped_events
-        self.network.close()
-        self.network = Network(config, streams, putter)
-        self.network.dropped_events += dropped
-        try:
-            self.network.start()
-        except NetworkError as error:
-            _log.error("the changed Detector has no network, correct it: %s", error)
-
-    def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
-        """Hand the demands over."""
-        self._reconciler.update(demands, ended)
 
 
 def _keys(streams: Iterable[Stream]) -> list[tuple[str, str]]:
@@ -298,19 +259,6 @@ class _Running:
         self._loop.call_soon_threadsafe(tell)
 
     def _summarise(self) -> None:
-        """What was dropped or could not be read, on one line each."""
-        counters, intake, network = self._engine.counters, self._intake, self._outlet.network
-        _log.info("%d samples in, %d bytes buffered", sum(counters.samples.values()), self._engine.buffer.bytes)
-        lost = {
-            "samples dropped, the intake being full": intake.dropped,
-            "samples pushed out of the buffer before their time": self._engine.buffer.evicted,
-            "events not published": network.dropped_events,
-            **{f"samples of stream {s} that could not be read": n for s, n in counters.undecodable.items()},
-            **{f"samples of stream {s} whose key names no client": n for s, n in counters.unnamed.items()},
-        }
-        for what, count in lost.items():
-            if count:
-                _log.warning("%d %s", count, what)
-        for name, rule in counters.rules.items():
-            if rule.errors:
-                _log.warning("EventRule %s: %d evaluation errors, the last: %s", name, rule.errors, rule.last_error)
+        self._evaluator.losses.sum_up()
+        if self._outlet.network.dropped_events:
+            _log.warning("in all, %d events not published", self._outlet.network.dropped_events)

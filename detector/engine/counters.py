@@ -20,6 +20,9 @@ class RuleCounters:
     errors: int = 0
     """Expressions that failed on values that were there."""
     last_error: str = ""
+    misplaced: int = 0
+    """Looks at a client whose newest sample says no place: absent, no number, infinite."""
+    last_misplaced: str = ""
 
     def note(self, reason: Reason, message: str) -> None:
         """Count an expression's unknown result."""
@@ -28,6 +31,11 @@ class RuleCounters:
             self.last_error = message
         else:
             self.unknowns += 1
+
+    def misplace(self, message: str) -> None:
+        """Count a sample that should say where its client is, and does not."""
+        self.misplaced += 1
+        self.last_misplaced = message
 
 
 @dataclass(slots=True)

@@ -227,7 +227,9 @@ class Engine:
             max_behind=_longest(self.detector),
             alone_after=spec.client_timeout.ns,
             maximum_bytes=spec.buffer.bytes.bytes,
-            stamp_of=lambda arrival: self._messages.time(arrival.stream, arrival.received, arrival.payload),
+            stamp_of=lambda arrival: self._messages.time(
+                arrival.stream, arrival.key, arrival.received, arrival.payload
+            ),
             client_of=self._inflow.client_of,
         )
 

@@ -51,7 +51,7 @@ class Messages:
             try:
                 message = self._decoders[stream].decode(sample.payload)
             except DecodeError as error:
-                self._unreadable(stream, error)
+                self._unreadable(stream, sample.key, error)
                 message = UNKNOWN
             self._decoded[at] = message
         return message
@@ -79,7 +79,7 @@ class Messages:
             }
         return values
 
-    def time(self, stream: str, received: int, payload: bytes) -> int | None:
+    def time(self, stream: str, key: str, received: int, payload: bytes) -> int | None:
         """A sample's time with clock Data, in nanoseconds: its stamp, or the receive time where it carries none.
 
         None where it cannot be read; that is counted.
@@ -87,7 +87,7 @@ class Messages:
         try:
             stamp = self._stamp(stream, payload)
         except (DecodeError, EvaluationError, ValueError) as error:
-            self._unreadable(stream, error)
+            self._unreadable(stream, key, error)
             return None
         return received if stamp is None else stamp
 
@@ -98,9 +98,9 @@ class Messages:
             return decoder.stamp(payload)
         return _nanoseconds(expression.evaluate({"msg": decoder.decode(payload)}))
 
-    def _unreadable(self, stream: str, error: Exception) -> None:
+    def _unreadable(self, stream: str, key: str, error: Exception) -> None:
         self._counters.undecodable[stream] += 1
-        self._counters.last_undecodable[stream] = str(error)
+        self._counters.last_undecodable[stream] = f"{key}: {error}"
 
 
 def _nanoseconds(seconds: object) -> int:

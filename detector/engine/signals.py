@@ -82,12 +82,14 @@ class Signals:
             self._no_value(counters)
             return None
         axes = []
-        for expression in (position.x, position.y, position.z):
+        for axis, expression in (("x", position.x), ("y", position.y), ("z", position.z)):
             value = 0.0 if expression is None else self._evaluate(expression, lane, sample, counters)
             if not isinstance(value, int | float):
+                counters.misplace(f"{axis} of {client} is absent, NaN, no number, or cannot be read")
                 return None
             if not abs(value) <= _FARTHEST:
                 self._no_value(counters)
+                counters.misplace(f"{axis} of {client} is {value:g} m, where nobody is")
                 return None
             axes.append(float(value))
         return axes[0], axes[1], axes[2]

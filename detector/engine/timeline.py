@@ -178,6 +178,8 @@ class DataTimeline:
         self.dropped_ahead = 0
         self.dropped_late = 0
         self.dropped_full = 0
+        self.last = ""
+        """Whose stamp was dropped last for its time, and how far off it was."""
         self.jumps = 0
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
@@ -268,6 +270,7 @@ class DataTimeline:
                 return True
         else:
             self._row = _Row(client, stamp, stamp, arrival.received)
+        self.last = f"{client} is {abs(stamp - newest) / 1e9:g} s {'ahead of' if stamp > newest else 'behind'} the rest"
         if stamp > newest:
             self.dropped_ahead += 1
         else:

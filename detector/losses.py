@@ -1,0 +1,84 @@
+"""What is lost, or cannot be used: said when it first happens, then at most once a minute, and in all at the end.
+
+Every kind of loss has a counter where it happens, and the last one's reason. Here they are only read.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from detector.engine.engine import Engine
+from detector.engine.intake import Intake
+from detector.engine.timeline import DataTimeline
+
+_log = logging.getLogger(__name__)
+
+_EVERY = 60.0
+"""Seconds between two lines about the same kind of loss: bad input may come a thousand times a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """One kind of loss."""
+
+    what: str
+    count: int
+    last: str = ""
+    """The reason of the last one, where there is one."""
+
+
+class Losses:
+    """Says what is new in the counters of an engine and its intake."""
+
+    def __init__(self, engine: Engine, intake: Intake, monotonic: Callable[[], float] = time.monotonic) -> None:
+        """`monotonic` gives seconds."""
+        self._engine = engine
+        self._intake = intake
+        self._monotonic = monotonic
+        self._said: dict[str, tuple[int, float]] = {}
+
+    def say(self) -> None:
+        """Log each kind of loss of which there is more, unless it was said within the last minute."""
+        now = self._monotonic()
+        for loss in self.all():
+            said, since = self._said.get(loss.what, (0, -math.inf))
+            if loss.count > said and now - since >= _EVERY:
+                self._said[loss.what] = loss.count, now
+                _log.warning("%s", _line(loss, loss.count - said))
+
+    def sum_up(self) -> None:
+        """Log how many samples came, and all losses since the start."""
+        counters, buffer = self._engine.counters, self._engine.buffer
+        _log.info("%d samples in, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
+        for loss in self.all():
+            if loss.count:
+                _log.warning("in all, %s", _line(loss, loss.count))
+
+    def all(self) -> Iterator[Loss]:
+        """Every kind of loss, also those that did not happen."""
+        counters, timeline = self._engine.counters, self._engine.timeline
+        yield Loss("samples dropped, the intake being full: more come in than are evaluated", self._intake.dropped)
+        yield Loss("samples pushed out of the buffer before their time: it is too small", self._engine.buffer.evicted)
+        if isinstance(timeline, DataTimeline):
+            yield Loss("samples dropped, their stamps being ahead of the rest", timeline.dropped_ahead, timeline.last)
+            yield Loss("samples dropped, their stamps being too old", timeline.dropped_late, timeline.last)
+            yield Loss("samples dropped, too many waiting for their time", timeline.dropped_full)
+        for stream, count in counters.undecodable.items():
+            yield Loss(
+                f"times a sample of stream {stream} could not be read", count, counters.last_undecodable.get(stream, "")
+            )
+        for stream, count in counters.unnamed.items():
+            yield Loss(f"samples of stream {stream} dropped, their keys naming no client", count)
+        for stream, count in counters.crowded.items():
+            yield Loss(f"samples of stream {stream} dropped, too many clients being known", count)
+        for name, rule in counters.rules.items():
+            yield Loss(f"evaluation errors in EventRule {name}", rule.errors, rule.last_error)
+            yield Loss(f"times a sample had no position for EventRule {name}", rule.misplaced, rule.last_misplaced)
+
+
+def _line(loss: Loss, count: int) -> str:
+    return f"{count} {loss.what}" + (f"; the last: {loss.last}" if loss.last else "")

@@ -1,0 +1,54 @@
+"""Where events and demands of a running detector go: Zenoh, a file, the reconciler of tasks."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from detector.actions.deploy import DemandReconciler
+from detector.engine.demands import Demand
+from detector.engine.events import Event
+from detector.event_log import EventLog
+from detector.streams.zenoh import Network, NetworkError, Put
+from wayside.api.detector import Stream, Zenoh
+
+_log = logging.getLogger(__name__)
+
+
+class LiveOutlet:
+    """Events go to Zenoh and into the log, demands to the reconciler; nothing here waits."""
+
+    def __init__(self, network: Network, log: EventLog | None, reconciler: DemandReconciler) -> None:
+        self.network = network
+        self._log = log
+        self._reconciler = reconciler
+
+    def events(self, events: Sequence[Event]) -> None:
+        """Publish and log what started and ended."""
+        for event in events:
+            line = event.to_json()
+            self.network.publish(event.key, line.encode())
+            if self._log is not None:
+                self._log.write(line)
+            _log.info(
+                "%s %s %s%s",
+                event.rule,
+                event.subject,
+                "started" if event.started else "ended",
+                "" if event.reason is None else f" ({event.reason})",
+            )
+
+    def reconnect(self, config: Zenoh, streams: Iterable[Stream], putter: Callable[[str], Put]) -> None:
+        """The Detector changed: leave the network and join it anew. Where that fails, it is said."""
+        dropped = self.network.dropped_events
+        self.network.close()
+        self.network = Network(config, streams, putter)
+        self.network.dropped_events += dropped
+        try:
+            self.network.start()
+        except NetworkError as error:
+            _log.error("the changed Detector has no network, correct it: %s", error)
+
+    def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
+        """Hand the demands over."""
+        self._reconciler.update(demands, ended)
