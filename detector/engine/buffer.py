@@ -115,7 +115,7 @@ class Buffer:
         """Account for what was inserted, and keep to the cap."""
         self.bytes += size
         if self.bytes > self.maximum_bytes:
-            self._shrink()
+            self.shrink()
 
     def expire(self, now: int) -> None:
         """Forget what is older than the lanes' durations."""
@@ -158,7 +158,7 @@ class Buffer:
         self.bytes -= lane.bytes
         self._evicted_before += lane.evicted
 
-    def _shrink(self) -> None:
+    def shrink(self) -> None:
         """Free the oldest samples over all lanes."""
         target = self.maximum_bytes - self.maximum_bytes // _SLACK
         heads = [(lane.samples[0].time, index, lane) for index, lane in enumerate(self) if lane.samples]
