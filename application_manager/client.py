@@ -5,6 +5,7 @@ The generated model classes are left aside: they cost more time than the request
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -108,7 +109,8 @@ async def load_configuration() -> Configuration:
     configuration = Configuration()
     configuration.connection_pool_maxsize = 32
     try:
-        await _load_kube_config(client_configuration=configuration)
+        # Given here, since the library reads the variable when it is imported.
+        await _load_kube_config(config_file=os.environ.get("KUBECONFIG"), client_configuration=configuration)
     except ConfigException as no_file:
         try:
             _load_incluster_config(client_configuration=configuration)

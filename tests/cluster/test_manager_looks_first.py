@@ -1,0 +1,122 @@
+"""Nothing is stopped without looking: what the manager knows may have holes.
+
+The manager's parts run in the test itself here, since a hole in what a process knows cannot be made from outside.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import pytest
+
+from application_manager.apply import Applier
+from application_manager.claims import instance_name
+from application_manager.client import Client, Object, Resource, load_configuration
+from application_manager.demand import Decision
+from application_manager.instances import InstanceWork
+from application_manager.policy import Policy
+from application_manager.recorder import Recorder
+from application_manager.router import Router
+from application_manager.store import Name
+from application_manager.world import World
+from tests.cluster.api import Api
+from tests.cluster.managed_world import deployment, task, template
+from wayside.api import API_VERSION
+
+INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
+TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
+LINGERING = {"phase": "Lingering", "releaseTime": "2020-01-01T00:00:00Z"}
+NORTH = instance_name("app", "north")
+
+
+def ignore(*_: object) -> None:
+    """Stands for the queues, which do not run here."""
+
+
+def work_on(world: World, client: Client) -> tuple[Router, InstanceWork]:
+    resources = {("apps/v1", "Deployment"): Resource("apps/v1", "Deployment", "deployments")}
+    applier = Applier(client, world.store, resources)
+    router = Router(world, applier, ignore, ignore, ignore, ignore)
+    absent: Callable[[Name, Decision | None], None] = ignore
+    work = InstanceWork(
+        world=world,
+        client=client,
+        applier=applier,
+        recorder=Recorder(client),
+        instances=INSTANCES,
+        tasks=TASKS,
+        again=ignore,
+        done=ignore,
+        absent=absent,
+        observe=router.observe,
+    )
+    return router, work
+
+
+def reconcile(api: Api, known: list[Object]) -> None:
+    """Reconcile the instance once, knowing only these objects."""
+
+    async def run() -> None:
+        client = Client(await load_configuration())
+        try:
+            router, work = work_on(World(Policy()), client)
+            for raw in known:
+                router.observe(raw)
+            await work.reconcile((api.namespace, NORTH))
+        finally:
+            await client.close()
+
+    asyncio.run(run())
+
+
+def lingering(api: Api) -> list[Object]:
+    """A template, and an instance whose linger is over, as the API server has them."""
+    made = api.create(template())
+    managed = {"app.kubernetes.io/managed-by": "wayside"}
+    api.create(
+        {
+            "apiVersion": API_VERSION,
+            "kind": "ApplicationInstance",
+            "metadata": {"name": NORTH, "labels": managed},
+            "spec": {"template": "app", "key": "north", "parameters": {"region": "north"}},
+        }
+    )
+    return [made, api.patch("ApplicationInstance", NORTH, {"status": LINGERING}, subresource="status")]
+
+
+def test_a_task_that_the_watch_has_missed_keeps_its_instance(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KUBECONFIG", str(api.kubeconfig))
+    known = lingering(api)
+    api.create(task("north"))
+    reconcile(api, known)
+    assert "deletionTimestamp" not in api.get("ApplicationInstance", NORTH)["metadata"]
+    assert api.get("Deployment", NORTH)["spec"]["replicas"] == 1
+
+
+def test_an_instance_that_nobody_demands_goes(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KUBECONFIG", str(api.kubeconfig))
+    reconcile(api, lingering(api))
+    api.wait_gone("ApplicationInstance", NORTH)
+
+
+def test_what_has_the_instance_as_controller_is_pruned_though_nobody_wrote_it_down(
+    api: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("KUBECONFIG", str(api.kubeconfig))
+    known = lingering(api)
+    known.append(api.create(task("north")))
+    owner = {key: known[1][key] for key in ("apiVersion", "kind")} | {
+        "name": NORTH,
+        "uid": known[1]["metadata"]["uid"],
+        "controller": True,
+    }
+    labels = {"app.kubernetes.io/managed-by": "wayside", "wayside.dev/instance": NORTH}
+    spec = deployment(name="other")["spec"]
+    for name, owners in (("forgotten", [owner]), ("bystander", [])):
+        metadata = {"name": name, "labels": labels, "ownerReferences": owners}
+        known.append(api.create({"apiVersion": "apps/v1", "kind": "Deployment", "metadata": metadata, "spec": spec}))
+    reconcile(api, known)
+    api.wait_gone("Deployment", "forgotten")
+    assert api.find("Deployment", "bystander") is not None
+    assert api.find("Deployment", NORTH) is not None
