@@ -73,6 +73,7 @@ def measure(receiver: str, publishers: int, seconds: float) -> float:
             for _ in range(publishers)
         ]
         sent = [json.loads(sender.communicate()[0]) for sender in senders]
+        time.sleep(1.0)  # what Zenoh has taken from the publishers must reach the callback
         process.send_signal(signal.SIGTERM)
         report = process.communicate(timeout=60)[1]
     total = sum(each["count"] for each in sent)

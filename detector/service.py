@@ -8,6 +8,7 @@ Zenoh ─▶ intake ─▶ evaluator (thread, owns the engine) ─▶ events: Ze
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import signal
 import time
@@ -78,6 +79,7 @@ async def run(options: Options) -> None:
     Raises:
         DocumentError, DetectorError, NetworkError, NoClusterError, OSError: it cannot start; the text says why.
     """
+    _tune_garbage_collection()
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -87,6 +89,17 @@ async def run(options: Options) -> None:
             await _run_from_files(files, options.record_intake, stopping)
         case Named() as named:
             await _run_in_cluster(named, options.record_intake, stopping)
+
+
+def _tune_garbage_collection() -> None:
+    """Let Python look for reference cycles less often.
+
+    A sample is a tuple, and by default every 700 new ones start a search, although they never form cycles. That cost as
+    much as receiving and inserting them (`benchmarks/intake_rate.py`).
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 50)
 
 
 async def _run_from_files(files: Files, record: Path | None, stopping: asyncio.Event) -> None:
