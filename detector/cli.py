@@ -7,7 +7,7 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, NoReturn, cast
 
 import typer
 
@@ -35,6 +35,9 @@ app = typer.Typer(
 
 _EXPECTED = (DocumentError, DetectorError, RecordingError, NetworkError, NoClusterError, OSError)
 """Errors of the input: said in one line, without a trace."""
+
+_UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
+"""The base of all that is said of a wrong command line, which typer does not export."""
 
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
 RuleFiles = Annotated[
@@ -207,16 +210,29 @@ def _refuse(message: str) -> NoReturn:
 
 
 def main() -> None:
-    """The console script: errors of the input are one clear line and exit code 2."""
+    """The console script: bad usage and errors of the input are one clear line each and exit code 2."""
     debug = "--debug" in sys.argv
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
+    except* _UsageError as group:
+        for error in _leaves(group):
+            _tell_usage(error)
+        sys.exit(2)
+    except* typer.Abort:
+        sys.exit(130)
     except* _EXPECTED as group:
         if debug:
             raise
         for error in _leaves(group):
             typer.echo(f"detector: {error}", err=True)
         sys.exit(2)
+
+
+def _tell_usage(error: BaseException) -> None:
+    """One line, and where to read more; nothing where the help itself is the answer, which then stands there."""
+    if isinstance(error, _UsageError) and (message := error.format_message()):
+        command = error.ctx.command_path if error.ctx is not None else "detector"
+        typer.echo(f"detector: {message.rstrip('.')}; see {command} --help", err=True)
 
 
 def _leaves(group: BaseExceptionGroup[BaseException]) -> list[BaseException]:

@@ -17,7 +17,7 @@ from typing import Any
 
 from detector.streams.zenoh import open_session
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import start_manager, wait_settled
+from tests.cluster.managed_world import condition, start_manager, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until
 from tests.unit.ros_messages import cdr, pose_stamped
@@ -182,6 +182,13 @@ class Chain:
             timeout=timeout,
             what=f"the events of {pair} are {kinds}",
         )
+
+    def wait_condition(self, kind: str, name: str, type_: str, status: str) -> Object:
+        """Wait until the object has the condition with this status; return the condition."""
+        found = self.api.wait_for(
+            kind, name, lambda it: condition(it, type_).get("status") == status, what=f"{name} is {type_}={status}"
+        )
+        return condition(found, type_)
 
     def settled(self) -> None:
         """Wait until the cluster is as its live tasks demand, and nothing else is there."""
