@@ -176,7 +176,7 @@ def test_a_template_that_makes_no_sense_keeps_what_runs_until_it_does(api: Api) 
     wrong = {"parameters": {"region": {"type": "string", "required": True}, "rate": {"type": "number", "default": "x"}}}
     api.patch("ApplicationTemplate", "bad", {"spec": wrong})
     refused = api.wait_for(
-        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Refused", what="the task is told"
+        "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("phase") == "Refused", what="the task is told"
     )
     assert condition(refused, "Accepted")["reason"] == "TemplateInvalid"
     assert "'x' is not of type number" in condition(refused, "Accepted")["message"]
@@ -188,7 +188,9 @@ def test_a_template_that_makes_no_sense_keeps_what_runs_until_it_does(api: Api) 
     )
     assert "releaseTime" not in api.get("ApplicationInstance", BAD)["status"]
     api.patch("ApplicationTemplate", "bad", {"spec": {"parameters": {"rate": None}}})
-    api.wait_for("ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Active", what="it counts again")
+    api.wait_for(
+        "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("phase") == "Active", what="it counts again"
+    )
     assert api.get("Deployment", BAD)["metadata"]["uid"] == first["uid"]
 
 

@@ -219,9 +219,12 @@ def test_without_its_template_an_instance_lingers_and_goes(api: Api, manager: Pr
     there(api, NORTH)
     wait_settled(api)
     api.delete("ApplicationTemplate", "app")
-    api.wait_for("ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw["status"], what="it lingers")
+    api.wait_for("ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw.get("status", {}), what="it lingers")
     refused = api.wait_for(
-        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Refused", what="the task is refused"
+        "ApplicationTask",
+        "north",
+        lambda raw: raw.get("status", {}).get("phase") == "Refused",
+        what="the task is refused",
     )
     assert condition(refused, "Accepted")["reason"] == "TemplateNotFound"
     api.wait_gone("ApplicationInstance", NORTH)
@@ -238,7 +241,7 @@ def test_a_linger_goes_on_through_a_restart(api: Api, manager: Process) -> None:
     there(api, NORTH)
     end(api, "north")
     lingering = api.wait_for(
-        "ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw["status"], what="the deadline is noted"
+        "ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw.get("status", {}), what="the deadline is noted"
     )
     manager.kill9()
     manager.start()

@@ -40,13 +40,13 @@ def test_a_task_becomes_a_deployment_that_is_ready_when_its_pods_are(api: Api, m
     api.wait_for(
         "ApplicationInstance",
         NORTH,
-        lambda raw: "has 0 of 1 pods available" in condition(raw, "Ready")["message"],
+        lambda raw: "has 0 of 1 pods available" in condition(raw, "Ready").get("message", ""),
         what="the instance says what it waits for",
     )
 
     wait_until(lambda: mark_pods_ready(api), bool, timeout=20, what="the pod exists")
     done = api.wait_for(
-        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="the task is ready"
+        "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("phase") == "Ready", what="the task is ready"
     )
     assert {each["type"]: each["status"] for each in done["status"]["conditions"]} == {
         "Accepted": "True",
@@ -65,11 +65,16 @@ def test_when_the_demand_ends_the_instance_lingers_and_goes_with_all_that_is_its
     api.create(task("north"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
     end(api, "north")
-    api.wait_for("ApplicationInstance", NORTH, lambda raw: raw["status"].get("phase") == "Lingering", what="it lingers")
+    api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: raw.get("status", {}).get("phase") == "Lingering", what="it lingers"
+    )
     api.wait_gone("ApplicationInstance", NORTH)
     api.wait_gone("Deployment", NORTH)
     ended = api.wait_for(
-        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Finished", what="the task is finished"
+        "ApplicationTask",
+        "north",
+        lambda raw: raw.get("status", {}).get("phase") == "Finished",
+        what="the task is finished",
     )
     assert condition(ended, "Finished")["reason"] == "Ended"
     assert ended["status"]["instance"] == NORTH
@@ -83,10 +88,12 @@ def test_a_new_demand_within_the_linger_keeps_the_instance_untouched(api: Api, m
     wait_settled(api)
     before = api.get("Deployment", NORTH)["metadata"]
     end(api, "north")
-    api.wait_for("ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw["status"], what="the deadline is noted")
+    api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw.get("status", {}), what="the deadline is noted"
+    )
     api.create(task("again", region="north"))
     api.wait_for(
-        "ApplicationInstance", NORTH, lambda raw: "releaseTime" not in raw["status"], what="the linger is over"
+        "ApplicationInstance", NORTH, lambda raw: "releaseTime" not in raw.get("status", {}), what="the linger is over"
     )
     wait_settled(api)
     after = api.get("Deployment", NORTH)["metadata"]

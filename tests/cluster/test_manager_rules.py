@@ -40,4 +40,6 @@ def test_a_rule_follows_its_detectors_and_what_is_wrong_is_told(api: Api, proces
     for part in ("spec.when", "line 1, column 1", "distence", "distance"):
         assert part in told["message"]
     api.delete("EventRule", name)
-    api.wait_for("Detector", "intersection-a", lambda raw: raw["status"]["rules"] == 0, what="it is counted no more")
+    api.wait_for(
+        "Detector", "intersection-a", lambda raw: raw.get("status", {}).get("rules") == 0, what="it is counted no more"
+    )
