@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from application_manager.demand import Decision, Standing, demand
 from application_manager.policy import Policy
 from application_manager.rendering import Renderer, RenderError
@@ -17,6 +15,7 @@ from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplat
 from wayside.api.applicationinstance import ApplicationInstanceSpec
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
 from wayside.api.documents import load_documents
+from wayside.manifests import to_yaml
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +33,7 @@ class Rendered:
     @property
     def text(self) -> str:
         """The objects as YAML documents."""
-        if not self.objects:
-            return ""
-        return yaml.safe_dump_all(self.objects, sort_keys=False, width=120, allow_unicode=True)
+        return to_yaml(self.objects)
 
 
 def render_files(paths: Iterable[Path], policy: Policy) -> Rendered:

@@ -24,6 +24,7 @@ from detector.actions.stores import (
 )
 from wayside.api import ApplicationTask
 from wayside.api.base import JsonValue
+from wayside.manifests import to_yaml
 from wayside.times import format_time, parse_time
 
 _log = logging.getLogger(__name__)
@@ -96,7 +97,7 @@ class FileTaskStore:
 def write_tasks_yaml(path: Path, tasks: Iterable[ApplicationTask]) -> None:
     """Write tasks into one file of several documents, in the order of their event's start and name."""
     documents = [manifest(_created(task)) for task in sorted(tasks, key=_order)]
-    _replace(path, yaml.safe_dump_all(documents, sort_keys=False, allow_unicode=True, explicit_start=True))
+    _replace(path, to_yaml(documents))
 
 
 class _Read(NamedTuple):
@@ -153,7 +154,7 @@ class _Folder:
 
     def _write(self, task: ApplicationTask) -> StoredTask:
         self.path.mkdir(parents=True, exist_ok=True)
-        _replace(self._file(task.name), yaml.safe_dump(manifest(task), sort_keys=False, allow_unicode=True))
+        _replace(self._file(task.name), to_yaml([manifest(task)]))
         return StoredTask(task, self._next())
 
     def _read(self, file: Path) -> StoredTask | None:

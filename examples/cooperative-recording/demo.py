@@ -20,7 +20,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import yaml
 import zenoh
 from cooperative_recording.expected import episodes
 from cooperative_recording.seeds import DEMO_SEED
@@ -30,6 +29,7 @@ from rich.console import Console
 
 from wayside.api import ApplicationTask, ApplicationTemplate
 from wayside.api.documents import load_documents
+from wayside.manifests import to_yaml
 
 HERE = Path(__file__).resolve().parent
 ENDPOINT = "tcp/127.0.0.1:7447"
@@ -141,7 +141,7 @@ class Timeline:
     def write_manifests(self, path: Path) -> None:
         """The manifests of every instance that there was, as they were last."""
         manifests = [each for rendering in self._foresight.ever.values() for each in rendering.manifests]
-        path.write_text(yaml.safe_dump_all(manifests, sort_keys=False), encoding="utf-8")
+        path.write_text(to_yaml(manifests), encoding="utf-8")
 
     @property
     def running(self) -> list[str]:

@@ -11,6 +11,7 @@ import yaml
 
 from tests.cluster.api import Api, ApiError
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.crds import CRDS
 from tests.cluster.manifests import (
     ABSENT,
     APPLICATION_INSTANCE,
@@ -22,6 +23,7 @@ from tests.cluster.manifests import (
     changed,
 )
 from tests.cluster.wrong_objects import TIME, UPDATES, WRONG, Changes
+from wayside.api import KINDS
 
 EXAMPLES = [
     file
@@ -239,3 +241,9 @@ def _fields(path: str, schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, 
     for inner in (schema.get("items"), schema.get("additionalProperties")):
         for name, child in (inner or {}).get("properties", {}).items():
             yield from _fields(f"{path}[].{name}", child)
+
+
+def test_kubectl_applies_the_files_as_they_are(control_plane: ControlPlane) -> None:
+    """It reads YAML in its own way: a lone y is a boolean to it."""
+    told = control_plane.kubectl("apply", "--server-side", "--force-conflicts", "--dry-run=server", "-f", str(CRDS))
+    assert len(told.splitlines()) == len(KINDS)

@@ -5,18 +5,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import yaml
-
 from wayside.api import GROUP, KINDS
 from wayside.api.schema import crd
+from wayside.manifests import to_yaml
 
 
 def crd_files() -> dict[str, str]:
     """The CRDs' YAML by file name."""
-    return {
-        f"{GROUP}_{kind.plural}.yaml": yaml.safe_dump(crd(kind), sort_keys=False, width=120, allow_unicode=True)
-        for kind in KINDS.values()
-    }
+    return {f"{GROUP}_{kind.plural}.yaml": to_yaml([crd(kind)]) for kind in KINDS.values()}
 
 
 def main() -> None:
