@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from application_manager.client import FIELD_MANAGER, ApiError, Client, Object, Resource
-from application_manager.conditions import Aspect
-from application_manager.policy import KindKey
-from application_manager.rendering import Manifest, Rendering, object_key, owned
+from application_manager.core.conditions import Aspect
+from application_manager.core.policy import KindKey
+from application_manager.core.rendering import Manifest, Rendering, object_key, owned
 from application_manager.store import Store
 from wayside.api import API_VERSION, ApplicationInstance
 from wayside.api.applicationinstance import ObjectReference

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from application_manager.claims import Claim, InvalidTemplate, Refused
-from application_manager.demand import Standing, Verdict, claim_or_verdict
-from application_manager.leases import HolderKey
+from application_manager.core.claims import Claim, InvalidTemplate, Refused
+from application_manager.core.demand import Standing, Verdict, claim_or_verdict
+from application_manager.core.leases import HolderKey
 from application_manager.store import Entry, Name
 from wayside.api import ApplicationTask, ApplicationTemplate
 

@@ -14,8 +14,8 @@ from typing import Annotated
 import typer
 
 from application_manager.client import ApiError, ConfigurationError
+from application_manager.core.policy import Policy
 from application_manager.offline import render_files
-from application_manager.policy import Policy
 from application_manager.service import Options, serve
 from wayside.api.base import Duration
 from wayside.api.documents import DocumentError

@@ -16,7 +16,7 @@ import msgspec
 from kubernetes.aio.client import ApiClient, Configuration
 from kubernetes.aio.config import ConfigException, load_incluster_config, load_kube_config
 
-from application_manager.policy import KindKey
+from application_manager.core.policy import KindKey
 
 Object = dict[str, Any]
 """A Kubernetes object, as JSON."""

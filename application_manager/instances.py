@@ -13,13 +13,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager import drafting
 from application_manager.apply import Applied, Applier, Known, ObjectKey
 from application_manager.client import ApiError, Client, Object, Resource
-from application_manager.conditions import Aspect, find
-from application_manager.demand import Decision, decide
+from application_manager.core import drafting
+from application_manager.core.conditions import Aspect, find
+from application_manager.core.demand import Decision, decide
+from application_manager.core.rendering import Rendering
 from application_manager.recorder import Reason, Recorder
-from application_manager.rendering import Rendering
 from application_manager.store import Name
 from application_manager.world import Record, World
 from wayside.api import ApplicationInstance

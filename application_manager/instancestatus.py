@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 from application_manager.apply import Applied, Applier
 from application_manager.client import ApiError, Client, Object, Resource
-from application_manager.conditions import Aspect
-from application_manager.demand import Decision
-from application_manager.readiness import not_ready
+from application_manager.core.conditions import Aspect
+from application_manager.core.demand import Decision
+from application_manager.core.readiness import not_ready
+from application_manager.core.status import Service, difference, instance_status
 from application_manager.recorder import Reason, Recorder
-from application_manager.status import Service, difference, instance_status
 from application_manager.store import Name
 from application_manager.world import Served, World
 from wayside.api import ApplicationInstance

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from application_manager.client import LEASES, ApiError, Client, Resource, Unreachable
-from application_manager.leases import lease_name
+from application_manager.core.leases import lease_name
 from application_manager.store import Name
 from application_manager.world import World
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from application_manager.demand import Decision, Standing, demand
-from application_manager.policy import Policy
-from application_manager.rendering import Renderer, RenderError
+from application_manager.core.demand import Decision, Standing, demand
+from application_manager.core.policy import Policy
+from application_manager.core.rendering import Renderer, RenderError
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.applicationinstance import ApplicationInstanceSpec
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata

@@ -14,8 +14,8 @@ from typing import Any
 import kopf
 
 from application_manager.client import LEASES, Object, Resource
-from application_manager.leases import LEASE_PREFIX
-from application_manager.rendering import INSTANCE_LABEL
+from application_manager.core.leases import LEASE_PREFIX
+from application_manager.core.rendering import INSTANCE_LABEL
 
 News = Callable[[Object], None]
 

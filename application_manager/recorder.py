@@ -17,9 +17,9 @@ from enum import StrEnum
 from typing import Any
 
 from application_manager.client import EVENTS, ApiError, Client, Unreachable
-from application_manager.conditions import changed
-from application_manager.times import format_time
+from application_manager.core.conditions import changed
 from wayside.api.base import Condition, Kind
+from wayside.times import format_seconds
 
 COMPONENT = "wayside.dev/application-manager"
 _WAITING = 1000  # Events that may wait; further ones are dropped and counted, since work goes before words
@@ -77,7 +77,7 @@ class Recorder:
     def say(self, regarding: Kind, reason: Reason, note: str, now: float) -> None:
         """Post an Event about the object; `now` in seconds since 1970."""
         try:
-            self._waiting.put_nowait(_Said(regarding, reason, note, format_time(now)))
+            self._waiting.put_nowait(_Said(regarding, reason, note, format_seconds(now)))
         except asyncio.QueueFull:
             self.dropped += 1
 

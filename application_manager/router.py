@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 from application_manager.apply import Applier
 from application_manager.client import Object
-from application_manager.leases import LEASE_PREFIX
-from application_manager.policy import KindKey
-from application_manager.readiness import not_ready
-from application_manager.rendering import INSTANCE_LABEL
+from application_manager.core.leases import LEASE_PREFIX
+from application_manager.core.policy import KindKey
+from application_manager.core.readiness import not_ready
+from application_manager.core.rendering import INSTANCE_LABEL
 from application_manager.rulework import RuleKey
 from application_manager.store import Entry, Name
 from application_manager.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, TASK, TEMPLATE, World

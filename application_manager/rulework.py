@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from application_manager.client import ApiError, Client, Object, Resource
-from application_manager.policy import KindKey
+from application_manager.core.policy import KindKey
+from application_manager.core.rulestatus import detector_status, rule_status
+from application_manager.core.status import difference
 from application_manager.recorder import Recorder
-from application_manager.rulestatus import detector_status, rule_status
-from application_manager.status import difference
 from application_manager.store import Name
 from application_manager.world import DETECTOR, EVENT_RULE, World
 from wayside.api import Detector, EventRule

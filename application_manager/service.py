@@ -18,12 +18,12 @@ import kopf
 from application_manager.apply import Applier
 from application_manager.client import Client, ConfigurationError, Resource, Unreachable
 from application_manager.client import load_configuration as load
+from application_manager.core.policy import KindKey, Policy, kind_text
 from application_manager.instances import InstanceWork
 from application_manager.instancestatus import InstanceStatusWork
 from application_manager.leasewatch import LeaseWatch
 from application_manager.listing import Listing
 from application_manager.operator import watch
-from application_manager.policy import KindKey, Policy, kind_text
 from application_manager.recorder import Recorder
 from application_manager.router import Router
 from application_manager.rulework import RuleKey, RuleWork

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager.policy import KindKey
+from application_manager.core.policy import KindKey
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
 

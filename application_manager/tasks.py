@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager.claims import Refused
 from application_manager.client import ApiError, Client, Object, Resource
-from application_manager.demand import Standing, Verdict
+from application_manager.core.claims import Refused
+from application_manager.core.demand import Standing, Verdict
+from application_manager.core.status import Service, difference, finished_since, task_status
 from application_manager.recorder import Recorder
-from application_manager.status import Service, difference, finished_since, task_status
 from application_manager.store import Name
 from application_manager.world import World
 from wayside.api.applicationtask import ApplicationTaskStatus

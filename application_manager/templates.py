@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager.claims import InvalidTemplate
 from application_manager.client import ApiError, Client, Object, Resource
+from application_manager.core.claims import InvalidTemplate
+from application_manager.core.rendering import RenderError
+from application_manager.core.status import difference, template_status
 from application_manager.recorder import Recorder
-from application_manager.rendering import RenderError
-from application_manager.status import difference, template_status
 from application_manager.store import Name
 from application_manager.world import TEMPLATE, World
 from wayside.api.applicationtemplate import ApplicationTemplateStatus

@@ -8,12 +8,12 @@ from typing import Final, TypeVar
 
 from application_manager.apply import Applied
 from application_manager.claimbook import ClaimBook
-from application_manager.claims import InvalidTemplate
-from application_manager.demand import Decision, Verdict
-from application_manager.leases import HealthyTime, LeaseBook, LeaseView
-from application_manager.policy import KindKey, Policy
-from application_manager.rendering import Renderer, RenderError
-from application_manager.status import Service
+from application_manager.core.claims import InvalidTemplate
+from application_manager.core.demand import Decision, Verdict
+from application_manager.core.leases import HealthyTime, LeaseBook, LeaseView
+from application_manager.core.policy import KindKey, Policy
+from application_manager.core.rendering import Renderer, RenderError
+from application_manager.core.status import Service
 from application_manager.store import Name, Store
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 

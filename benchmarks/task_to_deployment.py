@@ -27,10 +27,10 @@ from typing import Any
 
 import aiohttp
 
-from application_manager.claims import instance_name
 from application_manager.client import Client, Resource, load_configuration
-from application_manager.policy import Policy
-from application_manager.rendering import Renderer, owned
+from application_manager.core.claims import instance_name
+from application_manager.core.policy import Policy
+from application_manager.core.rendering import Renderer, owned
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate

@@ -48,3 +48,17 @@ def parse_time(text: str) -> int:
     since = whole - _EPOCH
     fraction = int((match["fraction"] or "").ljust(9, "0"))
     return (since.days * 86_400 + since.seconds) * _SECOND + fraction
+
+
+def parse_seconds(text: str) -> float:
+    """Seconds since the epoch of an RFC 3339 time. Raises ValueError where it is none."""
+    return parse_time(text) / _SECOND
+
+
+def format_seconds(seconds: float) -> str:
+    """The time in UTC with milliseconds, as statuses have it: ``2026-05-04T10:20:30.500Z``.
+
+    Raises:
+        ValueError: outside the years 1 to 9999.
+    """
+    return f"{format_time(round(seconds * 1000) * 1_000_000)[:-7]}Z"

@@ -9,13 +9,13 @@ from typing import Any
 
 import yaml
 
-from application_manager.demand import LINGER_ANNOTATION, Decision, demand
-from application_manager.policy import Policy
-from application_manager.rendering import Renderer, Rendering
-from application_manager.times import format_time
+from application_manager.core.demand import LINGER_ANNOTATION, Decision, demand
+from application_manager.core.policy import Policy
+from application_manager.core.rendering import Renderer, Rendering
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 from wayside.api.applicationinstance import ApplicationInstanceSpec, ApplicationInstanceStatus
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
+from wayside.times import format_seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ def _instance(decision: Decision, before: ApplicationInstance | None) -> Applica
         ),
         spec=ApplicationInstanceSpec(template=decision.template, key=decision.key, parameters=parameters),
         status=ApplicationInstanceStatus(
-            release_time=None if decision.release_time is None else format_time(decision.release_time)
+            release_time=None if decision.release_time is None else format_seconds(decision.release_time)
         ),
     )
 

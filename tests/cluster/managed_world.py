@@ -12,12 +12,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from application_manager.claims import InvalidTemplate
-from application_manager.demand import Outcome, Standing, demand, is_managed
-from application_manager.leases import LeaseView
-from application_manager.policy import Policy
-from application_manager.rendering import Renderer, RenderError
-from application_manager.status import task_status
+from application_manager.core.claims import InvalidTemplate
+from application_manager.core.demand import Outcome, Standing, demand, is_managed
+from application_manager.core.leases import LeaseView
+from application_manager.core.policy import Policy
+from application_manager.core.rendering import Renderer, RenderError
+from application_manager.core.status import task_status
 from tests.cluster.api import Api, Object
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until

@@ -11,11 +11,11 @@ from collections.abc import Callable
 import pytest
 
 from application_manager.apply import Applier
-from application_manager.claims import instance_name
 from application_manager.client import Client, Object, Resource, load_configuration
-from application_manager.demand import Decision
+from application_manager.core.claims import instance_name
+from application_manager.core.demand import Decision
+from application_manager.core.policy import Policy
 from application_manager.instances import InstanceWork
-from application_manager.policy import Policy
 from application_manager.recorder import Recorder
 from application_manager.router import Router
 from application_manager.store import Name

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from application_manager.times import format_time
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
+from wayside.times import format_seconds
 
 NOW = 1_790_000_000.0
 
@@ -50,15 +50,20 @@ def task(
     if holder:
         spec["requester"] = {"holder": holder}
     if ended:
-        spec["endTime"] = format_time(NOW)
+        spec["endTime"] = format_seconds(NOW)
     raw: dict[str, Any] = {
         "kind": "ApplicationTask",
-        "metadata": {"name": name, "namespace": "site", "creationTimestamp": format_time(NOW - 3600 + created)},
+        "metadata": {"name": name, "namespace": "site", "creationTimestamp": format_seconds(NOW - 3600 + created)},
         "spec": spec,
     }
     if accepted_condition:
         status, reason, since = accepted_condition
-        condition = {"type": "Accepted", "status": status, "reason": reason, "lastTransitionTime": format_time(since)}
+        condition = {
+            "type": "Accepted",
+            "status": status,
+            "reason": reason,
+            "lastTransitionTime": format_seconds(since),
+        }
         raw["status"] = {"conditions": [condition]}
     return ApplicationTask.model_validate(raw)
 
@@ -85,5 +90,5 @@ def instance(
         "spec": {"template": of, "key": key, "parameters": parameters or {}},
     }
     if release_at is not None:
-        raw["status"] = {"releaseTime": format_time(release_at)}
+        raw["status"] = {"releaseTime": format_seconds(release_at)}
     return ApplicationInstance.model_validate(raw)

@@ -22,8 +22,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from application_manager.policy import Policy
-from application_manager.rendering import Renderer
+from application_manager.core.policy import Policy
+from application_manager.core.rendering import Renderer
 from tests.unit.manager_objects import instance
 from wayside.api import ApplicationTemplate, Detector, EventRule, Kind
 from wayside.api.documents import load_documents

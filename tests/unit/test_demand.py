@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from application_manager.demand import Outcome, Standing, demand
-from application_manager.leases import LeaseView
+from application_manager.core.demand import Outcome, Standing, demand
+from application_manager.core.leases import LeaseView
 from tests.unit.manager_objects import NOW, instance, task, template
 
 FUSION = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from application_manager.leases import DEFAULT_DURATION, HealthyTime, LeaseBook, LeaseView
+from application_manager.core.leases import DEFAULT_DURATION, HealthyTime, LeaseBook, LeaseView
 
 KEY = ("site", "det")
 

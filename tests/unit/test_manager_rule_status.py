@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from application_manager.rulestatus import detector_status, rule_status
+from application_manager.core.rulestatus import detector_status, rule_status
 from tests.unit.manager_objects import NOW
 from wayside.api import Detector, EventRule
 

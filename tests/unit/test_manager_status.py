@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from application_manager.conditions import Aspect, changed, updated
-from application_manager.demand import Standing, Verdict
-from application_manager.readiness import not_ready
-from application_manager.status import Service, difference, finished_since, task_status
-from application_manager.times import format_time, parse_time
+from application_manager.core.conditions import Aspect, changed, updated
+from application_manager.core.demand import Standing, Verdict
+from application_manager.core.readiness import not_ready
+from application_manager.core.status import Service, difference, finished_since, task_status
 from tests.unit.manager_objects import NOW, task
 from wayside.api.applicationtask import TaskPhase
+from wayside.times import format_seconds, parse_seconds
 
 COUNTS = Verdict(Standing.COUNTS, "Accepted", "counts", "app")
 
@@ -25,9 +25,9 @@ def test_a_condition_keeps_its_time_while_its_status_stays() -> None:
     first = updated((), [Aspect("Ready", False, "NotReady", "0 of 1")], 1, NOW)
     second = updated(first, [Aspect("Ready", False, "NotReady", "0 of 2")], 2, NOW + 5)
     third = updated(second, [Aspect("Ready", True, "Ready")], 2, NOW + 9)
-    assert second[0].last_transition_time == format_time(NOW)
+    assert second[0].last_transition_time == format_seconds(NOW)
     assert (second[0].message, second[0].observed_generation) == ("0 of 2", 2)
-    assert third[0].last_transition_time == format_time(NOW + 9)
+    assert third[0].last_transition_time == format_seconds(NOW + 9)
 
 
 def test_only_a_change_of_status_or_reason_is_worth_an_event() -> None:
@@ -77,7 +77,7 @@ def test_the_difference_is_a_merge_patch() -> None:
     ["2026-05-04T10:20:30Z", "2026-05-04T10:20:30.123Z", "2026-05-04T10:20:30.123456789Z", "2026-05-04T12:20:30+02:00"],
 )
 def test_times_of_all_precisions_are_read(text: str) -> None:
-    assert int(parse_time(text)) == 1777890030
+    assert int(parse_seconds(text)) == 1777890030
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from application_manager.conditions import Aspect, updated
+from application_manager.core.conditions import Aspect, updated
 from wayside.api import Detector, EventRule
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus

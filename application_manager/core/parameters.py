@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager import values
+from application_manager.core import values
 from wayside.api.applicationtask import MAXIMUM_PARAMETER_BYTES
 from wayside.api.applicationtemplate import Merge, Parameter
 

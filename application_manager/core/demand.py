@@ -12,13 +12,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from application_manager import parameters
-from application_manager.claims import Claim, InvalidTemplate, Refusal, Refused, claim
-from application_manager.leases import LeaseView
-from application_manager.times import parse_time
+from application_manager.core import parameters
+from application_manager.core.claims import Claim, InvalidTemplate, Refusal, Refused, claim
+from application_manager.core.leases import LeaseView
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle, LossPolicy
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Duration
+from wayside.times import parse_seconds
 
 LINGER_ANNOTATION = "wayside.dev/linger"
 """On an instance: its template's linger, for when the template is gone."""
@@ -220,7 +220,7 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
 def _release_time(instance: ApplicationInstance, template: ApplicationTemplate | None, now: float) -> float:
     """The deadline that the status holds, or a new one: linger begins when we see that no demand is left."""
     if instance.status is not None and instance.status.release_time is not None:
-        return parse_time(instance.status.release_time)
+        return parse_seconds(instance.status.release_time)
     return now + linger_of(instance, template).seconds
 
 
@@ -265,5 +265,5 @@ def _lapse(
 def _lost_since(task: ApplicationTask) -> float | None:
     for condition in task.status.conditions if task.status else ():
         if condition.type == "Accepted" and condition.status == "False" and condition.reason == HOLDER_LOST:
-            return parse_time(condition.last_transition_time)
+            return parse_seconds(condition.last_transition_time)
     return None

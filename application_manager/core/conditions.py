@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from application_manager.times import format_time
 from wayside.api.base import Condition
+from wayside.times import format_seconds
 
 MAXIMUM_MESSAGE = 4096  # characters, as the CRDs allow
 
@@ -43,7 +43,7 @@ def updated(
             reason=aspect.reason,
             message=_cut(aspect.message),
             observed_generation=generation,
-            last_transition_time=old.last_transition_time if old is not None and kept else format_time(now),
+            last_transition_time=old.last_transition_time if old is not None and kept else format_seconds(now),
         )
     return tuple(by_type.values())
 

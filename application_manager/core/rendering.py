@@ -12,9 +12,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from application_manager import parameters, values
-from application_manager.claims import check_paths
-from application_manager.policy import Policy
+from application_manager.core import parameters, values
+from application_manager.core.claims import check_paths
+from application_manager.core.policy import Policy
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import API_VERSION, MANAGED_BY, MANAGED_BY_LABEL
 from wayside.expressions import CompiledTemplate, Environment, InterpolationError, Kind, compile_template

@@ -10,14 +10,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager.conditions import Aspect, find, holds, updated
-from application_manager.demand import Decision, Standing, Verdict
-from application_manager.times import format_time, parse_time
+from application_manager.core.conditions import Aspect, find, holds, updated
+from application_manager.core.demand import Decision, Standing, Verdict
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
 from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
 from wayside.api.base import Condition
+from wayside.times import format_seconds, parse_seconds
 
 Json = dict[str, Any]
 
@@ -64,7 +64,7 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
 def finished_since(task: ApplicationTask) -> float | None:
     """When the task's status began to say that it is finished, in seconds since 1970; None where it does not."""
     condition = find(task.status.conditions, "Finished") if task.status else None
-    return parse_time(condition.last_transition_time) if condition and condition.status == "True" else None
+    return parse_seconds(condition.last_transition_time) if condition and condition.status == "True" else None
 
 
 def _latched(
@@ -111,7 +111,7 @@ def instance_status(
         phase=phase,
         observed_generation=generation,
         spec_hash=spec_hash,
-        release_time=None if decision.release_time is None else format_time(decision.release_time),
+        release_time=None if decision.release_time is None else format_seconds(decision.release_time),
         objects=list(objects),
         demands=demands(decision),
         conditions=list(updated(old.conditions, (applied, ready), generation, now)),

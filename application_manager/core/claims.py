@@ -13,7 +13,7 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import Any
 
-from application_manager import parameters, values
+from application_manager.core import parameters, values
 from wayside.api import ApplicationTask, ApplicationTemplate
 from wayside.expressions import CompiledTemplate, Environment, InterpolationError, Kind, compile_template
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from application_manager.claims import InvalidTemplate
-from application_manager.conditions import Aspect
-from application_manager.demand import LINGER_ANNOTATION, Decision, is_managed, linger_of
-from application_manager.rendering import Renderer, RenderError, Rendering
-from application_manager.store import Name
+from application_manager.core.claims import InvalidTemplate
+from application_manager.core.conditions import Aspect
+from application_manager.core.demand import LINGER_ANNOTATION, Decision, is_managed, linger_of
+from application_manager.core.rendering import Renderer, RenderError, Rendering
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationinstance import ApplicationInstanceSpec
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
+
+Name = tuple[str, str]
+"""Namespace and name."""
 
 TemplateState = ApplicationTemplate | InvalidTemplate | None
 
