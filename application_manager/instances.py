@@ -17,7 +17,7 @@ from application_manager.apply import Applied, Applier, Known, ObjectKey
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core import drafting
 from application_manager.core.conditions import Aspect, find
-from application_manager.core.demand import Decision, decide
+from application_manager.core.demand import Decision
 from application_manager.core.rendering import Rendering
 from application_manager.recorder import Reason, Recorder
 from application_manager.store import Name
@@ -69,7 +69,7 @@ class InstanceWork:
 
     async def _reconcile(self, name: Name) -> None:
         now = time.time()
-        instance, decision = self.world.instance(name), self._decide(name, now)
+        instance, decision = self.world.instance(name), self.world.decide(name, now)
         if decision is None or (instance is None and not decision.wanted):
             self.world.records.pop(name, None)
             self.absent(name, decision)
@@ -79,27 +79,10 @@ class InstanceWork:
         if decision.release_time is not None and decision.release_time <= now:
             if await self._released(name):
                 return
-            decision = self._decide(name, time.time()) or decision
+            decision = self.world.decide(name, time.time()) or decision
         if decision.next_change is not None:
             self.again(name, decision.next_change)
         await self._make(name, decision, self.world.instance(name))
-
-    def _decide(self, name: Name, now: float) -> Decision | None:
-        instance = self.world.instance(name)
-        claims = self.world.claims.claims(name)
-        if instance is None and not claims:
-            return None
-        of = instance.spec.template if instance is not None else claims[0].task.spec.template
-        holders = (each.task.spec.requester.holder for each in claims)
-        return decide(
-            name[1],
-            of,
-            template=self.world.template((name[0], of)),
-            claims=claims,
-            instance=instance,
-            leases=self.world.lease_views(name[0], holders),
-            now=now,
-        )
 
     async def _make(self, name: Name, decision: Decision, existing: ApplicationInstance | None) -> None:
         wanted = drafting.draft(name, decision, existing)
@@ -184,7 +167,7 @@ class InstanceWork:
         listed, _ = await self.client.list(self.tasks, name[0], fields=fields)
         for raw in listed:
             self.observe(raw)
-        decision = self._decide(name, time.time())
+        decision = self.world.decide(name, time.time())
         if decision is None or decision.release_time is None or decision.release_time > time.time():
             return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)

@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 from application_manager.apply import Applied
 from application_manager.claimbook import ClaimBook
 from application_manager.core.claims import InvalidTemplate
-from application_manager.core.demand import Decision, Verdict
+from application_manager.core.demand import Decision, Verdict, decide, written_deadline
 from application_manager.core.leases import HealthyTime, LeaseBook, LeaseView
 from application_manager.core.policy import KindKey, Policy
 from application_manager.core.rendering import Renderer, RenderError
@@ -60,6 +60,8 @@ class World:
     Attributes:
         served: by instance; empty until it was reconciled for the first time.
         records: by instance; ahead of its status, and empty likewise.
+        deadlines: by instance, its uid and the release time last decided; ahead of its status as well, since a status
+            may be written long after what it says was decided.
     """
 
     policy: Policy
@@ -69,6 +71,7 @@ class World:
     healthy: HealthyTime = field(default_factory=HealthyTime)
     served: dict[Name, Served] = field(default_factory=dict)
     records: dict[Name, Record] = field(default_factory=dict)
+    deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
     _renderers: dict[Name, tuple[tuple[str, int], Renderer | RenderError]] = field(default_factory=dict)
 
     def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:
@@ -105,6 +108,33 @@ class World:
             and isinstance(entry.model, ApplicationInstance)
             and entry.model.spec.template == template[1]
         ]
+
+    def decide(self, name: Name, now: float) -> Decision | None:
+        """What should become of the instance as of `now`, in seconds since 1970; None: no one knows or wants it."""
+        instance = self.instance(name)
+        claims = self.claims.claims(name)
+        if instance is None and not claims:
+            self.deadlines.pop(name, None)
+            return None
+        of = instance.spec.template if instance is not None else claims[0].task.spec.template
+        holders = (each.task.spec.requester.holder for each in claims)
+        decision = decide(
+            name[1],
+            of,
+            template=self.template((name[0], of)),
+            claims=claims,
+            instance=instance,
+            deadline=self._deadline(name, instance) if instance is not None else None,
+            leases=self.lease_views(name[0], holders),
+            now=now,
+        )
+        if instance is not None:
+            self.deadlines[name] = (instance.metadata.uid, decision.release_time)
+        return decision
+
+    def _deadline(self, name: Name, instance: ApplicationInstance) -> float | None:
+        uid, decided = self.deadlines.get(name, ("", None))
+        return decided if uid == instance.metadata.uid else written_deadline(instance)
 
     def lease_views(self, namespace: str, holders: Iterable[str | None]) -> dict[str, LeaseView]:
         """The Leases of the holders, by holder."""

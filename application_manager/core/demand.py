@@ -118,6 +118,7 @@ def demand(
             template=by_name.get(template),
             claims=claims,
             instance=instance,
+            deadline=written_deadline(instance) if instance else None,
             leases=leases,
             now=now,
         )
@@ -147,10 +148,15 @@ def decide(
     template: ApplicationTemplate | InvalidTemplate | None,
     claims: Iterable[Claim],
     instance: ApplicationInstance | None,
+    deadline: float | None,
     leases: Mapping[str, LeaseView],
     now: float,
 ) -> Decision:
-    """What should become of the instance, given the tasks that claim it."""
+    """What should become of the instance, given the tasks that claim it.
+
+    `deadline` is the release time of the decision before this one, None where that said to keep the instance: the
+    linger goes on while no demand comes, and begins anew after one came.
+    """
     ordered = sorted(claims, key=lambda each: precedence(each.task))
     if instance is not None and not is_managed(instance):
         return _left_alone(instance, ordered)
@@ -182,7 +188,8 @@ def decide(
     key = contributing[0].key if contributing else instance.spec.key if instance else None
     release_time = None
     if not contributing and instance is not None:
-        release_time = _release_time(instance, template, now)
+        linger = linger_of(instance, template).seconds  # from when we see that no demand is left
+        release_time = now + linger if deadline is None else deadline
         changes.append(release_time)
     return Decision(
         name=name,
@@ -217,11 +224,10 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     return Decision(instance.name, spec.template, spec.key, None, (), verdicts, None, None)
 
 
-def _release_time(instance: ApplicationInstance, template: ApplicationTemplate | None, now: float) -> float:
-    """The deadline that the status holds, or a new one: linger begins when we see that no demand is left."""
-    if instance.status is not None and instance.status.release_time is not None:
-        return parse_seconds(instance.status.release_time)
-    return now + linger_of(instance, template).seconds
+def written_deadline(instance: ApplicationInstance) -> float | None:
+    """The release time that the status holds, in seconds since 1970: what survives our own restart."""
+    written = instance.status.release_time if instance.status else None
+    return None if written is None else parse_seconds(written)
 
 
 def linger_of(instance: ApplicationInstance, template: ApplicationTemplate | None) -> Duration:

@@ -1,0 +1,78 @@
+"""Linger: an instance goes when its deadline comes, however late its status is written."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from application_manager.core.demand import Decision
+from application_manager.core.policy import Policy
+from application_manager.store import Entry
+from application_manager.world import INSTANCE, World
+from tests.unit.manager_objects import NOW, instance, task, template
+from wayside.api import ApplicationInstance, ApplicationTask
+from wayside.api.base import API_VERSION
+
+NAME = ("site", "app")
+
+
+def world_with(existing: ApplicationInstance) -> World:
+    world = World(Policy())
+    see(world, template(lifecycle={"linger": "30s"}), "1")
+    see(world, existing, "2")
+    return world
+
+
+def see(world: World, model: Any, version: str) -> None:
+    raw = {"apiVersion": API_VERSION, **model.to_json()}
+    raw["metadata"] = {**raw["metadata"], "uid": model.metadata.uid or model.name, "resourceVersion": version}
+    assert world.store.put(raw) is not None
+
+
+def claim(world: World, wanted: ApplicationTask) -> None:
+    world.claims.note(("site", wanted.name), Entry(wanted.to_json(), wanted), world.template(NAME))
+
+
+def decided(world: World, at: float) -> Decision:
+    decision = world.decide(NAME, NOW + at)
+    assert decision is not None
+    return decision
+
+
+def test_a_deadline_holds_from_when_it_was_decided_though_no_status_says_it_yet() -> None:
+    world = world_with(instance())
+    assert decided(world, 0).release_time == NOW + 30
+    assert decided(world, 20).release_time == NOW + 30
+    assert decided(world, 31).release_time == NOW + 30
+
+
+def test_a_demand_that_came_and_went_begins_the_linger_anew_though_the_status_says_the_old_deadline() -> None:
+    world = world_with(instance(release_at=NOW + 10))
+    assert decided(world, 0).release_time == NOW + 10
+    claim(world, task("a"))
+    assert decided(world, 5).release_time is None
+    claim(world, task("a", ended=True))
+    assert decided(world, 9).release_time == NOW + 9 + 30
+
+
+def test_after_a_restart_the_status_is_what_is_known() -> None:
+    assert decided(world_with(instance(release_at=NOW + 10)), 5).release_time == NOW + 10
+
+
+def test_the_deadline_of_a_namesake_is_worth_nothing() -> None:
+    world = world_with(instance())
+    assert decided(world, 0).release_time == NOW + 30
+    successor = instance()
+    successor = successor.model_copy(update={"metadata": successor.metadata.model_copy(update={"uid": "another"})})
+    see(world, successor, "3")
+    assert world.store.get(INSTANCE, NAME) is not None
+    assert decided(world, 20).release_time == NOW + 50
+
+
+def test_the_deadline_of_what_is_gone_is_forgotten() -> None:
+    world = world_with(instance(release_at=NOW + 10))
+    decided(world, 0)
+    entry = world.store.get(INSTANCE, NAME)
+    assert entry is not None
+    world.store.remove(entry.raw)
+    assert world.decide(NAME, NOW + 11) is None
+    assert world.deadlines == {}
