@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from application_manager.client import ApiError, Client, Resource, Unreachable
 from application_manager.core.rendering import INSTANCE_LABEL
 from application_manager.router import Router
+from application_manager.starting import until_answered
 from application_manager.world import World
 
 FIRST_RESYNC = 3.0  # s after the watches began: what vanished between our first list and theirs
-_PAUSE = 1.0  # s between attempts to reach the API server at the start
 
 log = logging.getLogger(__name__)
 
@@ -39,15 +39,11 @@ class Listing:
     every: float
 
     async def first(self) -> None:
-        """List everything, however long the API server takes to answer."""
-        while True:
-            try:
-                await self._everything()
-            except Unreachable as error:
-                log.warning("%s; again in %g s", error, _PAUSE)
-                await asyncio.sleep(_PAUSE)
-            else:
-                return
+        """List everything, however long the API server takes to answer.
+
+        Raises ApiError where it refuses for good.
+        """
+        await until_answered(self._everything)
 
     async def resync(self, watching: asyncio.Event) -> None:
         """List everything again and again, once the watches have begun, until cancelled."""

@@ -12,11 +12,12 @@ import signal
 import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
+from functools import partial
 
 import kopf
 
 from application_manager.apply import Applier
-from application_manager.client import Client, ConfigurationError, Resource, Unreachable
+from application_manager.client import Client, ConfigurationError, Resource
 from application_manager.client import load_configuration as load
 from application_manager.core.policy import KindKey, Policy, kind_text
 from application_manager.instances import InstanceWork
@@ -27,6 +28,7 @@ from application_manager.operator import watch
 from application_manager.recorder import Recorder
 from application_manager.router import Router
 from application_manager.rulework import RuleKey, RuleWork
+from application_manager.starting import until_answered
 from application_manager.store import Name
 from application_manager.tasks import TaskWork
 from application_manager.templates import TemplateWork
@@ -36,7 +38,6 @@ from application_manager.world import INSTANCE, OWN_KINDS, TASK, TEMPLATE, World
 JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
 _INSTANCE_WORKERS = 16
 _STATUS_WORKERS = 2  # few: what runs goes before what is said of it
-_START_PAUSE = 1.0  # s between attempts to reach the API server at the start
 
 log = logging.getLogger(__name__)
 
@@ -229,15 +230,9 @@ class Manager:
 
 async def _discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
     """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and said."""
-    while True:
-        try:
-            found: dict[KindKey, Resource] = {}
-            for version in sorted({each[0] for each in (*OWN_KINDS, *policy.kinds)}):
-                found |= await client.discover(version)
-            break
-        except Unreachable as error:
-            log.warning("%s; again in %g s", error, _START_PAUSE)
-            await asyncio.sleep(_START_PAUSE)
+    found: dict[KindKey, Resource] = {}
+    for version in sorted({each[0] for each in (*OWN_KINDS, *policy.kinds)}):
+        found |= await until_answered(partial(client.discover, version))
     lacking = [kind_text(kind) for kind in OWN_KINDS if kind not in found]
     if lacking:
         raise ConfigurationError(f"the cluster has no kind {', '.join(lacking)}: run kubectl apply -f crds/")

@@ -1,0 +1,52 @@
+"""The manager starts as soon as the API server lets it, and gives up only where waiting is in vain."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import pytest
+
+from application_manager.client import ApiError, Unreachable
+from application_manager.starting import until_answered
+
+
+def asked(*failures: Exception) -> str:
+    """The answer of what fails in these ways first."""
+    left = list(failures)
+
+    async def ask() -> str:
+        if left:
+            raise left.pop(0)
+        return "answer"
+
+    return asyncio.run(until_answered(ask, pause=0.0))
+
+
+def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_said_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    failures = [
+        Unreachable("GET /apis: refused"),
+        ApiError(503, "starting"),
+        ApiError(429, "too many requests"),
+        ApiError(500, "etcd"),
+    ]
+    assert asked(*failures) == "answer"
+    assert [record.getMessage() for record in caplog.records] == [
+        "GET /apis: refused; asking again until the API server answers",
+        "the API server answers",
+    ]
+
+
+@pytest.mark.parametrize("code", [401, 403, 400])
+def test_what_waiting_cannot_change_is_told_at_once(code: int) -> None:
+    with pytest.raises(ApiError, match="no"):
+        asked(ApiError(code, "no"))
+
+
+def test_an_answer_at_once_is_not_commented(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    assert asked() == "answer"
+    assert caplog.records == []
