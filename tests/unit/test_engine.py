@@ -474,3 +474,11 @@ def test_the_two_tasks_of_one_episode_restore_one_episode() -> None:
     again.engine.restore(list(held.values()), at(0))
     assert again.engine.demands() == held
     assert again.take(speed(0.5, 1), until=1) == ["r car Until 1"]
+
+
+def test_of_two_episodes_of_one_subject_the_second_is_no_episode() -> None:
+    first, second = held_by(RECORD), held_by(RECORD, episode="zzz", start_time=at(-5))
+    drive = Drive(a_detector(), RECORD)
+    told = drive.engine.restore([second, first], at(0))
+    assert [(event.episode, event.reason) for event in told] == [("zzz", "RuleChanged")]
+    assert list(drive.engine.demands().values()) == [first]

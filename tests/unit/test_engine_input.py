@@ -158,6 +158,7 @@ def test_keys_that_name_no_client_are_counted_and_leave_nothing_behind() -> None
     ]
     drive.note(drive.engine.advance([Arrival(at(0.1) + n, "speed", key, b"{}") for n, key in enumerate(bad)], at(1)))
     assert drive.engine.counters.unnamed == {"speed": len(bad)}
+    assert drive.engine.counters.samples.total() == 0
     assert list(drive.engine.clients) == []
     assert list(drive.engine.buffer) == []
 
@@ -200,6 +201,7 @@ def test_of_lost_clients_a_bounded_number_is_remembered(monkeypatch: pytest.Monk
     for n in range(20, 25):
         drive.take(arrival(5 * n + 0.5, f"made{n}", {"v": 1}), arrival(5 * n + 0.6, "made7", {"v": 1}), until=5 * n + 1)
     assert "made7" in drive.engine.clients
+    assert drive.engine.buffer.lane("made7", "speed") is not None
 
 
 def test_ever_new_keys_of_one_client_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
