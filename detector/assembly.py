@@ -36,10 +36,16 @@ class Inlets:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A rule that is not evaluated, and why."""
+    """A rule that is not evaluated as it is written, and why."""
 
     rule: EventRule
     problems: tuple[RuleProblem, ...]
+    kept: bool
+    """Whether its last good version goes on."""
+
+    def __str__(self) -> str:
+        what = "is refused, and goes on as it last was" if self.kept else "is refused"
+        return f"EventRule {self.rule.name} {what}: {'; '.join(map(str, self.problems))}"
 
 
 def inlets(detector: Detector) -> Inlets:
@@ -81,17 +87,43 @@ def inlets(detector: Detector) -> Inlets:
     return Inlets(decoders, read_key, fields)
 
 
-def compile_rules(
-    rules: Sequence[EventRule], detector: Detector, fields: Mapping[str, Fields]
-) -> tuple[list[CompiledRule], list[Refusal]]:
-    """The rules that can be evaluated, and those that cannot: one does not keep the others from running."""
-    compiled, refused = [], []
-    for rule in rules:
-        try:
-            compiled.append(compile_rule(rule, detector, fields))
-        except RuleError as error:
-            refused.append(Refusal(rule, error.problems))
-    return compiled, refused
+class RuleBook:
+    """Compiles rules, time and again. A rule that is refused goes on as it last was, and never harms the others.
+
+    So a slip of the pen in a rule that is being edited ends no episode.
+    """
+
+    def __init__(self) -> None:
+        self._good: dict[str, EventRule] = {}
+
+    def compile(
+        self, rules: Sequence[EventRule], detector: Detector, fields: Mapping[str, Fields]
+    ) -> tuple[list[CompiledRule], list[Refusal]]:
+        """The rules to evaluate, and those that are not evaluated as they are written."""
+        compiled: list[CompiledRule] = []
+        refused: list[Refusal] = []
+        good: dict[str, EventRule] = {}
+        for rule in rules:
+            try:
+                compiled.append(compile_rule(rule, detector, fields))
+                good[rule.name] = rule
+            except RuleError as error:
+                before = self._good.get(rule.name)
+                last = None if before is None else _compiled(before, detector, fields)
+                refused.append(Refusal(rule, error.problems, kept=last is not None))
+                if before is not None and last is not None:
+                    compiled.append(last)
+                    good[rule.name] = before
+        self._good = good
+        return compiled, refused
+
+
+def _compiled(rule: EventRule, detector: Detector, fields: Mapping[str, Fields]) -> CompiledRule | None:
+    """The rule, or None where the Detector no longer allows it."""
+    try:
+        return compile_rule(rule, detector, fields)
+    except RuleError:
+        return None
 
 
 def make_engine(detector: Detector, entries: Inlets, *, holder: str, start: int) -> Engine:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NoReturn, cast
 
 import typer
+from rich.console import Console
 
 from detector.actions.file_store import write_tasks_yaml
-from detector.assembly import DetectorError, Inlets, compile_rules, inlets
+from detector.assembly import DetectorError
+from detector.checking import check_documents, summary
 from detector.cluster.connection import NoClusterError
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import is_intake_file, read_intake
+from detector.replay.progress import Progress
 from detector.replay.recordings import open_recordings
 from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
 from detector.replay.routing import Router
@@ -23,8 +25,7 @@ from detector.rules.files import load_rules
 from detector.service import Files, Named, Options
 from detector.service import run as run_service
 from detector.streams.zenoh import NetworkError
-from wayside.api import Detector, EventRule
-from wayside.api.documents import Document, DocumentError, Problem, load_documents
+from wayside.api.documents import DocumentError, load_documents
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -99,14 +100,16 @@ def replay(
     rules: RuleFiles = None,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
-    outcome = _replayed(recordings, detector, rules)
+    with Progress(Console(stderr=True)) as progress:
+        outcome = _replayed(recordings, detector, rules, progress)
     output.mkdir(parents=True, exist_ok=True)
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
         file.writelines(event.to_json() + "\n" for event in outcome.events)
     write_tasks_yaml(output / "tasks.yaml", outcome.tasks.values())
     for refusal in outcome.refusals:
-        for problem in refusal.problems:
-            typer.echo(f"EventRule {refusal.rule.name} is refused: {problem}", err=True)
+        typer.echo(str(refusal), err=True)
+    for note in outcome.notes:
+        typer.echo(note, err=True)
     if outcome.cut:
         typer.echo("the intake file ends in the middle: its detector was killed", err=True)
     if outcome.lost:
@@ -136,49 +139,10 @@ def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folder
         typer.echo(str(problem), err=True)
     if problems:
         raise typer.Exit(1)
-    counted = ", ".join(
-        f"{sum(isinstance(document.object, kind) for document in documents)} {kind.__name__}s"
-        for kind in (Detector, EventRule)
-    )
-    typer.echo(f"{counted}: nothing wrong", err=True)
+    typer.echo(f"{summary(documents)}: nothing wrong", err=True)
 
 
-def check_documents(documents: Sequence[Document]) -> list[Problem]:
-    """Every problem of the Detectors, and of the rules against each Detector that selects them."""
-    problems: list[Problem] = []
-    detectors: list[tuple[Detector, Inlets]] = []
-    selected: set[str] = set()
-    for document in documents:
-        if isinstance(document.object, Detector):
-            try:
-                detectors.append((document.object, inlets(document.object)))
-            except DetectorError as error:
-                problems += [document.problem(each.path, each.message) for each in error.problems]
-    for document in documents:
-        rule = document.object
-        if not isinstance(rule, EventRule):
-            continue
-        for detector, entries in detectors:
-            if detector.spec.rules.matches(rule.metadata.labels):
-                selected.add(rule.name)
-                _, refused = compile_rules([rule], detector, entries.fields)
-                problems += [
-                    document.problem(each.path, each.message) for refusal in refused for each in refusal.problems
-                ]
-        if detectors and rule.name not in selected:
-            names = ", ".join(detector.name for detector, _ in detectors)
-            problems.append(
-                document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
-            )
-    rules = [document for document in documents if isinstance(document.object, EventRule)]
-    if rules and not any(isinstance(document.object, Detector) for document in documents):
-        problems.append(
-            rules[0].problem((), "a rule is checked against its Detector: give the Detector's file as well")
-        )
-    return list(dict.fromkeys(problems))
-
-
-def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] | None) -> Outcome:
+def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] | None, progress: Progress) -> Outcome:
     if recordings[0].exists() and is_intake_file(recordings[0]):
         if len(recordings) > 1:
             _refuse("an intake file is replayed alone: give one recording")
@@ -186,7 +150,7 @@ def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] |
             _refuse("give --detector as well: rules are compiled against their Detector")
         given = None if detector is None else load_rules(detector, rules or ()).rule_set
         return replay_intake(
-            read_intake(recordings[0]),
+            progress.watch(read_intake(recordings[0])),
             None if given is None else given.detector,
             given.rules if given is not None and rules else None,
         )
@@ -198,7 +162,7 @@ def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] |
     rule_set = loaded.rule_set
     router = Router(rule_set.detector.spec.streams)
     arrivals = router.arrivals(open_recordings(recordings, router.wanted))
-    outcome = replay_arrivals(arrivals, rule_set.detector, rule_set.rules)
+    outcome = replay_arrivals(progress.watch(arrivals), rule_set.detector, rule_set.rules)
     if not outcome.samples:
         keys = ", ".join(router.unrouted) or "none"
         typer.echo(f"no message belongs to a stream of the Detector; keys in the recording: {keys}", err=True)

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
-from detector.assembly import compile_rules, inlets
+from detector.assembly import RuleBook, inlets
 from detector.engine.demands import Demand, to_task
 from detector.engine.engine import Engine
 from detector.engine.events import Event
@@ -73,6 +73,7 @@ class Evaluator:
         self._now = now
         self._recorder = recorder
         self._on_failure = on_failure
+        self._rule_book = RuleBook()
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
         self._stopping = False
@@ -121,7 +122,7 @@ class Evaluator:
             while not stopping:
                 with self._wake:
                     if self._wanted is None and not self._stopping:
-                        self._wake.wait(self._pause())
+                        self._wake.wait(self.pause())
                     wanted, self._wanted = self._wanted, None
                     stopping = self._stopping
                 self._look(wanted)
@@ -130,8 +131,10 @@ class Evaluator:
         except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
             self._on_failure(error)
 
-    def _pause(self) -> float:
-        """Seconds until there is something to do."""
+    def pause(self) -> float:
+        """Seconds until there is something to do. With clock Data only the samples say when a tick is due."""
+        if not self._engine.on_wall_clock:
+            return _DRAIN_EVERY
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
 
     def _look(self, wanted: RuleSet | None) -> None:
@@ -181,10 +184,9 @@ class Evaluator:
 
     def _apply_rules(self, rule_set: RuleSet) -> list[Event]:
         entries = inlets(rule_set.detector)
-        compiled, refused = compile_rules(rule_set.rules, rule_set.detector, entries.fields)
+        compiled, refused = self._rule_book.compile(rule_set.rules, rule_set.detector, entries.fields)
         for refusal in refused:
-            for problem in refusal.problems:
-                _log.error("EventRule %s is refused: %s", refusal.rule.name, problem)
+            _log.error("%s", refusal)
         return self._engine.set_rules(compiled)
 
     def _hand_over(self, events: Sequence[Event]) -> None:

@@ -49,6 +49,6 @@ class EventLog:
                 self._file.write(line + "\n")
                 if self._lines.empty():
                     self._file.flush()
-            except OSError as error:
+            except (OSError, ValueError) as error:  # a disk that refuses, a text that has no UTF-8
                 self.dropped += 1
                 _log.error("an event is missing in %s: %s", self._path, error)

@@ -34,8 +34,10 @@ class Loss:
 class Losses:
     """Says what is new in the counters of an engine and its intake."""
 
-    def __init__(self, engine: Engine, intake: Intake, monotonic: Callable[[], float] = time.monotonic) -> None:
-        """`monotonic` gives seconds."""
+    def __init__(
+        self, engine: Engine, intake: Intake | None = None, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`intake`: None in a replay, which has none; `monotonic` gives seconds."""
         self._engine = engine
         self._intake = intake
         self._monotonic = monotonic
@@ -51,17 +53,31 @@ class Losses:
                 _log.warning("%s", _line(loss, loss.count - said))
 
     def sum_up(self) -> None:
-        """Log how many samples came, and all losses since the start."""
+        """Log how many samples came, all losses since the start, and how the evaluations went."""
         counters, buffer = self._engine.counters, self._engine.buffer
         _log.info("%d samples in, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
+        for line in self.report():
+            _log.warning("in all, %s", line)
+
+    def report(self) -> Iterator[str]:
+        """All losses since the start; and where values were unknown, since a misspelt field looks like that."""
         for loss in self.all():
             if loss.count:
-                _log.warning("in all, %s", _line(loss, loss.count))
+                yield _line(loss, loss.count)
+        for name, rule in self._engine.counters.rules.items():
+            if rule.unknowns:
+                often = "; ".join(f"{count} times {what}" for what, count in rule.absences.most_common(3))
+                yield (
+                    f"{rule.unknowns} unknown values in {rule.evaluations} evaluations of EventRule {name}"
+                    + (f": {often}" if often else ", samples not being there or stale")
+                )
 
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, also those that did not happen."""
         counters, timeline = self._engine.counters, self._engine.timeline
-        yield Loss("samples dropped, the intake being full: more come in than are evaluated", self._intake.dropped)
+        if self._intake is not None:
+            full = "samples dropped, the intake being full: more come in than are evaluated"
+            yield Loss(full, self._intake.dropped)
         yield Loss("samples pushed out of the buffer before their time: it is too small", self._engine.buffer.evicted)
         if isinstance(timeline, DataTimeline):
             yield Loss("samples dropped, their stamps being ahead of the rest", timeline.dropped_ahead, timeline.last)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from detector.actions.deploy import DemandReconciler
 from detector.engine.demands import Demand
 from detector.engine.events import Event
 from detector.event_log import EventLog
-from detector.streams.zenoh import Network, NetworkError, Put
-from wayside.api.detector import Stream, Zenoh
+from detector.streams.zenoh import Network, NetworkError
 
 _log = logging.getLogger(__name__)
 
@@ -38,11 +37,11 @@ class LiveOutlet:
                 "" if event.reason is None else f" ({event.reason})",
             )
 
-    def reconnect(self, config: Zenoh, streams: Iterable[Stream], putter: Callable[[str], Put]) -> None:
-        """The Detector changed: leave the network and join it anew. Where that fails, it is said."""
+    def move(self, network: Network) -> None:
+        """The Detector changed: leave the network, and join the other. Where that fails, it is said."""
         dropped = self.network.dropped_events
         self.network.close()
-        self.network = Network(config, streams, putter)
+        self.network = network
         self.network.dropped_events += dropped
         try:
             self.network.start()

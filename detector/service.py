@@ -205,8 +205,7 @@ class _Running:
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns())
         self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams)
         self._log = None if output is None else EventLog(output / "events.jsonl")
-        network = Network(detector.spec.zenoh, detector.spec.streams, self._intake.putter)
-        self._outlet = LiveOutlet(network, self._log, reconciler)
+        self._outlet = LiveOutlet(self._network(detector), self._log, reconciler)
         self._reconciler = reconciler
         self._evaluator = Evaluator(
             self._engine,
@@ -253,7 +252,11 @@ class _Running:
             self._evaluator.configure(self._rule_set)
             spec = detector.spec
             if spec.zenoh != before.zenoh or _keys(spec.streams) != _keys(before.streams):
-                await asyncio.to_thread(self._outlet.reconnect, spec.zenoh, spec.streams, self._intake.putter)
+                await asyncio.to_thread(self._outlet.move, self._network(detector))
+
+    def _network(self, detector: Detector) -> Network:
+        spec = detector.spec
+        return Network(spec.zenoh, spec.streams, self._intake.putter, on_failure=self._fail)
 
     def _good(self, wanted: Detector) -> Detector:
         """The changed Detector; the last one where it cannot run."""

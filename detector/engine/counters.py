@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 
 from wayside.expressions import Reason
 
+_MAXIMUM_REASONS = 16
+"""So many different reasons are kept for each rule: some name values, of which there is no end."""
+
 
 @dataclass(slots=True)
 class RuleCounters:
@@ -17,6 +20,8 @@ class RuleCounters:
     ended: int = 0
     unknowns: int = 0
     """Values that were not there when an expression needed them."""
+    absences: Counter[str] = field(default_factory=Counter)
+    """What was not there, by what the expressions said; a bounded number of them."""
     errors: int = 0
     """Expressions that failed on values that were there."""
     last_error: str = ""
@@ -31,6 +36,8 @@ class RuleCounters:
             self.last_error = message
         else:
             self.unknowns += 1
+            if message in self.absences or len(self.absences) < _MAXIMUM_REASONS:
+                self.absences[message] += 1
 
     def misplace(self, message: str) -> None:
         """Count a sample that should say where its client is, and does not."""

@@ -138,11 +138,6 @@ class RuleRun:
     def _in_progress(self) -> Iterator[Members]:
         return (members for members, state in self._states.items() if state.is_open or state.onset is not None)
 
-    @property
-    def open_episodes(self) -> int:
-        """How many episodes are open."""
-        return len(self._open)
-
     def _lost(self, now: int, clients: Clients) -> Iterator[Event]:
         for members in [m for m in self._states if any(member not in clients for member in m)]:
             state = self._states[members]

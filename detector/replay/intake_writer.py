@@ -60,7 +60,7 @@ class IntakeWriter:
         self._unmarked_since = 0
         self.lost = 0
         """Arrivals that the file does not hold, and so its replay does not see."""
-        self.error: OSError | None = None
+        self.error: Exception | None = None
         """Why writing ended early, if it did."""
         self._thread = threading.Thread(target=self._run, name="intake-writer", daemon=True)
         self._thread.start()
@@ -116,7 +116,7 @@ class IntakeWriter:
     def _run(self) -> None:
         try:
             self._write()
-        except OSError as error:
+        except Exception as error:  # noqa: BLE001  this thread's edge: whatever it is ends the recording, and is said
             log.error("%s: writing failed, the recording ends here: %s", self._path, error)
             with self._changed:
                 self.error = error

@@ -12,16 +12,21 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any
 
-from detector.assembly import Inlets, Refusal, compile_rules, inlets, make_engine
+from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
 from detector.engine.demands import Demand, from_task, to_task
 from detector.engine.engine import Engine
 from detector.engine.events import Event
 from detector.engine.sample import Arrival
+from detector.losses import Losses
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control
 from wayside.api import ApplicationTask, Detector, EventRule
+from wayside.times import format_time
 
 _BATCH = 4096
+
+PAUSE = 3600 * 1_000_000_000
+"""Nanoseconds: a longer pause in a recording is a gap; evaluating nothing for years helps nobody."""
 
 
 @dataclass(slots=True)
@@ -32,6 +37,8 @@ class Outcome:
     tasks: dict[str, ApplicationTask] = field(default_factory=dict)
     refusals: list[Refusal] = field(default_factory=list)
     samples: int = 0
+    notes: list[str] = field(default_factory=list)
+    """What a person should know: pauses, losses, and what was unknown or failed."""
     cut: bool = False
     """The intake file ends in the middle: its writer was killed."""
     lost: int = 0
@@ -52,6 +59,7 @@ class Replay:
         self.outcome = outcome
         self._entries: Inlets = inlets(detector)
         self._detector = detector
+        self._rule_book = RuleBook()
         self._engine: Engine = make_engine(detector, self._entries, holder=holder, start=start)
         self._demands: dict[str, Demand] = {}
         self._version: tuple[int, int] | None = None
@@ -75,7 +83,7 @@ class Replay:
 
     def set_rules(self, rules: Sequence[EventRule]) -> None:
         """Go on with these rules."""
-        compiled, refused = compile_rules(rules, self._detector, self._entries.fields)
+        compiled, refused = self._rule_book.compile(rules, self._detector, self._entries.fields)
         self.outcome.refusals += refused
         self._note(self._engine.set_rules(compiled))
 
@@ -85,6 +93,10 @@ class Replay:
             self._demands[demand.name] = demand
             self.outcome.tasks[demand.name] = to_task(demand)
         self._note(self._engine.restore(demands, time))
+
+    def report(self) -> Iterator[str]:
+        """What was lost, and how the evaluations went, a line each."""
+        return Losses(self._engine).report()
 
     def _tick_by_tick(self, arrivals: Sequence[Arrival], until: int) -> Iterator[tuple[Sequence[Arrival], int]]:
         """In steps so small that no episode starts and ends in one: its tasks would not be seen."""
@@ -139,7 +151,9 @@ def replay_intake(
         replay.take(batch, _until(record, batch))
         batch = []
         _control(replay, record, detector, rules, outcome)
-    if replay is None:
+    if replay is not None:
+        outcome.notes += replay.report()
+    else:
         raise RecordingError("the intake file holds nothing: its writer was killed before it began; record again")
     return outcome
 
@@ -204,6 +218,14 @@ def replay_arrivals(arrivals: Iterable[Arrival], detector: Detector, rules: Sequ
     for arrival in arrivals:
         if replay is None:
             replay = Replay(detector, rules, holder=detector.name, start=arrival.received - 1, outcome=outcome)
+        elif arrival.received - last > PAUSE:
+            replay.take(batch, last)
+            batch = []
+            replay.gap(arrival.received - 1)
+            outcome.notes.append(
+                f"the recording pauses after {format_time(last)} for {(arrival.received - last) / 1e9:.0f} s: "
+                "nothing is evaluated in between, windows begin anew, open episodes hold"
+            )
         batch.append(arrival)
         last = arrival.received
         if len(batch) >= _BATCH:
@@ -212,4 +234,5 @@ def replay_arrivals(arrivals: Iterable[Arrival], detector: Detector, rules: Sequ
     if replay is None:
         replay = Replay(detector, rules, holder=detector.name, start=0, outcome=outcome)
     replay.take(batch, last)
+    outcome.notes += replay.report()
     return outcome

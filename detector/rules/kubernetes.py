@@ -131,9 +131,9 @@ class _Known(Generic[Object]):
         try:
             parsed = parse_object(shape | read)
         except ValueError as error:
-            self.objects.pop(name, None)
             if self.unreadable.get(name) != str(error):
-                _log.warning("the %s %s cannot be read and is left out: %s", self._kind.__name__, name, error)
+                what = "goes on as it last was" if name in self.objects else "is left out"
+                _log.warning("the %s %s cannot be read and %s: %s", self._kind.__name__, name, what, error)
             self.unreadable[name] = str(error)
             return
         assert isinstance(parsed, self._kind)  # noqa: S101  the shape says so

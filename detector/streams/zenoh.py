@@ -35,12 +35,19 @@ class Network:
     """One session: subscribed to all streams, and the way out for events."""
 
     def __init__(
-        self, config: Zenoh, streams: Iterable[Stream], putter: Callable[[str], Put], *, capacity: int = 4096
+        self,
+        config: Zenoh,
+        streams: Iterable[Stream],
+        putter: Callable[[str], Put],
+        *,
+        capacity: int = 4096,
+        on_failure: Callable[[BaseException], None] = lambda error: None,
     ) -> None:
         """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
 
-        Raises KeyPatternError.
+        `on_failure` is told if the thread that publishes dies of an error. Raises KeyPatternError.
         """
+        self._on_failure = on_failure
         self._config = config
         self._subscriptions = [
             (zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression), _receiver(putter(stream.name)))
@@ -96,6 +103,13 @@ class Network:
         self._session = session
 
     def _run(self) -> None:
+        try:
+            self._serve()
+        except Exception as error:  # noqa: BLE001  this thread's edge: without it, events would wait for ever
+            log.critical("the network thread ended, no event is published any more: %s", error)
+            self._on_failure(error)
+
+    def _serve(self) -> None:
         if self._session is None:
             session = await_session(self._config, self._stop)
             if session is None:

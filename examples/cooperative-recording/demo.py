@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import queue
-import shutil
 import signal
 import subprocess
 import sys
@@ -34,6 +33,8 @@ from wayside.manifests import to_yaml
 HERE = Path(__file__).resolve().parent
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where detector.yaml listens."""
+WRITTEN = ("events.jsonl", "tasks.yaml", "manifests.yaml", "detector.log")
+"""What comes out, beside the folder tasks."""
 DURATION_S = 22.5
 """Of the drive: by then all have parted, and the demo is no longer than it must be."""
 LINGERING_S = 3.5
@@ -45,8 +46,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="demo.py", description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("out"), help="the folder for what comes out (%(default)s)")
     output: Path = parser.parse_args().output
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir(parents=True)
+    output.mkdir(parents=True, exist_ok=True)
+    for file in [*(output / name for name in WRITTEN), *(output / "tasks").glob("*.yaml")]:
+        file.unlink(missing_ok=True)
     console = Console(highlight=False, soft_wrap=True)
     console.print(
         "[bold]Fifteen vehicles drive; six carry a lidar. Two of those closer than 150 m: record the scene.[/]"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -42,8 +41,8 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=Path("out"), help="the folder for what comes out (%(default)s)")
     options = parser.parse_args()
     output: Path = options.output.resolve()
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir(parents=True)
+    output.mkdir(parents=True, exist_ok=True)
+    (output / "events.jsonl").unlink(missing_ok=True)  # the detector would append to it
     console = Console(highlight=False, soft_wrap=True)
     with ExitStack() as stack:
         kubeconfig = _current() if options.current else stack.enter_context(_own_control_plane(console))
@@ -56,6 +55,7 @@ def main() -> int:
         console.print(f"To look on from another terminal: export KUBECONFIG={kubeconfig}")
         console.print(f"                                  kubectl -n {NAMESPACE} get wayside,deployments")
         drive = subprocess.Popen([sys.executable, str(HERE / "drive.py"), "--wait", "60"], stdout=subprocess.DEVNULL)
+        stack.callback(drive.terminate)
         left = _tell(console, Api(kubeconfig, NAMESPACE), drive)
     console.print(f"See {output}: events.jsonl, detector.log, manager.log.")
     return 1 if left or drive.returncode else 0

@@ -48,9 +48,9 @@ class Foresight:
             del self.instances[name]
             yield Change("is removed", name, "")
             return
-        after = _instance(decision, before)
-        self.instances[name] = after
         template = next(each for each in self.templates if each.name == decision.template)
+        after = _instance(decision, before, template)
+        self.instances[name] = after
         self.ever[name] = Renderer(template, Policy()).render(after)
         lingering = decision.release_time is not None
         lingered = before is not None and before.status is not None and before.status.release_time is not None
@@ -84,7 +84,9 @@ class TaskFolder:
         return {task.name: task for _, task in self._read.values()}
 
 
-def _instance(decision: Decision, before: ApplicationInstance | None) -> ApplicationInstance:
+def _instance(
+    decision: Decision, before: ApplicationInstance | None, template: ApplicationTemplate
+) -> ApplicationInstance:
     parameters: dict[str, Any] = (
         decision.parameters if decision.parameters is not None else before.spec.parameters if before else {}
     )
@@ -92,7 +94,7 @@ def _instance(decision: Decision, before: ApplicationInstance | None) -> Applica
         metadata=Metadata(
             name=decision.name,
             labels={MANAGED_BY_LABEL: MANAGED_BY},
-            annotations=before.metadata.annotations if before else {LINGER_ANNOTATION: "2s"},
+            annotations={LINGER_ANNOTATION: str(template.spec.lifecycle.linger)},
         ),
         spec=ApplicationInstanceSpec(template=decision.template, key=decision.key, parameters=parameters),
         status=ApplicationInstanceStatus(

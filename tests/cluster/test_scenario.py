@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
 
 from tests.cluster.api import Api
@@ -189,9 +188,8 @@ def events_of(folder: Path) -> list[str]:
     return (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
 
 
-@pytest.mark.parametrize("speed", ["1"])
 def test_with_clock_data_a_recording_gives_the_same_events_played_live_and_replayed(
-    processes: Processes, tmp_path: Path, speed: str
+    processes: Processes, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
     detector_file = tmp_path / "detector.yaml"
@@ -206,7 +204,7 @@ def test_with_clock_data_a_recording_gives_the_same_events_played_live_and_repla
     live, replayed = tmp_path / "live", tmp_path / "replayed"
     detector = processes.start("detector", "run", *files, "--output", str(live))
     detector.wait_for_output("Detector town runs with 1 rules")
-    assert drive(endpoint, start_ns, "--speed", speed).wait(DURATION + 30) == 0
+    assert drive(endpoint, start_ns).wait(DURATION + 30) == 0
     expected = 2 * len(episodes(simulate(SEED, DURATION), DURATION))
     wait_until(lambda: len(events_of(live)), lambda count: count >= expected, timeout=10, what="all events are there")
     assert detector.terminate() == 0

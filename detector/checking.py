@@ -1,0 +1,62 @@
+"""What `detector check` finds: every problem of Detectors and rules, with file, line and column."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+from detector.assembly import DetectorError, Inlets, inlets
+from wayside.api import Detector, EventRule
+from wayside.api.documents import Document, Problem
+from wayside.rules import RuleError, compile_rule
+
+_CHECKED = (Detector, EventRule)
+
+
+def check_documents(documents: Sequence[Document]) -> list[Problem]:
+    """Every problem of the Detectors, and of the rules against each Detector that selects them."""
+    problems: list[Problem] = []
+    detectors: list[tuple[Detector, Inlets]] = []
+    for document in documents:
+        if isinstance(document.object, Detector):
+            try:
+                detectors.append((document.object, inlets(document.object)))
+            except DetectorError as error:
+                problems += [document.problem(each.path, each.message) for each in error.problems]
+    any_detector = any(isinstance(document.object, Detector) for document in documents)
+    rules = [document for document in documents if isinstance(document.object, EventRule)]
+    if rules and not any_detector:
+        problems.append(
+            rules[0].problem((), "a rule is checked against its Detector: give the Detector's file as well")
+        )
+    for document in rules:
+        problems += _rule_problems(document, detectors)
+    return list(dict.fromkeys(problems))
+
+
+def _rule_problems(document: Document, detectors: Sequence[tuple[Detector, Inlets]]) -> Iterator[Problem]:
+    rule = document.object
+    assert isinstance(rule, EventRule)  # noqa: S101  the caller picked it
+    selecting = [each for each in detectors if each[0].spec.rules.matches(rule.metadata.labels)]
+    if detectors and not selecting:
+        names = ", ".join(detector.name for detector, _ in detectors)
+        yield document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
+    for detector, entries in selecting:
+        try:
+            compile_rule(rule, detector, entries.fields)
+        except RuleError as error:
+            yield from (document.problem(each.path, each.message) for each in error.problems)
+
+
+def summary(documents: Sequence[Document]) -> str:
+    """How much was looked at, and what was not."""
+    counts = Counter(type(document.object).__name__ for document in documents)
+    looked = ", ".join(_counted(counts.pop(kind.__name__, 0), kind.__name__) for kind in _CHECKED)
+    if not counts:
+        return looked
+    others = ", ".join(_counted(count, kind) for kind, count in sorted(counts.items()))
+    return f"{looked} (not looked at: {others}; see `application-manager render`)"
+
+
+def _counted(count: int, kind: str) -> str:
+    return f"{count} {kind}{'' if count == 1 else 's'}"
