@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -257,7 +257,3 @@ class Detector(Kind):
     status: DetectorStatus | None = Field(
         default=None, description="What the application manager says of the detector."
     )
-
-    def known_labels(self) -> dict[str, dict[str, Any]]:
-        """Labels of the clients that are known beforehand, by client."""
-        return {client.name: dict(client.labels) for client in self.spec.clients}
