@@ -5,15 +5,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from application_manager.client import LEASES, ApiError, Client, Resource, Unreachable
-from application_manager.core.leases import lease_name
+from application_manager.core.leases import HolderKey, lease_name
 from application_manager.store import Name
 from application_manager.world import World
 
 LOOK_EVERY = 1.0  # s
+_AT_ONCE = 8  # Leases read at once: few, since what runs goes before
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,12 @@ class LeaseWatch:
     instance: Callable[[Name], None]
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Look until cancelled. Reading never holds up the look at the health, by which all Leases are judged."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._measure(), name="health")
+            group.create_task(self._read(), name="overdue leases")
+
+    async def _measure(self) -> None:
         was_reached = True
         while True:
             reached = await self._reached()
@@ -43,11 +49,12 @@ class LeaseWatch:
             if reached != was_reached:
                 log.warning("the API server answers again" if reached else "the API server does not answer")
                 was_reached = reached
-            if reached:
-                try:
-                    await self._read_due()
-                except (ApiError, Unreachable) as error:
-                    log.warning("leases: %s", error)
+            await asyncio.sleep(LOOK_EVERY)
+
+    async def _read(self) -> None:
+        while True:
+            if self.world.healthy.reached:
+                await self.read_due()
             await asyncio.sleep(LOOK_EVERY)
 
     async def _reached(self) -> bool:
@@ -59,13 +66,27 @@ class LeaseWatch:
             return error.code < 500
         return True
 
-    async def _read_due(self) -> None:
-        """Read the Leases that are unchanged for longer than they last; news of them also come by watching."""
+    async def read_due(self) -> None:
+        """Read the Leases that are unchanged for longer than they last; news of them also come by watching.
+
+        One that cannot be read is left as it was seen last, and does not concern the others.
+        """
         at = self.world.healthy.elapsed
-        for (namespace, holder), instances in self.world.claims.holders().items():
-            if not self.world.leases.due((namespace, holder), at):
-                continue
-            raw = await self.client.get(LEASES, namespace, lease_name(holder))
-            self.world.leases.observe((namespace, holder), raw, self.world.healthy.elapsed)
-            for instance in instances:
-                self.instance(instance)
+        gate = asyncio.Semaphore(_AT_ONCE)
+        due = [each for each in self.world.claims.holders().items() if self.world.leases.due(each[0], at)]
+        problems = [each for each in await asyncio.gather(*(self._look_at(*each, gate) for each in due)) if each]
+        if problems:
+            others = f", and {len(problems) - 1} more Leases cannot be read" if len(problems) > 1 else ""
+            log.warning("leases: %s%s", problems[0], others)
+
+    async def _look_at(self, key: HolderKey, instances: Iterable[Name], gate: asyncio.Semaphore) -> Exception | None:
+        """Read one Lease; what failed, if anything."""
+        async with gate:
+            try:
+                raw = await self.client.get(LEASES, key[0], lease_name(key[1]))
+            except (ApiError, Unreachable) as error:
+                return error
+        self.world.leases.observe(key, raw, self.world.healthy.elapsed)
+        for instance in instances:
+            self.instance(instance)
+        return None

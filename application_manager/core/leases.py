@@ -14,6 +14,8 @@ from typing import Any
 
 DEFAULT_DURATION = 15.0  # s, of a Lease that says none, and of a holder that has no Lease yet
 LEASE_PREFIX = "wayside-"
+RAREST_LOOK = 5.0  # s between two looks at a Lease that is long overdue; a renewal also comes by watching
+_RARER = 0.25  # of the time that a Lease is overdue: what a lapse may be noticed late by, in proportion
 
 HolderKey = tuple[str, str]
 """Namespace and holder."""
@@ -45,6 +47,11 @@ class HealthyTime:
         self._longest = longest
         self._last: float | None = None
         self.elapsed = 0.0
+
+    @property
+    def reached(self) -> bool:
+        """Whether the last look succeeded."""
+        return self._last is not None
 
     def look(self, now: float, *, succeeded: bool) -> None:
         """Note a look at the API server at `now`, in seconds of a monotonic clock."""
@@ -99,10 +106,14 @@ class LeaseBook:
     def due(self, key: HolderKey, at: float) -> bool:
         """Whether the Lease should be read: it is unchanged for longer than its duration, as far as we know.
 
-        A watch that broke unnoticed looks just like a holder that is lost, so only a look can tell.
+        A watch that broke unnoticed looks just like a holder that is lost, so only a look can tell. The longer a
+        Lease was seen to be overdue, the rarer the looks, so that many lost holders cost little.
         """
         known = self._observed.get(key)
-        return known is None or at - known.since >= known.duration
+        if known is None:
+            return True
+        overdue = known.looked - known.since - known.duration
+        return at - known.since >= known.duration and at - known.looked >= min(RAREST_LOOK, overdue * _RARER)
 
     def forget_except(self, keys: Iterable[HolderKey]) -> None:
         """Drop what concerns no holder of interest any more."""

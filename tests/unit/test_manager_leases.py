@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import itertools
 from typing import Any
 
-from application_manager.core.leases import DEFAULT_DURATION, HealthyTime, LeaseBook, LeaseView
+from kubernetes.aio.client import Configuration
+
+from application_manager.client import LEASES, ApiError, Client, Resource
+from application_manager.core.leases import (
+    DEFAULT_DURATION,
+    RAREST_LOOK,
+    HealthyTime,
+    LeaseBook,
+    LeaseView,
+    lease_name,
+)
+from application_manager.core.policy import Policy
+from application_manager.leasewatch import LeaseWatch
+from application_manager.store import Entry
+from application_manager.world import World
+from tests.unit.manager_objects import task, template
 
 KEY = ("site", "det")
 
@@ -32,6 +49,21 @@ def test_time_in_which_nobody_looked_says_nothing() -> None:
     assert book.view(KEY, 100.0).unchanged == 0.0
     assert not book.due(KEY, 2.9)
     assert book.due(KEY, 3.0)
+
+
+def test_the_longer_a_lease_is_overdue_the_rarer_it_is_looked_at() -> None:
+    book = LeaseBook()
+    book.observe(KEY, lease("a"), 0.0)
+    looks = []
+    for at in range(3, 200):
+        if book.due(KEY, float(at)):
+            book.observe(KEY, lease("a"), float(at))
+            looks.append(at)
+    pauses = [later - earlier for earlier, later in itertools.pairwise(looks)]
+    assert looks[0] == 3
+    assert pauses == sorted(pauses)
+    assert (pauses[0], pauses[-1]) == (1, RAREST_LOOK)
+    assert all(later - 3 <= (earlier - 3) * 1.25 + 1 for earlier, later in itertools.pairwise(looks))
 
 
 def test_seeing_the_same_again_is_no_renewal() -> None:
@@ -77,3 +109,30 @@ def test_a_time_in_which_we_stood_still_does_not_count() -> None:
     for now in (0.0, 60.0, 61.0):
         time.look(now, succeeded=True)
     assert time.elapsed == 1.0
+
+
+class _OneUnreadable(Client):
+    """An API server that answers for all Leases but one."""
+
+    async def get(self, resource: Resource, namespace: str, name: str) -> dict[str, Any] | None:
+        if name == lease_name("bad"):
+            raise ApiError(500, "cannot be decoded")
+        return lease(name)
+
+
+def test_a_lease_that_cannot_be_read_does_not_keep_the_others_from_being_read() -> None:
+    world = World(Policy())
+    holders = ("a", "bad", "c")
+    for holder in holders:
+        wanted = task(holder, of=holder, holder=holder)
+        world.claims.note(("site", holder), Entry(wanted.to_json(), wanted), template(holder))
+    asked: list[tuple[str, str]] = []
+
+    async def read() -> None:
+        client = _OneUnreadable(Configuration())
+        await LeaseWatch(world, client, LEASES, (), asked.append).read_due()
+        await client.close()
+
+    asyncio.run(read())
+    assert sorted(asked) == [("site", "a"), ("site", "c")]
+    assert [holder for holder in holders if world.leases.due(("site", holder), 0.0)] == ["bad"]
