@@ -27,6 +27,16 @@ WRONG: list[tuple[str, str, Changes, str]] = [
     ("EventRule", "a duration without unit", {"spec.for": "2"}, r"spec\.for: .*\(ms\|s\|m\|h\)"),
     ("EventRule", "a duration as number", {"spec.cooldown": 30}, r"spec\.cooldown: .*must be of type string"),
     ("EventRule", "evaluation too often", {"spec.evaluation.every": "5ms"}, r"every: give 10ms or more"),
+    *(
+        ("EventRule", f"evaluation every {zero}", {"spec.evaluation.every": zero}, r"every: give 10ms or more")
+        for zero in ("0ms", "0s", "0m", "0h")
+    ),
+    (
+        "EventRule",
+        "a window without length",
+        {"spec.signals.0.over": "0s"},
+        r"spec\.signals\[0\]\.over: .*should match",
+    ),
     ("EventRule", "an unknown field", {"spec.untl": "distance > 200"}, r'unknown field "spec\.untl"'),
     (
         "EventRule",
@@ -117,6 +127,11 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         r'spec\.streams\[0\]\.encoding: Unsupported value: "protobuf": supported values: "cdr", "json"',
     ),
     ("Detector", "a size without number", {"spec.buffer.bytes": "much"}, r"spec\.buffer\.bytes: .*should match"),
+    ("Detector", "a buffer without room", {"spec.buffer.bytes": "0Mi"}, r"spec\.buffer\.bytes: .*should match"),
+    ("Detector", "a buffer without time", {"spec.buffer.duration": "0s"}, r"spec\.buffer\.duration: .*should match"),
+    ("Detector", "a stream without time", {f"{STREAM}.buffer.duration": "0s"}, r"streams\[0\]\.buffer\.duration: "),
+    ("Detector", "a client lost at once", {"spec.clientTimeout": "0s"}, r"spec\.clientTimeout: .*should match"),
+    ("Detector", "data stale at once", {f"{STREAM}.staleAfter": "00s"}, r"spec\.streams\[0\]\.staleAfter: "),
     ("Detector", "a size as number", {"spec.buffer.bytes": 512}, r"spec\.buffer\.bytes: .*must be of type string"),
     ("Detector", "a client's name with a slash", {"spec.clients.0.name": "a/b"}, r"spec\.clients\[0\]\.name: "),
     (

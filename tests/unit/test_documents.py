@@ -61,6 +61,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         ("  when: a\n  whem: b", "f.yaml:6:9: spec.whem: there is no such field", ["check its spelling"]),
         ("  when: a\n  for: 2", "f.yaml:6:8: spec.for: must be a text, is 2", []),
         ("  when: a\n  for: 2 s", "f.yaml:6:8: spec.for: '2 s' is not a duration", ["such as 500ms, 10s"]),
+        ("  when: a\n  evaluation: {every: 0s}", "f.yaml:6:15: spec.evaluation: every: 0s", ["give 10ms or more"]),
         ("  when: a\n  enabled: maybe", "f.yaml:6:12: spec.enabled: must be true or false; given: 'maybe'", []),
         (
             "  when: a\n  classification: {incidence: [Rare, Never]}",
@@ -122,8 +123,20 @@ def test_a_problem_names_its_place_the_value_and_the_remedy(
             "f.yaml:6:65: spec.streams[0].staleAfter: must be a text, is 3",
         ),
         (
+            DETECTOR + "  streams:\n  - {name: s, key: 'a/${client:*}', encoding: json, staleAfter: 0s}",
+            "f.yaml:6:5: spec.streams[0]: staleAfter: '0s' is not a duration above zero: write a whole number",
+        ),
+        (
+            DETECTOR + "  clientTimeout: 0m\n  streams: [{name: s, key: a, client: c, encoding: json}]",
+            "f.yaml:5:18: spec.clientTimeout: '0m' is not a duration above zero: write a whole number and a unit",
+        ),
+        (
+            DETECTOR + "  buffer: {bytes: 0Mi}\n  streams: [{name: s, key: a, client: c, encoding: json}]",
+            "f.yaml:5:19: spec.buffer.bytes: '0Mi' is not a size above zero: write a whole number of bytes",
+        ),
+        (
             DETECTOR + "  buffer: {bytes: 5 MB}\n  streams: [{name: s, key: a, client: c, encoding: json}]",
-            "f.yaml:5:19: spec.buffer.bytes: '5 MB' is not a size: write a whole number of bytes",
+            "f.yaml:5:19: spec.buffer.bytes: '5 MB' is not a size above zero: write a whole number of bytes",
         ),
         (
             DETECTOR + "  zenoh: {connect: ['zenoh:7447']}\n  streams: [{name: s, key: a, client: c, encoding: json}]",

@@ -75,6 +75,13 @@ class Duration(_PatternString):
         return self.ns / 1e9
 
 
+class PositiveDuration(Duration):
+    """A length of time that is not zero."""
+
+    pattern = r"0*[1-9][0-9]{0,8}(ms|s|m|h)"
+    expectation = "a duration above zero: write a whole number and a unit, such as 500ms, 10s, 5m or 2h"
+
+
 class Quantity(_PatternString):
     """A size in Kubernetes notation, such as ``64Mi`` or ``1G``."""
 
@@ -98,6 +105,13 @@ class Quantity(_PatternString):
         digits = re.match("[0-9]+", self)
         assert digits is not None  # noqa: S101  the pattern guarantees it
         return int(digits[0]) * self._UNITS[self[digits.end() :]]
+
+
+class PositiveQuantity(Quantity):
+    """A size that is not zero."""
+
+    pattern = r"0*[1-9][0-9]{0,11}(k|M|G|T|Ki|Mi|Gi|Ti)?"
+    expectation = "a size above zero: write a whole number of bytes with or without a unit, such as 512Mi or 2G"
 
 
 Expression = Annotated[str, Field(min_length=1, max_length=2048)]

@@ -15,7 +15,8 @@ from wayside.api.base import (
     Kind,
     Model,
     ObjectName,
-    Quantity,
+    PositiveDuration,
+    PositiveQuantity,
     conditions_field,
     validations,
 )
@@ -69,8 +70,10 @@ class Encoding(StrEnum):
 class StreamBuffer(Model):
     """How much of a stream is kept, per client."""
 
-    duration: Duration | None = Field(default=None, description="Samples older than this are forgotten.")
-    bytes: Quantity | None = Field(default=None, description="The oldest samples beyond this size are forgotten.")
+    duration: PositiveDuration | None = Field(default=None, description="Samples older than this are forgotten.")
+    bytes: PositiveQuantity | None = Field(
+        default=None, description="The oldest samples beyond this size are forgotten."
+    )
 
 
 class Stream(Model):
@@ -113,7 +116,7 @@ class Stream(Model):
         default=None,
         description="Signals of the stream are unknown when its newest sample is older than this. "
         "Default: clientTimeout. Never: not at all, for latched topics.",
-        json_schema_extra={"type": "string", "pattern": "^([0-9]{1,9}(ms|s|m|h)|Never)$", "maxLength": 20},
+        json_schema_extra={"type": "string", "pattern": f"^({PositiveDuration.pattern}|Never)$", "maxLength": 20},
     )
     buffer: StreamBuffer = Field(
         default=StreamBuffer(), description="How much is kept; the Detector's buffer where absent."
@@ -131,7 +134,10 @@ class Stream(Model):
         if not captures and self.client is None:
             raise ValueError("key captures no client: write ${client:*} where its name stands, or give client")
         if self.stale_after is not None and self.stale_after != "Never":
-            Duration.parse(self.stale_after)
+            try:
+                PositiveDuration.parse(self.stale_after)
+            except ValueError as error:
+                raise ValueError(f"staleAfter: {error}; or Never") from None
         return self
 
     @property
@@ -148,9 +154,10 @@ class Stream(Model):
 class Buffer(Model):
     """How much is kept of all streams together, and of a stream that does not say."""
 
-    duration: Duration = Field(default=Duration("10s"), description="How long samples are kept.")
-    bytes: Quantity = Field(
-        default=Quantity("512Mi"), description="The cap over all streams: beyond it, the oldest samples are forgotten."
+    duration: PositiveDuration = Field(default=PositiveDuration("10s"), description="How long samples are kept.")
+    bytes: PositiveQuantity = Field(
+        default=PositiveQuantity("512Mi"),
+        description="The cap over all streams: beyond it, the oldest samples are forgotten.",
     )
 
 
@@ -190,8 +197,8 @@ class DetectorSpec(Model):
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     buffer: Buffer = Field(default=Buffer(), description="How much is kept.")
-    client_timeout: Duration = Field(
-        default=Duration("30s"),
+    client_timeout: PositiveDuration = Field(
+        default=PositiveDuration("30s"),
         description="A client from which nothing was received this long is lost: its episodes end, reason ClientLost. "
         "Counted from the detector's start at the earliest.",
     )

@@ -16,6 +16,7 @@ from wayside.api.base import (
     Kind,
     Model,
     ObjectName,
+    PositiveDuration,
     TemplateName,
     conditions_field,
     validations,
@@ -95,7 +96,7 @@ class Evaluation(Model):
     """When the rule is evaluated."""
 
     model_config = validations(
-        ("!self.every.endsWith('ms') || duration(self.every) >= duration('10ms')", "every: give 10ms or more"),
+        ("duration(self.every) >= duration('10ms')", "every: give 10ms or more"),
     )
 
     every: Duration = Field(
@@ -133,7 +134,7 @@ class Signal(Model):
     where: Expression | None = Field(
         default=None, description="CEL over msg, key and sample: only samples for which it is true count."
     )
-    over: Duration | None = Field(
+    over: PositiveDuration | None = Field(
         default=None, description="The window (t - over, t]. Needed by Min, Max, Mean and Count."
     )
     aggregate: Aggregate = Field(
