@@ -10,8 +10,8 @@ from detector.engine.engine import Engine, KeyReader
 from detector.engine.sample import Decoder
 from detector.streams.codecs import UnknownTypeError, codec_for
 from detector.streams.codecs.fields import message_fields
-from detector.streams.keys import KeyPattern, KeyPatternError
 from wayside.api import Detector, EventRule
+from wayside.keys import KeyPattern
 from wayside.rules import CompiledRule, Fields, RuleError, RuleProblem, compile_rule, stream_problems
 
 _CLIENT_NAME = re.compile(r"[A-Za-z0-9._:-]{1,63}")
@@ -55,26 +55,22 @@ def inlets(detector: Detector) -> Inlets:
         DetectorError: a key that is not in key-format notation, an unknown message type, or a bad expression.
     """
     decoders: dict[str, Decoder] = {}
-    patterns: dict[str, KeyPattern] = {}
     fields: dict[str, Fields] = {}
     problems: list[RuleProblem] = []
     for index, stream in enumerate(detector.spec.streams):
-        at = ("spec", "streams", index)
-        try:
-            patterns[stream.name] = KeyPattern.parse(stream.key)
-        except KeyPatternError as error:
-            problems.append(RuleProblem((*at, "key"), str(error)))
+        known: Fields | None = None
         try:
             decoders[stream.name] = codec_for(stream)
         except UnknownTypeError as error:
-            problems.append(RuleProblem((*at, "type"), str(error)))
-            continue
-        known = message_fields(stream)
+            problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
+        else:
+            known = message_fields(stream)
         if known is not None:
             fields[stream.name] = known
         problems += stream_problems(stream, index, known)
     if problems:
         raise DetectorError(problems)
+    patterns = {stream.name: KeyPattern.parse(stream.key) for stream in detector.spec.streams}
     clients = {stream.name: stream.client for stream in detector.spec.streams}
 
     def read_key(stream: str, key: str) -> tuple[str, Mapping[str, str]] | None:

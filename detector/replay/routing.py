@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from detector.engine.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.message import Message
-from detector.streams.keys import KeyPattern
 from wayside.api.detector import Encoding, Stream
+from wayside.keys import KeyPattern
 
 _SHOWN = 20
 

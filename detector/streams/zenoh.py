@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from detector.streams.keys import KeyPattern
 from wayside.api.detector import Stream, Zenoh, ZenohMode
+from wayside.keys import KeyPattern
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.streams.keys import KeyPattern, KeyPatternError
+from wayside.keys import KeyPattern, KeyPatternError
 
 
 def test_the_captured_client_is_read_from_the_key() -> None:

@@ -24,6 +24,7 @@ from wayside.expressions import (
     Path,
     compile_template,
 )
+from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.compiled import (
     ClientSubject,
     CompiledDeploy,
@@ -96,7 +97,11 @@ def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> 
 
 
 def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
-    """What is wrong with the expressions of a Detector's stream."""
+    """What is wrong with a Detector's stream: its key, and its expressions."""
+    try:
+        KeyPattern.parse(stream.key)
+    except KeyPatternError as error:
+        yield RuleProblem(("spec", "streams", index, "key"), str(error))
     if stream.stamp is None:
         return
     path: FieldPath = ("spec", "streams", index, "stamp")
