@@ -8,17 +8,20 @@ from dataclasses import dataclass
 
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core.policy import KindKey
-from application_manager.core.rulestatus import detector_status, rule_status
+from application_manager.core.rulestatus import detector_status, rule_status, unreadable_status
 from application_manager.core.status import difference
 from application_manager.recorder import Recorder
-from application_manager.store import Name
+from application_manager.store import Entry, Name
 from application_manager.world import DETECTOR, EVENT_RULE, World
 from wayside.api import Detector, EventRule
+from wayside.api.base import Kind, Metadata
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
 
 RuleKey = tuple[KindKey, Name]
 """An EventRule or a Detector."""
+
+Status = EventRuleStatus | DetectorStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,25 +48,34 @@ class RuleWork:
         entry = self.world.store.get(kind, name)
         if entry is None:
             return
-        judged, now = entry.model, time.time()
-        old: EventRuleStatus | DetectorStatus
-        new: EventRuleStatus | DetectorStatus
-        if isinstance(judged, EventRule):
-            old = judged.status or EventRuleStatus()
-            new = rule_status(judged, self.world.models(DETECTOR, Detector, name[0]), now)
-        elif isinstance(judged, Detector):
-            old = judged.status or DetectorStatus()
-            new = detector_status(judged, self.world.models(EVENT_RULE, EventRule, name[0]), now)
-        else:
-            return  # passed the API server and is no model: the detector says so in its log
-        patch = difference(old.to_json() if judged.status else {}, new.to_json())
+        now = time.time()
+        metadata = Metadata.model_validate(entry.raw["metadata"])
+        written = entry.raw.get("status")
+        old, new = self._judged(kind, name[0], entry, now)
+        patch = difference(old.to_json() if written else {}, new.to_json())
         if not patch:
             return
         try:
-            uid = judged.metadata.uid
-            self.observe(await self.client.patch_status(self.resources[kind], name[0], name[1], uid, patch))
+            self.observe(await self.client.patch_status(self.resources[kind], name[0], name[1], metadata.uid, patch))
         except ApiError as error:
             if error.terminating or error.code == 404:
                 return
             raise
-        self.recorder.transitions(judged, old.conditions, new.conditions, now)
+        about = Kind(kind=self.resources[kind].kind, metadata=metadata)
+        self.recorder.transitions(about, old.conditions, new.conditions, now)
+
+    def _judged(self, kind: KindKey, namespace: str, entry: Entry, now: float) -> tuple[Status, Status]:
+        """The status as it is and as it should be."""
+        written = entry.raw.get("status") or {}
+        generation = int(entry.raw["metadata"].get("generation", 0))
+        old: Status
+        if kind == EVENT_RULE:
+            old, judged = EventRuleStatus.model_validate(written), entry.model
+            if not isinstance(judged, EventRule):
+                return old, unreadable_status(old, "RuleInvalid", entry.problem, generation, now)
+            detectors = self.world.models(DETECTOR, Detector, namespace)
+            return old, rule_status(judged, detectors, now, self.world.invalid(DETECTOR, namespace))
+        old, judged = DetectorStatus.model_validate(written), entry.model
+        if not isinstance(judged, Detector):
+            return old, unreadable_status(old, "DetectorInvalid", entry.problem, generation, now)
+        return old, detector_status(judged, self.world.models(EVENT_RULE, EventRule, namespace), now)

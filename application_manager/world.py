@@ -99,6 +99,10 @@ class World:
             if name[0] == namespace and isinstance(entry.model, model)
         ]
 
+    def invalid(self, kind: KindKey, namespace: str) -> list[str]:
+        """The names of the objects of a kind in a namespace that `models` leaves out."""
+        return [name[1] for name, entry in self.store.all(kind) if name[0] == namespace and entry.model is None]
+
     def instances_of(self, template: Name) -> list[Name]:
         """The instances of a template."""
         return [

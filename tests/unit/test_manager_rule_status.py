@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
+import pytest
+from kubernetes.aio.client import Configuration
+
+from application_manager.client import Client, Resource
+from application_manager.core.policy import Policy
 from application_manager.core.rulestatus import detector_status, rule_status
+from application_manager.recorder import Recorder
+from application_manager.rulework import RuleWork
+from application_manager.world import World
 from tests.unit.manager_objects import NOW
-from wayside.api import Detector, EventRule
+from wayside.api import API_VERSION, Detector, EventRule
 
 
 def rule(**spec: Any) -> EventRule:
@@ -24,7 +33,7 @@ def rule(**spec: Any) -> EventRule:
 
 
 def detector(name: str = "det", stream: str = "pose", site: str = "a", **more: Any) -> Detector:
-    streams = [{"name": stream, "key": "v/${client:*}/pose", "encoding": "json", **more}]
+    streams = [{"name": stream, "key": "v/${client:*}/pose", "encoding": "json"} | more]
     return Detector.model_validate(
         {
             "kind": "Detector",
@@ -65,6 +74,63 @@ def test_a_detector_counts_its_rules_and_is_told_what_is_wrong_with_its_streams(
     (condition,) = detector_status(detector(stamp="msg.t +"), [rule()], NOW).conditions
     assert (condition.status, condition.reason) == ("False", "DetectorInvalid")
     assert "spec.streams[0].stamp" in condition.message
+
+
+def test_a_key_that_is_none_is_told_with_its_place() -> None:
+    (condition,) = detector_status(detector(key="/v/${client:*}/pose"), [], NOW).conditions
+    assert (condition.status, condition.reason) == ("False", "DetectorInvalid")
+    assert "spec.streams[0].key: key '/v/${client:*}/pose', column 1: a chunk is empty" in condition.message
+
+
+def test_what_is_accepted_is_so_only_as_far_as_can_be_told_here() -> None:
+    for status in (rule_status(rule(), [detector()], NOW), detector_status(detector(), [], NOW)):
+        assert "as far as can be told without the message types" in status.conditions[0].message
+
+
+def test_a_rule_that_nobody_selects_is_told_of_detectors_that_are_none() -> None:
+    (condition,) = rule_status(rule(), [], NOW, ["det"]).conditions
+    assert (condition.status, condition.reason) == ("False", "NotSelected")
+    assert "correct Detector det, whose status says what is wrong" in condition.message
+
+
+@pytest.mark.parametrize(("kind", "reason"), [("EventRule", "RuleInvalid"), ("Detector", "DetectorInvalid")])
+def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: str, reason: str) -> None:
+    world = World(Policy())
+    written: list[dict[str, Any]] = []
+
+    def observe(seen: dict[str, Any]) -> None:
+        world.store.put(seen)
+
+    raw: dict[str, Any] = {
+        "apiVersion": API_VERSION,
+        "kind": kind,
+        "metadata": {"name": "odd", "namespace": "site", "uid": "u", "resourceVersion": "1", "generation": 2},
+        "spec": {"odd": True},
+    }
+    assert world.store.put(raw) is not None
+
+    class Accepting(Client):
+        """An API server that takes every status."""
+
+        async def patch_status(
+            self, resource: Resource, namespace: str, name: str, uid: str, status: dict[str, Any]
+        ) -> dict[str, Any]:
+            written.append(status)
+            return {**raw, "metadata": {**raw["metadata"], "resourceVersion": str(len(written) + 1)}, "status": status}
+
+    async def reconcile_twice() -> None:
+        client = Accepting(Configuration())
+        resources = {(API_VERSION, kind): Resource(API_VERSION, kind, f"{kind.lower()}s")}
+        work = RuleWork(world, client, Recorder(client), resources, observe)
+        await work.reconcile(((API_VERSION, kind), ("site", "odd")))
+        await work.reconcile(((API_VERSION, kind), ("site", "odd")))
+        await client.close()
+
+    asyncio.run(reconcile_twice())
+    (status,) = written
+    (condition,) = status["conditions"]
+    assert (condition["status"], condition["reason"], condition["observedGeneration"]) == ("False", reason, 2)
+    assert "spec.odd: there is no such field" in condition["message"]
 
 
 def test_the_same_state_gives_the_same_status() -> None:
