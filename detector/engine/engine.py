@@ -97,7 +97,7 @@ class Engine:
         self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after, self._floor)
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
-        """Take in what arrived, in order, none after `until`, and run the ticks up to there."""
+        """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later."""
         return self._run(self._timeline.steps(arrivals, until))
 
     def gap(self, time: int) -> list[Event]:

@@ -32,7 +32,7 @@ class Moment:
 
 
 def worth(truth: Truth) -> float:
-    return 0.5 if truth is UNKNOWN else float(truth)
+    return float(truth) if isinstance(truth, bool) else 0.5
 
 
 def run(history: list[Moment], timing: Timing) -> list[Happening]:
@@ -166,7 +166,7 @@ SEEN = Observation(in_scope=True, near=True, when=True, until=False)
 
 
 def seen(**fields: Truth) -> Observation:
-    return replace(SEEN, **fields)  # type: ignore[arg-type]
+    return replace(SEEN, **fields)
 
 
 def happened(timing: Timing, *observations: Observation) -> list[Happening]:
