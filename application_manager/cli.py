@@ -13,7 +13,8 @@ from typing import Annotated
 
 import typer
 
-from application_manager.client import ApiError, ConfigurationError
+from application_manager.client import ApiError
+from application_manager.connection import ConfigurationError
 from application_manager.core.policy import Policy
 from application_manager.offline import render_files
 from application_manager.service import Options, serve

@@ -5,7 +5,6 @@ The generated model classes are left aside: they cost more time than the request
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -14,7 +13,6 @@ from urllib.parse import urlencode
 import aiohttp
 import msgspec
 from kubernetes.aio.client import ApiClient, Configuration
-from kubernetes.aio.config import ConfigException, load_incluster_config, load_kube_config
 
 from application_manager.core.policy import KindKey
 
@@ -25,19 +23,12 @@ FIELD_MANAGER = "wayside"
 _APPLY = "application/apply-patch+yaml"
 _MERGE = "application/merge-patch+json"
 _JSON = "application/json"
-# The package says that it is typed, yet these functions are not.
-_load_kube_config: Any = load_kube_config
-_load_incluster_config: Any = load_incluster_config
 _TIMEOUT = aiohttp.ClientTimeout(total=15)
 _BAD_MANIFEST = "failed to create typed patch object"
 
 
 class Unreachable(Exception):  # noqa: N818  a state of the world
     """The API server gave no answer."""
-
-
-class ConfigurationError(Exception):
-    """There is no usable kubeconfig, or the cluster lacks what the manager needs."""
 
 
 class ApiError(Exception):
@@ -99,26 +90,6 @@ class Resource:
 
 LEASES = Resource("coordination.k8s.io/v1", "Lease", "leases")
 EVENTS = Resource("events.k8s.io/v1", "Event", "events")
-
-
-async def load_configuration() -> Configuration:
-    """The kubeconfig (KUBECONFIG or the default file), or in a pod its service account.
-
-    Raises ConfigurationError where there is neither.
-    """
-    configuration = Configuration()
-    configuration.connection_pool_maxsize = 32
-    try:
-        # Given here, since the library reads the variable when it is imported.
-        await _load_kube_config(config_file=os.environ.get("KUBECONFIG"), client_configuration=configuration)
-    except ConfigException as no_file:
-        try:
-            _load_incluster_config(client_configuration=configuration)
-        except ConfigException:
-            raise ConfigurationError(
-                f"no cluster: {no_file}; set KUBECONFIG to a kubeconfig file, or run in a pod"
-            ) from None
-    return configuration
 
 
 class Client:

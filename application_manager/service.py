@@ -17,8 +17,8 @@ from functools import partial
 import kopf
 
 from application_manager.apply import Applier
-from application_manager.client import Client, ConfigurationError, Resource
-from application_manager.client import load_configuration as load
+from application_manager.client import Client, Resource
+from application_manager.connection import ConfigurationError, load_configuration
 from application_manager.core.policy import KindKey, Policy, kind_text
 from application_manager.instances import InstanceWork
 from application_manager.instancestatus import InstanceStatusWork
@@ -66,7 +66,7 @@ async def serve(options: Options) -> None:
         ConfigurationError: there is no cluster, or it lacks our CRDs.
         ApiError: the API server refuses what the manager needs, such as listing.
     """
-    client = Client(await load())
+    client = Client(await load_configuration())
     try:
         await Manager(client, options, await _discovered(client, options.policy)).run()
     finally:

@@ -27,7 +27,8 @@ from typing import Any
 
 import aiohttp
 
-from application_manager.client import Client, Resource, load_configuration
+from application_manager.client import Client, Resource
+from application_manager.connection import load_configuration
 from application_manager.core.claims import instance_name
 from application_manager.core.policy import Policy
 from application_manager.core.rendering import Renderer, owned

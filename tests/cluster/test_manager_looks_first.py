@@ -11,7 +11,8 @@ from collections.abc import Callable
 import pytest
 
 from application_manager.apply import Applier
-from application_manager.client import Client, Object, Resource, load_configuration
+from application_manager.client import Client, Object, Resource
+from application_manager.connection import load_configuration
 from application_manager.core.claims import instance_name
 from application_manager.core.demand import Decision
 from application_manager.core.policy import Policy
