@@ -1,6 +1,6 @@
 """The command line: `application-manager run` and `application-manager render`.
 
-Errors are one clear line on stderr, with exit code 2 for bad usage or input; `--debug` shows the trace.
+That the API server refuses us at the start is bad input as well: the account and its rights are given to us.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Annotated
 
 import typer
 
-from application_manager.client import ApiError
 from application_manager.connection import ConfigurationError
 from application_manager.core.policy import Policy
 from application_manager.offline import render_files
 from application_manager.service import Options, serve
+from wayside import commandline
 from wayside.api.base import Duration
 from wayside.api.documents import DocumentError
 
@@ -28,7 +28,9 @@ app = typer.Typer(
     help="Makes a cluster run what the live ApplicationTasks demand.",
 )
 
-BAD_INPUT = 2
+EXPECTED = (DocumentError, ConfigurationError)
+"""Errors of the input: said in one line, without a trace."""
+
 RESYNC = Duration("60s")
 TTL_AFTER_FINISHED = Duration("1h")
 
@@ -40,7 +42,22 @@ ServiceAccounts = Annotated[
     list[str] | None,
     typer.Option(help="A service account that templates may use; repeatable. Default: only `default`, without token."),
 ]
-Debug = Annotated[bool, typer.Option("--debug", help="Show traces of errors, and more in the log.")]
+
+
+@app.callback()
+def _main(
+    debug: Annotated[bool, typer.Option(commandline.DEBUG, help="Show the trace of an error, and log more.")] = False,
+) -> None:
+    logging.basicConfig(
+        level=logging.DEBUG if debug else logging.INFO,
+        format="%(asctime)s %(levelname)-7s %(message)s",
+        stream=sys.stderr,
+    )
+    for noisy in ("asyncio", "aiohttp", "kopf"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    if not debug:  # each watch tells of each attempt to come back; that the API server is away is said once, by us
+        for handler in logging.getLogger().handlers:
+            handler.addFilter(lambda record: not record.getMessage().startswith("Request attempt"))
 
 
 def _duration(text: str) -> Duration:
@@ -70,28 +87,15 @@ def run(
     ] = TTL_AFTER_FINISHED,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
-    debug: Debug = False,
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
-    level = logging.DEBUG if debug else logging.INFO
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s", stream=sys.stderr)
-    for noisy in ("asyncio", "aiohttp", "kopf"):
-        logging.getLogger(noisy).setLevel(logging.WARNING)
-    if not debug:  # each watch tells of each attempt to come back; that the API server is away is said once, by us
-        for handler in logging.getLogger().handlers:
-            handler.addFilter(lambda record: not record.getMessage().startswith("Request attempt"))
     options = Options(
         policy=_policy(allowed_kinds, service_accounts),
         namespaces=tuple(namespace or ()),
         resync=resync.seconds,
         ttl_after_finished=ttl_after_finished.seconds,
     )
-    try:
-        asyncio.run(serve(options))
-    except ConfigurationError as error:
-        _fail(str(error), BAD_INPUT, error, debug=debug)
-    except ApiError as error:
-        _fail(f"the API server refuses: {error}", 1, error, debug=debug)
+    asyncio.run(serve(options))
 
 
 @app.command()
@@ -100,17 +104,13 @@ def render(
     tasks: Annotated[list[Path], typer.Option(help="A file or folder of ApplicationTasks; repeatable.")],
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
-    debug: Debug = False,
 ) -> None:
     """Print what would run, as YAML: merged instances and their manifests, without a cluster.
 
     What is refused is said on stderr; then the exit code is 1.
     """
     policy = _policy(allowed_kinds, service_accounts)
-    try:
-        result = render_files([*templates, *tasks], policy)
-    except DocumentError as error:
-        _fail(str(error), BAD_INPUT, error, debug=debug)
+    result = render_files([*templates, *tasks], policy)
     sys.stdout.write(result.text)
     for refusal in result.refusals:
         typer.echo(refusal, err=True)
@@ -118,16 +118,9 @@ def render(
         raise typer.Exit(1)
 
 
-def _fail(message: str, code: int, error: Exception, *, debug: bool) -> None:
-    if debug:
-        raise error
-    typer.echo(message, err=True)
-    raise typer.Exit(code) from None
-
-
 def main() -> None:
-    """Run the command line."""
-    app()
+    """The console script."""
+    sys.exit(commandline.run(app, "application-manager", EXPECTED, sys.argv[1:]))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from functools import partial
 import kopf
 
 from application_manager.apply import Applier
-from application_manager.client import Client, Resource
+from application_manager.client import ApiError, Client, Resource
 from application_manager.connection import ConfigurationError, load_configuration
 from application_manager.core.policy import KindKey, Policy, kind_text
 from application_manager.instances import InstanceWork
@@ -63,12 +63,15 @@ async def serve(options: Options) -> None:
     """Run the manager until SIGTERM or SIGINT.
 
     Raises:
-        ConfigurationError: there is no cluster, or it lacks our CRDs.
-        ApiError: the API server refuses what the manager needs, such as listing.
+        ConfigurationError: there is no cluster, it lacks our CRDs, or refuses what the manager needs, such as listing.
     """
     client = Client(await load_configuration())
     try:
         await Manager(client, options, await _discovered(client, options.policy)).run()
+    except ApiError as error:
+        raise ConfigurationError(
+            f"the API server refuses what the manager needs: {error}; check the account and its rights"
+        ) from error
     finally:
         await client.close()
 

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn, cast
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -25,7 +25,9 @@ from detector.rules.files import load_rules
 from detector.service import Files, Named, Options
 from detector.service import run as run_service
 from detector.streams.zenoh import NetworkError
+from wayside import commandline
 from wayside.api.documents import DocumentError, load_documents
+from wayside.commandline import refuse
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -37,9 +39,6 @@ app = typer.Typer(
 _EXPECTED = (DocumentError, DetectorError, RecordingError, NetworkError, NoClusterError, OSError)
 """Errors of the input: said in one line, without a trace."""
 
-_UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
-"""The base of all that is said of a wrong command line, which typer does not export."""
-
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
 RuleFiles = Annotated[
     list[Path] | None, typer.Option("--rules", help="YAML files or folders with EventRules; may be repeated.")
@@ -48,7 +47,7 @@ RuleFiles = Annotated[
 
 @app.callback()
 def _main(
-    debug: Annotated[bool, typer.Option("--debug", help="Show the trace of an error, and log more.")] = False,
+    debug: Annotated[bool, typer.Option(commandline.DEBUG, help="Show the trace of an error, and log more.")] = False,
 ) -> None:
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.INFO,
@@ -79,15 +78,15 @@ def run(
 ) -> None:
     """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
     if (name is None) == (detector is None):
-        _refuse("give either --detector FILE and --rules FILE, or --name NAME")
+        refuse("give either --detector FILE and --rules FILE, or --name NAME")
     if name is not None:
         if rules:
-            _refuse("--rules goes with --detector; with --name the rules are read from the API server")
+            refuse("--rules goes with --detector; with --name the rules are read from the API server")
         options = Options(Named(name, namespace, output), record_intake)
     else:
         assert detector is not None  # noqa: S101  one of both is given
         if namespace is not None:
-            _refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
+            refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
         options = Options(Files(detector, tuple(rules or ()), output or Path("out")), record_intake)
     asyncio.run(run_service(options))
 
@@ -145,9 +144,9 @@ def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folder
 def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] | None, progress: Progress) -> Outcome:
     if recordings[0].exists() and is_intake_file(recordings[0]):
         if len(recordings) > 1:
-            _refuse("an intake file is replayed alone: give one recording")
+            refuse("an intake file is replayed alone: give one recording")
         if detector is None and rules:
-            _refuse("give --detector as well: rules are compiled against their Detector")
+            refuse("give --detector as well: rules are compiled against their Detector")
         given = None if detector is None else load_rules(detector, rules or ()).rule_set
         return replay_intake(
             progress.watch(read_intake(recordings[0])),
@@ -155,7 +154,7 @@ def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] |
             given.rules if given is not None and rules else None,
         )
     if detector is None:
-        _refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
+        refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
     loaded = load_rules(detector, rules or ())
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
@@ -169,43 +168,9 @@ def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] |
     return outcome
 
 
-def _refuse(message: str) -> NoReturn:
-    raise typer.BadParameter(message)
-
-
 def main() -> None:
-    """The console script: bad usage and errors of the input are one clear line each and exit code 2."""
-    debug = "--debug" in sys.argv
-    try:
-        sys.exit(app(standalone_mode=False))
-    except* _UsageError as group:
-        for error in _leaves(group):
-            _tell_usage(error)
-        sys.exit(2)
-    except* typer.Abort:
-        sys.exit(130)
-    except* _EXPECTED as group:
-        if debug:
-            raise
-        for error in _leaves(group):
-            typer.echo(f"detector: {error}", err=True)
-        sys.exit(2)
-
-
-def _tell_usage(error: BaseException) -> None:
-    """One line, and where to read more; nothing where the help itself is the answer, which then stands there."""
-    if isinstance(error, _UsageError) and (message := error.format_message()):
-        command = error.ctx.command_path if error.ctx is not None else "detector"
-        typer.echo(f"detector: {message.rstrip('.')}; see {command} --help", err=True)
-
-
-def _leaves(group: BaseExceptionGroup[BaseException]) -> list[BaseException]:
-    """The errors of a group, however nested."""
-    return [
-        leaf
-        for error in group.exceptions
-        for leaf in (_leaves(error) if isinstance(error, BaseExceptionGroup) else [error])
-    ]
+    """The console script."""
+    sys.exit(commandline.run(app, "detector", _EXPECTED, sys.argv[1:]))
 
 
 if __name__ == "__main__":

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from typer.testing import CliRunner, Result
 
-from application_manager.cli import app
+from application_manager.cli import EXPECTED, app
 from tests.unit.manager_objects import DEPLOYMENT
+from wayside import commandline
 
 TEMPLATE: dict[str, Any] = {
     "apiVersion": "wayside.dev/v1alpha1",
@@ -29,15 +31,31 @@ def task(name: str, **spec: Any) -> dict[str, Any]:
     return {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask", "metadata": {"name": name}, "spec": spec}
 
 
+@dataclass(frozen=True)
+class Result:
+    exit_code: int
+    stdout: str
+    stderr: str
+
+
 @pytest.fixture
-def render(tmp_path: Path) -> Any:
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Result]:
+    def command(*arguments: str) -> Result:
+        code = commandline.run(app, "application-manager", EXPECTED, arguments)
+        return Result(code, *capsys.readouterr())
+
+    return command
+
+
+@pytest.fixture
+def render(tmp_path: Path, command: Callable[..., Result]) -> Any:
     def render(template: dict[str, Any], *tasks: dict[str, Any], options: tuple[str, ...] = ()) -> Result:
         (tmp_path / "template.yaml").write_text(yaml.safe_dump(template))
         folder = tmp_path / "tasks"
         folder.mkdir()
         (folder / "tasks.yaml").write_text(yaml.safe_dump_all(tasks))
         files = ["--templates", str(tmp_path / "template.yaml"), "--tasks", str(folder)]
-        return CliRunner().invoke(app, ["render", *files, *options])
+        return command("render", *files, *options)
 
     return render
 
@@ -45,7 +63,7 @@ def render(tmp_path: Path) -> Any:
 def test_merged_instances_and_their_manifests_are_printed(render: Any) -> None:
     pairs = [task(n, parameters={"region": "n", "sources": s}) for n, s in (("a", ["x"]), ("b", ["y", "x"]))]
     result = render(TEMPLATE, *pairs)
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 0, result.stderr
     instance, deployment = yaml.safe_load_all(result.stdout)
     assert instance["kind"] == "ApplicationInstance"
     assert instance["spec"] == {"template": "fusion", "key": "n", "parameters": {"region": "n", "sources": ["x", "y"]}}
@@ -80,22 +98,29 @@ def test_a_kind_that_is_not_allowed_is_refused(render: Any) -> None:
     assert "allowed are v1/ConfigMap" in result.stderr
 
 
-def test_bad_files_and_bad_options_are_one_clear_line_and_exit_code_2(render: Any, tmp_path: Path) -> None:
+def test_bad_files_and_bad_options_are_one_clear_line_and_exit_code_2(
+    render: Any, command: Callable[..., Result], tmp_path: Path
+) -> None:
     wrong = render({**TEMPLATE, "spec": {"manifests": "x"}})
     assert wrong.exit_code == 2
     assert f"{tmp_path / 'template.yaml'}:" in wrong.stderr
     assert "spec.manifests" in wrong.stderr
-    missing = CliRunner().invoke(app, ["render", "--templates", "nowhere.yaml", "--tasks", "nowhere.yaml"])
+    missing = command("render", "--templates", "nowhere.yaml", "--tasks", "nowhere.yaml")
     assert missing.exit_code == 2
     assert "nowhere.yaml: there is no such file" in missing.stderr
-    option = CliRunner().invoke(app, ["run", "--resync", "soon"])
+    option = command("run", "--resync", "soon")
     assert option.exit_code == 2
-    assert "'soon' is not a duration" in option.stderr.replace("\n", " ")
+    assert "'soon' is not a duration" in option.stderr
+    assert option.stderr.startswith("application-manager: ")
+    assert option.stderr.endswith("see application-manager run --help\n")
+    assert option.stderr.count("\n") == 1
 
 
-def test_without_a_cluster_run_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_a_cluster_run_says_so(
+    monkeypatch: pytest.MonkeyPatch, command: Callable[..., Result], tmp_path: Path
+) -> None:
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
-    result = CliRunner().invoke(app, ["run"])
+    result = command("run")
     assert result.exit_code == 2
     assert "set KUBECONFIG" in result.stderr

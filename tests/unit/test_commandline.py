@@ -1,0 +1,62 @@
+"""Both programs tell what is wrong in one line, and take `--debug` before or after the command."""
+
+from __future__ import annotations
+
+import pytest
+import typer
+
+import application_manager.cli
+import detector.cli
+from wayside import commandline
+
+APPS = [
+    pytest.param(application_manager.cli.app, ["render", "--tasks", "x"], "--templates", id="application-manager"),
+    pytest.param(detector.cli.app, ["replay", "x"], "--output", id="detector"),
+]
+
+
+@pytest.mark.parametrize(("app", "incomplete", "lacks"), APPS)
+def test_bad_usage_is_one_line_that_names_program_and_help(
+    app: typer.Typer, incomplete: list[str], lacks: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in (incomplete, [*incomplete, "--debug"], ["--debug", *incomplete]):
+        assert commandline.run(app, "program", (), arguments) == 2
+        told = capsys.readouterr().err
+        assert told.startswith("program: ")
+        assert lacks in told
+        assert told.endswith(f"see program {incomplete[0]} --help\n")
+        assert told.count("\n") == 1
+
+
+def failing(error: Exception) -> typer.Typer:
+    app = typer.Typer(pretty_exceptions_enable=False)
+
+    @app.callback()
+    def main(debug: bool = False) -> None: ...
+
+    @app.command()
+    def run() -> None:
+        raise error
+
+    return app
+
+
+def told(error: Exception, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert commandline.run(failing(error), "program", (ValueError,), ["run", *arguments]) == 2
+    return capsys.readouterr().err
+
+
+def test_an_expected_error_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(ValueError("no cluster"), capsys) == "program: no cluster\n"
+
+
+def test_errors_of_tasks_side_by_side_are_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    group = ExceptionGroup("tasks", [ValueError("a"), ExceptionGroup("more", [ValueError("b")])])
+    assert told(group, capsys) == "program: a\nprogram: b\n"
+
+
+def test_with_debug_and_for_defects_the_trace_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="no cluster"):
+        told(ValueError("no cluster"), capsys, "--debug")
+    with pytest.raises(KeyError):
+        told(KeyError("a defect"), capsys)

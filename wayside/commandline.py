@@ -1,0 +1,63 @@
+"""What all our commands have in common: one clear line for what is wrong, and `--debug` for the trace.
+
+Bad usage and bad input end with exit code 2; `--debug` may stand before or after the command.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import NoReturn, cast
+
+import typer
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+DEBUG = "--debug"
+
+_UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
+"""The base of all that is said of a wrong command line, which typer does not export."""
+
+
+def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], arguments: Sequence[str]) -> int:
+    """Run the command line and tell what is wrong; the exit code.
+
+    Args:
+        app: the commands; its callback takes `--debug`.
+        program: its name.
+        expected: errors of the input, which say all by themselves; any other error keeps its trace.
+        arguments: without the program's name.
+    """
+    debug = DEBUG in arguments
+    arguments = [*([DEBUG] if debug else []), *(each for each in arguments if each != DEBUG)]
+    try:
+        return app(arguments, prog_name=program, standalone_mode=False) or 0
+    except typer.Abort:
+        return INTERRUPTED
+    except Exception as error:
+        causes = _leaves(error)
+        if not all(isinstance(each, (_UsageError, *(() if debug else expected))) for each in causes):
+            raise
+        for each in causes:
+            _tell(program, each)
+        return BAD_INPUT
+
+
+def refuse(message: str) -> NoReturn:
+    """Refuse the command line, for what the parser cannot see."""
+    raise typer.BadParameter(message)
+
+
+def _tell(program: str, error: BaseException) -> None:
+    if not isinstance(error, _UsageError):
+        print(f"{program}: {error}", file=sys.stderr)  # noqa: T201  the one place
+    elif message := error.format_message():  # else the help is the answer, and is printed already
+        command = error.ctx.command_path if error.ctx is not None else program
+        print(f"{program}: {' '.join(message.split()).rstrip('.')}; see {command} --help", file=sys.stderr)  # noqa: T201
+
+
+def _leaves(error: BaseException) -> list[BaseException]:
+    """The errors of a group, however nested."""
+    if not isinstance(error, BaseExceptionGroup):
+        return [error]
+    return [leaf for each in error.exceptions for leaf in _leaves(each)]
