@@ -213,6 +213,8 @@ UPDATES: list[tuple[str, Changes, str]] = [
     ("ApplicationTask", {"spec.requester": ABSENT}, "only spec.parameters may change"),
     ("ApplicationTask", {"spec.event": ABSENT}, "only spec.parameters may change"),
     ("ApplicationTask", {"spec.event.startTime": TIME}, "only spec.parameters may change"),
+    ("ApplicationTask", {"spec.event.classification": {}}, "only spec.parameters may change"),
+    ("ApplicationTask", {"spec.event.classification": ABSENT}, "only spec.parameters may change"),
     ("ApplicationInstance", {"spec.template": "other"}, "spec.template and spec.key are immutable"),
     ("ApplicationInstance", {"spec.key": "south"}, "spec.template and spec.key are immutable"),
     ("ApplicationInstance", {"spec.key": ABSENT}, "spec.template and spec.key are immutable"),

@@ -131,8 +131,13 @@ class ApplicationTask(Kind):
             " && self.spec.event.action == oldSelf.spec.event.action"
             " && self.spec.event.subject == oldSelf.spec.event.subject"
             " && self.spec.event.onsetTime == oldSelf.spec.event.onsetTime"
-            " && self.spec.event.startTime == oldSelf.spec.event.startTime))",
-            "message": "only spec.parameters may change, and spec.endTime be set: end this task and create another",
+            " && self.spec.event.startTime == oldSelf.spec.event.startTime"
+            " && has(self.spec.event.classification) == has(oldSelf.spec.event.classification)"
+            " && (!has(self.spec.event.classification)"
+            " || self.spec.event.classification == oldSelf.spec.event.classification)))",
+            # CEL does not see event.values, whose items may be of any type.
+            "message": "only spec.parameters may change, and spec.endTime be set (spec.event.values is not looked at): "
+            "end this task and create another",
         },
         {
             "rule": "!has(oldSelf.spec.endTime)"
