@@ -14,7 +14,7 @@ from rich.console import Console
 from detector.actions.file_store import write_tasks_yaml
 from detector.assembly import DetectorError
 from detector.checking import check_documents, summary
-from detector.cluster.connection import NoClusterError
+from detector.cluster.errors import NoClusterError
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import is_intake_file, read_intake
 from detector.replay.progress import Progress

@@ -32,6 +32,7 @@ from pathlib import Path
 from detector.cluster.api import Api, JsonObject, Resource
 from detector.cluster.backoff import Backoff
 from detector.cluster.errors import AlreadyExistsError, ApiError, ConflictError, NotFoundError
+from wayside.leases import DEFAULT_DURATION, lease_name
 
 _log = logging.getLogger(__name__)
 
@@ -80,7 +81,7 @@ class HolderLease:
         holder: str,
         identity: Identity | None = None,
         *,
-        duration: float = 15.0,
+        duration: float = DEFAULT_DURATION,
         monotonic: Callable[[], float] = time.monotonic,
         now: Callable[[], float] = time.time,
     ) -> None:
@@ -95,7 +96,7 @@ class HolderLease:
             monotonic: seconds, for observing.
             now: seconds since the epoch, for what is written; nobody computes with it.
         """
-        self.name = f"wayside-{holder}"
+        self.name = lease_name(holder)
         self._api = api
         self._namespace = namespace
         self._identity = identity or Identity.of_this_process()

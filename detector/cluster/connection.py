@@ -13,6 +13,7 @@ from kubernetes.aio.config import ConfigException, kube_config, load_incluster_c
 from yaml import YAMLError
 
 from detector.cluster.api import Api
+from detector.cluster.errors import NoClusterError
 
 _OWN_NAMESPACE = Path("/var/run/secrets/kubernetes.io/serviceaccount/namespace")
 _IN_CLUSTER = "KUBERNETES_SERVICE_HOST"
@@ -20,10 +21,6 @@ _CONNECTIONS = 32
 
 _BROKEN = (ConfigException, OSError, YAMLError, ValueError, TypeError, KeyError, AttributeError)
 """What the loader stumbles over in files that are missing, no YAML or of another shape: it checks little itself."""
-
-
-class NoClusterError(Exception):
-    """There is no way to an API server; the text says what to give."""
 
 
 @dataclass(frozen=True)

@@ -71,3 +71,7 @@ def error_of(code: int, body: bytes, retry_after: str | None = None) -> ApiError
         return (AlreadyExistsError if reason == "AlreadyExists" else ConflictError)(code, reason, message)
     kind = {404: NotFoundError, 410: GoneError}.get(code, RefusedError)
     return kind(code, reason, message)
+
+
+class NoClusterError(Exception):
+    """There is no way to an API server; the text says what to give."""

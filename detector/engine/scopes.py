@@ -9,7 +9,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from detector.engine.buffer import Buffer
 from detector.engine.clients import Clients, fresh_streams
@@ -126,6 +125,9 @@ def near_pairs(positions: Mapping[str, Position], within: float) -> Iterator[tup
             if math.dist(positions[a], positions[b]) <= within:
                 yield a, b
         return
+    # Not at the top: it takes half a second to import, which a detector of few clients does not owe.
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
     tree = cKDTree(np.array([positions[name] for name in names]))
     for i, j in tree.query_pairs(within * _ROUNDING):
         # The tree rounds in its own way; this is what expressions see as distance.

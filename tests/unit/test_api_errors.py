@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from detector.cluster.api import Resource
-from detector.cluster.connection import NoClusterError, connect
+from detector.cluster.connection import connect
 from detector.cluster.errors import (
     AlreadyExistsError,
     ApiError,
     ConflictError,
     GoneError,
+    NoClusterError,
     NotFoundError,
     RefusedError,
     UnavailableError,

@@ -1,0 +1,81 @@
+"""A detector in a cluster: its Detector, rules and tasks live in the API server, and a Lease says that it lives.
+
+It begins once it knows its rules, holds its Lease and has the episodes of its live tasks back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable
+from pathlib import Path
+from typing import TypeVar
+
+from detector.actions.deploy import DemandReconciler
+from detector.actions.kubernetes_store import KubernetesTaskStore
+from detector.actions.lease import HolderLease
+from detector.actions.stores import TaskStore, restore
+from detector.cluster.connection import connect
+from detector.rules.kubernetes import ClusterRules
+from detector.running import Running
+
+Result = TypeVar("Result")
+
+
+async def run_in_cluster(
+    name: str, namespace: str | None, output: Path | None, record: Path | None, stopping: asyncio.Event
+) -> None:
+    """Run the Detector of that name until it is to stop.
+
+    Raises:
+        NoClusterError, DetectorError, NetworkError, OSError: it cannot start; the text says why.
+    """
+    async with connect(namespace) as cluster:
+        rules = ClusterRules(cluster.api, cluster.namespace, name)
+        lease = HolderLease(cluster.api, cluster.namespace, name)
+        store = KubernetesTaskStore(cluster.api, cluster.namespace, name)
+        reconciler = DemandReconciler(store, permitted=lease.held)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(lease.run())
+            try:
+                await _run_while_held(name, output, record, stopping, rules, lease, store, reconciler)
+            finally:
+                lease.stop()
+
+
+async def _run_while_held(
+    name: str,
+    output: Path | None,
+    record: Path | None,
+    stopping: asyncio.Event,
+    rules: ClusterRules,
+    lease: HolderLease,
+    store: TaskStore,
+    reconciler: DemandReconciler,
+) -> None:
+    changes = rules.follow()
+    first = await _unless(stopping, anext(changes))
+    if first is None or await _unless(stopping, lease.held.wait()) is None:
+        return
+    restored = await _unless(stopping, restore(store))
+    if restored is None:
+        return
+    async with asyncio.TaskGroup() as group:
+        group.create_task(reconciler.run())
+        try:
+            with Running(first, name, reconciler, output, record, restored) as running:
+                following = group.create_task(running.follow(changes))
+                await running.until(stopping)
+                following.cancel()
+        finally:
+            reconciler.stop()
+
+
+async def _unless(stopping: asyncio.Event, work: Awaitable[Result]) -> Result | None:
+    """The work's result, or None if it is to stop before."""
+    working = asyncio.ensure_future(work)
+    ending = asyncio.ensure_future(stopping.wait())
+    done, pending = await asyncio.wait({working, ending}, return_when=asyncio.FIRST_COMPLETED)
+    for task in pending:
+        task.cancel()
+    await asyncio.gather(*pending, return_exceptions=True)
+    return working.result() if working in done else None

@@ -1,0 +1,148 @@
+"""A detector at work: intake, evaluation, network, event log and recording, wired, started and ended in order."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import time
+from collections.abc import AsyncIterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from detector.actions.deploy import DemandReconciler
+from detector.assembly import DetectorError, inlets, make_engine
+from detector.engine.demands import Demand
+from detector.engine.intake import Intake
+from detector.evaluator import Evaluator
+from detector.event_log import EventLog
+from detector.outlet import LiveOutlet
+from detector.replay.intake_writer import IntakeWriter
+from detector.rules.selection import RuleSet
+from detector.streams.zenoh import Network
+from wayside.api import Detector
+
+_log = logging.getLogger(__name__)
+
+
+class Running:
+    """Inside the `with`, the detector's threads run."""
+
+    def __init__(
+        self,
+        rule_set: RuleSet,
+        holder: str,
+        reconciler: DemandReconciler,
+        output: Path | None,
+        record: Path | None,
+        restored: Sequence[Demand],
+    ) -> None:
+        """Raises DetectorError where the Detector cannot run, OSError where a file cannot be written."""
+        self._loop = asyncio.get_running_loop()
+        self._failed: asyncio.Future[None] = self._loop.create_future()
+        self._rule_set = rule_set
+        self._restored = restored
+        detector = rule_set.detector
+        entries = inlets(detector)
+        self._intake = Intake(time.time_ns)
+        self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns())
+        self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams)
+        self._log = None if output is None else EventLog(output / "events.jsonl")
+        self._outlet = LiveOutlet(self._network(detector), self._log, reconciler)
+        self._reconciler = reconciler
+        self._evaluator = Evaluator(
+            self._engine,
+            self._intake,
+            self._outlet,
+            now=time.time_ns,
+            recorder=self._writer,
+            on_failure=self._fail,
+        )
+
+    def __enter__(self) -> Running:
+        self._evaluator.start(self._rule_set, self._restored)
+        self._outlet.network.start()
+        _log.info(
+            "Detector %s runs with %d rules and %d restored demands",
+            self._rule_set.detector.name,
+            len(self._engine.rules),
+            len(self._restored),
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._evaluator.stop()
+        self._outlet.network.close()
+        if self._log is not None:
+            self._log.close()
+        if self._writer is not None:
+            self._writer.close()
+        self._summarise()
+
+    async def until(self, stopping: asyncio.Event) -> None:
+        """Wait for the end. Raises what ended the evaluation, if it was that."""
+        async with asyncio.TaskGroup() as group:
+            ending = group.create_task(stopping.wait())
+            self._failed.add_done_callback(lambda _: ending.cancel())
+        if self._failed.done():
+            self._failed.result()
+
+    async def follow(self, changes: AsyncIterator[RuleSet]) -> None:
+        """Take over each change of the Detector and its rules."""
+        async for wanted in changes:
+            detector, before = self._good(wanted.detector), self._rule_set.detector.spec
+            self._rule_set = replace(wanted, detector=detector)
+            self._evaluator.configure(self._rule_set)
+            spec = detector.spec
+            if spec.zenoh != before.zenoh or _keys(spec.streams) != _keys(before.streams):
+                await asyncio.to_thread(self._outlet.move, self._network(detector))
+
+    def _network(self, detector: Detector) -> Network:
+        spec = detector.spec
+        return Network(spec.zenoh, spec.streams, self._intake.putter, on_failure=self._fail)
+
+    def _good(self, wanted: Detector) -> Detector:
+        """The changed Detector; the last one where it cannot run."""
+        try:
+            inlets(wanted)
+        except DetectorError as error:
+            _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.name, error)
+            return self._rule_set.detector
+        return wanted
+
+    def _fail(self, error: BaseException) -> None:
+        def tell() -> None:
+            if not self._failed.done():
+                self._failed.set_exception(error)
+
+        self._loop.call_soon_threadsafe(tell)
+
+    def _summarise(self) -> None:
+        self._evaluator.losses.sum_up()
+        if self._outlet.network.dropped_events:
+            _log.warning("in all, %d events not published", self._outlet.network.dropped_events)
+
+
+def tune_garbage_collection() -> None:
+    """Let Python look for reference cycles less often.
+
+    A sample is a tuple, and by default every 700 new ones start a search, although they never form cycles. That cost as
+    much as receiving and inserting them (`benchmarks/intake_rate.py`).
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 50)
+
+
+def _unused(path: Path) -> Path:
+    """The path, or where there is a file already, one beside it: a restart must not destroy what was recorded."""
+    candidates = (path, *(path.with_name(f"{path.stem}.{number}{path.suffix}") for number in range(2, 1_000_000)))
+    free = next(candidate for candidate in candidates if not candidate.exists())
+    if free != path:
+        _log.warning("%s exists already: recording into %s", path, free)
+    return free
+
+
+def _keys(streams: Iterable[Stream]) -> list[tuple[str, str]]:
+    """What the network has to know of the streams."""
+    return [(stream.name, stream.key) for stream in streams]
