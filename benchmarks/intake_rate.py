@@ -28,6 +28,7 @@ from rosbags.typesys import Stores, get_typestore
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "cooperative-recording"
 TARGET = 0.9
+PATIENCE = 20.0  # s until a publisher gives up on its subscriber
 
 
 def main() -> None:
@@ -72,7 +73,11 @@ def measure(receiver: str, publishers: int, seconds: float) -> float:
             )
             for _ in range(publishers)
         ]
-        sent = [json.loads(sender.communicate()[0]) for sender in senders]
+        told = [sender.communicate()[0] for sender in senders]
+        if any(sender.returncode for sender in senders):
+            process.kill()
+            raise SystemExit(f"{receiver}: the publishers found no subscriber\n{process.communicate()[1]}")
+        sent = [json.loads(each) for each in told]
         time.sleep(1.0)  # what Zenoh has taken from the publishers must reach the callback
         process.send_signal(signal.SIGTERM)
         report = process.communicate(timeout=60)[1]
@@ -131,7 +136,10 @@ def publish(endpoint: str, seconds: float) -> None:
             session.declare_publisher(f"vehicles/car{i}/pose", congestion_control=zenoh.CongestionControl.BLOCK)
             for i in range(15)
         ]
+        patience = time.monotonic() + PATIENCE
         while not all(publisher.matching_status.matching for publisher in publishers):
+            if time.monotonic() > patience:
+                raise SystemExit(f"nobody subscribed within {PATIENCE:g} s")
             time.sleep(0.01)
         begin = time.monotonic()
         sent = 0

@@ -53,15 +53,13 @@ def main() -> int:
     console.print(
         "[bold]Fifteen vehicles drive; six carry a lidar. Two of those closer than 150 m: record the scene.[/]"
     )
-    with _detector(output) as detector, _events() as events:
-        drive = _start("drive.py", "--connect", ENDPOINT, "--seed", str(DEMO_SEED), "--duration", str(DURATION_S))
+    with _detector(output) as detector, _vehicles() as drive, _events() as events:
         teller = Timeline(console, output / "tasks")
         until = None
         while until is None or time.monotonic() < until:
             teller.look(events)
             if detector.poll() is not None:
                 console.print(f"[red]the detector ended early:[/] see {output / 'detector.log'}")
-                drive.terminate()
                 return 1
             if until is None and drive.poll() is not None:
                 until = time.monotonic() + LINGERING_S
@@ -69,10 +67,16 @@ def main() -> int:
     return _verdict(console, output, teller.running, drive.wait())
 
 
-def _start(*command: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, str(HERE / command[0]), *command[1:]], stdout=subprocess.DEVNULL, text=True
-    )
+@contextmanager
+def _vehicles() -> Iterator[subprocess.Popen[bytes]]:
+    """The drive; it begins as soon as the detector listens."""
+    command = ["--connect", ENDPOINT, "--seed", str(DEMO_SEED), "--duration", str(DURATION_S)]
+    process = subprocess.Popen([sys.executable, str(HERE / "drive.py"), *command], stdout=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait(10)
 
 
 @contextmanager
@@ -99,6 +103,7 @@ def _events() -> Iterator[queue.Queue[dict[str, Any]]]:
         "connect/endpoints": [ENDPOINT],
         "connect/timeout_ms": 10_000,  # the detector is just starting
         "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1},
         "listen/endpoints": [],
         "scouting/multicast/enabled": False,
     }.items():

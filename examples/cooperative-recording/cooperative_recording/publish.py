@@ -95,6 +95,7 @@ def _open(connect: Sequence[str], listen: Sequence[str], wait_s: float) -> zenoh
         "connect/endpoints": list(connect),
         "connect/timeout_ms": round(wait_s * 1000),
         "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1},
         "listen/endpoints": list(listen),
         "listen/exit_on_failure": True,
         "scouting/multicast/enabled": False,
