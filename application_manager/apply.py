@@ -44,6 +44,11 @@ class Known:
     digest: str | None = None
     objects: Mapping[ObjectKey, str | None] = field(default_factory=dict)
 
+    @classmethod
+    def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> Known:
+        """What references say, as `references` makes them."""
+        return cls(digest, {(each.api_version, each.kind, each.name): each.uid for each in references})
+
 
 @dataclass(frozen=True, slots=True)
 class Applied:
@@ -159,13 +164,13 @@ class Applier:
                 uids[object_key(result)] = result["metadata"]["uid"]
         problems = [result for result in results if isinstance(result, _Problem)]
         if problems:
-            return Applied(_refused(problems), _references({**dict.fromkeys(wanted), **uids}), complete=False)
+            return Applied(_refused(problems), references({**dict.fromkeys(wanted), **uids}), complete=False)
         # What has the instance as controller is its own, recorded or not.
         controlled = self._controlled.get(instance.metadata.uid, {})
         for key in (recorded.keys() | set(controlled.values())) - wanted:
             await self._prune(instance, key)
             uids.pop(key, None)
-        return Applied(Aspect("Applied", True, "Applied", _counted(len(wanted))), _references(uids), complete=True)
+        return Applied(Aspect("Applied", True, "Applied", _counted(len(wanted))), references(uids), complete=True)
 
     async def _apply_one(
         self,
@@ -225,8 +230,8 @@ def controller_uid(live: Mapping[str, Any]) -> str | None:
 
 
 def _controller(live: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    references: list[Mapping[str, Any]] = live["metadata"].get("ownerReferences") or []
-    return next((each for each in references if each.get("controller")), None)
+    owners: list[Mapping[str, Any]] = live["metadata"].get("ownerReferences") or []
+    return next((each for each in owners if each.get("controller")), None)
 
 
 def _foreign(live: Object, instance: ApplicationInstance, recorded: str | None, what: str) -> _Problem | None:
@@ -257,7 +262,8 @@ def _refused(problems: Sequence[_Problem]) -> Aspect:
     return Aspect("Applied", False, worst.reason, "; ".join(each.message for each in problems))
 
 
-def _references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:
+def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:
+    """The objects as a status lists them, in one order."""
     return tuple(
         ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid) for key, uid in sorted(uids.items())
     )

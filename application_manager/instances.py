@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager.apply import Applied, Applier, Known, ObjectKey
+from application_manager.apply import Applied, Applier, Known, ObjectKey, references
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core import drafting
 from application_manager.core.conditions import Aspect, find
@@ -23,7 +23,6 @@ from application_manager.recorder import Reason, Recorder
 from application_manager.store import Name
 from application_manager.world import Record, World
 from wayside.api import ApplicationInstance
-from wayside.api.applicationinstance import ObjectReference
 
 log = logging.getLogger(__name__)
 
@@ -102,12 +101,14 @@ class InstanceWork:
             return  # deleted by somebody meanwhile: its event brings us back
         known = self._known(name, instance)
         if not isinstance(rendering, Rendering):
-            self._note(name, instance, decision, Applied(rendering, _references(known), complete=False), known.digest)
+            self._note(
+                name, instance, decision, Applied(rendering, references(known.objects), complete=False), known.digest
+            )
             return
         pending = self.applier.pending(instance, rendering, known)
         was_applied = self._was_applied(name, instance)
         if not pending and was_applied is not None:
-            self._note(name, instance, decision, Applied(was_applied, _references(known), True), known.digest)
+            self._note(name, instance, decision, Applied(was_applied, references(known.objects), True), known.digest)
             return
         if existing is not None:
             looked = await self.applier.look(name[0], pending)
@@ -118,7 +119,9 @@ class InstanceWork:
         except ApiError as error:
             if not error.terminating:
                 message = f"the API server failed and is asked again: {error.message}"
-                failed = Applied(Aspect("Applied", False, "Retrying", message), _references(known), complete=False)
+                failed = Applied(
+                    Aspect("Applied", False, "Retrying", message), references(known.objects), complete=False
+                )
                 self._note(name, instance, decision, failed, known.digest)
             raise
         self._note(name, instance, decision, applied, rendering.digest if applied.complete else known.digest)
@@ -129,9 +132,9 @@ class InstanceWork:
         """What was applied so far: our own record where it is newer than the status."""
         record = self.world.records.get(name)
         if record is not None and record.uid == instance.metadata.uid:
-            return Known(record.digest, {_key(each): each.uid for each in record.applied.objects})
+            return Known.read(record.digest, record.applied.objects)
         status = instance.status
-        return Known(status.spec_hash, {_key(each): each.uid for each in status.objects}) if status else Known()
+        return Known.read(status.spec_hash, status.objects) if status else Known()
 
     def _was_applied(self, name: Name, instance: ApplicationInstance) -> Aspect | None:
         """The condition Applied, where it is True."""
@@ -146,8 +149,8 @@ class InstanceWork:
 
         An instance that was just created does without: whatever bears its label and has it as controller is its own.
         """
-        references = _references(Known(None, {**dict.fromkeys(rendering.keys()), **known.objects}))
-        status = {"objects": [each.to_json() for each in references]}
+        announced = references({**dict.fromkeys(rendering.keys()), **known.objects})
+        status = {"objects": [each.to_json() for each in announced]}
         uid = instance.metadata.uid
         self.observe(await self.client.patch_status(self.instances, name[0], name[1], uid, status))
 
@@ -174,14 +177,3 @@ class InstanceWork:
         self.recorder.say(instance, Reason.RELEASED, "no demand came within its linger", time.time())
         log.info("instance %s/%s: released", *name)
         return True
-
-
-def _key(reference: ObjectReference) -> ObjectKey:
-    return reference.api_version, reference.kind, reference.name
-
-
-def _references(known: Known) -> tuple[ObjectReference, ...]:
-    return tuple(
-        ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid)
-        for key, uid in sorted(known.objects.items())
-    )

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from application_manager.client import LEASES, ApiError, Client, Resource, Unreachable
-from application_manager.core.leases import HolderKey, lease_name
+from application_manager.core.leases import HolderKey
 from application_manager.store import Name
 from application_manager.world import World
+from wayside.leases import lease_name
 
 LOOK_EVERY = 1.0  # s
 _AT_ONCE = 8  # Leases read at once: few, since what runs goes before

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from application_manager.core import drafting
 from application_manager.core.demand import Decision, Standing, demand
 from application_manager.core.policy import Policy
 from application_manager.core.rendering import Renderer, RenderError
-from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
-from wayside.api.applicationinstance import ApplicationInstanceSpec
-from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
+from wayside.api import ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.documents import load_documents
 from wayside.manifests import to_yaml
 
@@ -60,26 +59,9 @@ def render_objects(objects: Sequence[Kind], policy: Policy, now: float) -> Rende
     return result
 
 
-def instance_of(decision: Decision, namespace: str) -> ApplicationInstance:
-    """The instance that a decision wants, as it would be created."""
-    return ApplicationInstance(
-        metadata=Metadata(name=decision.name, namespace=namespace, labels={MANAGED_BY_LABEL: MANAGED_BY}),
-        spec=ApplicationInstanceSpec(
-            template=decision.template, key=decision.key, parameters=dict(decision.parameters or {})
-        ),
-    )
-
-
 def _render(decision: Decision, template: ApplicationTemplate, policy: Policy, result: Rendered) -> None:
-    instance = instance_of(decision, template.namespace)
-    result.objects.append(
-        {
-            "apiVersion": instance.api_version,
-            "kind": instance.kind,
-            "metadata": {"name": instance.name, "namespace": instance.namespace, "labels": instance.metadata.labels},
-            "spec": instance.spec.to_json(),
-        }
-    )
+    instance = drafting.draft((template.namespace, decision.name), decision, None)
+    result.objects.append(drafting.created(instance, template))
     try:
         result.objects.extend(Renderer(template, policy).render(instance).manifests)
     except RenderError as error:

@@ -14,8 +14,8 @@ from typing import Any
 import kopf
 
 from application_manager.client import LEASES, Object, Resource
-from application_manager.core.leases import LEASE_PREFIX
 from application_manager.core.rendering import INSTANCE_LABEL
+from wayside.leases import holder_of
 
 News = Callable[[Object], None]
 
@@ -68,7 +68,7 @@ async def watch(
             observe(raw)
 
     def is_holders(name: str, **_: Any) -> bool:
-        return name.startswith(LEASE_PREFIX)
+        return holder_of(name) is not None
 
     kopf.on.login(registry=registry)(login)
     for resource in own:

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 from application_manager.apply import Applier
 from application_manager.client import Object
-from application_manager.core.leases import LEASE_PREFIX
-from application_manager.core.policy import KindKey
 from application_manager.core.readiness import not_ready
 from application_manager.core.rendering import INSTANCE_LABEL
 from application_manager.rulework import RuleKey
-from application_manager.store import Entry, Name
+from application_manager.store import Entry, Name, kind_of, name_of
 from application_manager.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, TASK, TEMPLATE, World
 from wayside.api import ApplicationInstance
+from wayside.leases import holder_of
 
 Ask = Callable[[Name], None]
 
@@ -44,7 +43,7 @@ class Router:
 
     def observe(self, raw: Object) -> None:
         """Take an object as it was read."""
-        kind, name = _kind(raw), _name(raw)
+        kind, name = kind_of(raw), name_of(raw)
         if kind == LEASE:
             self._lease(name, raw)
             return
@@ -68,7 +67,7 @@ class Router:
 
     def vanished(self, raw: Object) -> None:
         """Take the news that an object is gone."""
-        kind, name = _kind(raw), _name(raw)
+        kind, name = kind_of(raw), name_of(raw)
         if kind == LEASE:
             self._lease(name, None)
             return
@@ -148,9 +147,10 @@ class Router:
             self.instance((raw["metadata"]["namespace"], owner))
 
     def _lease(self, name: Name, raw: Object | None) -> None:
-        if not name[1].startswith(LEASE_PREFIX):
+        holder = holder_of(name[1])
+        if holder is None:
             return
-        key = (name[0], name[1].removeprefix(LEASE_PREFIX))
+        key = (name[0], holder)
         at = self.world.healthy.elapsed
         before = self.world.leases.view(key, at)
         renewed = self.world.leases.observe(key, raw, at)
@@ -173,11 +173,3 @@ class Router:
 def _written(entry: Entry) -> tuple[object, object]:
     """What people write of a rule or a detector."""
     return entry.raw["spec"], entry.raw["metadata"].get("labels")
-
-
-def _kind(raw: Object) -> KindKey:
-    return raw["apiVersion"], raw["kind"]
-
-
-def _name(raw: Object) -> Name:
-    return raw["metadata"]["namespace"], raw["metadata"]["name"]

@@ -61,7 +61,7 @@ class Store:
 
     def put(self, raw: Object) -> Entry | None:
         """Note an object; the new entry, or None where this version is not news."""
-        kind, name = _kind(raw), _name(raw)
+        kind, name = kind_of(raw), name_of(raw)
         uid = raw["metadata"]["uid"]
         known = self.get(kind, name)
         if uid in self._deleted:
@@ -78,14 +78,14 @@ class Store:
         self._deleted[uid] = None
         if len(self._deleted) > _TOMBSTONES:
             self._deleted.popitem(last=False)
-        known = self.get(_kind(raw), _name(raw))
+        known = self.get(kind_of(raw), name_of(raw))
         if known is None or known.uid != uid:
             return None
-        return self._objects[_kind(raw)].pop(_name(raw))
+        return self._objects[kind_of(raw)].pop(name_of(raw))
 
     def missing(self, kind: KindKey, listed: Iterable[Object], version: str, scope: str | None) -> list[Entry]:
         """The entries that a list (of the namespace `scope`, None for all) shows to be gone, since it has them not."""
-        present = {_name(raw) for raw in listed}
+        present = {name_of(raw) for raw in listed}
         return [
             entry
             for name, entry in self.all(kind)
@@ -101,9 +101,11 @@ class Store:
             return Entry(raw, problem=str(error))
 
 
-def _kind(raw: Object) -> KindKey:
+def kind_of(raw: Object) -> KindKey:
+    """The kind of an object as it was read."""
     return raw["apiVersion"], raw["kind"]
 
 
-def _name(raw: Object) -> Name:
+def name_of(raw: Object) -> Name:
+    """The namespace and name of an object as it was read."""
     return raw["metadata"]["namespace"], raw["metadata"]["name"]

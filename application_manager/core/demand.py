@@ -18,6 +18,7 @@ from application_manager.core.leases import LeaseView
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle, LossPolicy
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Duration
+from wayside.leases import lease_name
 from wayside.times import parse_seconds
 
 LINGER_ANNOTATION = "wayside.dev/linger"
@@ -262,7 +263,7 @@ def _lapse(
         message = f"holder {holder} has been lost for over an hour"
         return Verdict(Standing.FINISHED, "DetectorLost", message), None
     message = (
-        f"holder {holder} is lost: its Lease wayside-{holder} was not renewed for {limit:g} s; "
+        f"holder {holder} is lost: its Lease {lease_name(holder)} was not renewed for {limit:g} s; "
         "the demand counts again when it is"
     )
     return Verdict(Standing.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER

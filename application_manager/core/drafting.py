@@ -40,13 +40,18 @@ def manifest(
 ) -> dict[str, Any] | None:
     """What to apply so that the instance becomes as wanted; None if it is so already, or is a person's."""
     usable = template if isinstance(template, ApplicationTemplate) else None
+    if existing is None:
+        return created(wanted, usable)
     linger = str(linger_of(wanted, usable))
-    if existing is not None:
-        if not is_managed(existing):
-            return None
-        noted = existing.metadata.annotations.get(LINGER_ANNOTATION)
-        if existing.spec == wanted.spec and (usable is None or noted == linger):
-            return None
+    noted = existing.metadata.annotations.get(LINGER_ANNOTATION)
+    if not is_managed(existing) or (existing.spec == wanted.spec and (usable is None or noted == linger)):
+        return None
+    whole = created(wanted, usable)
+    return {**whole, "metadata": {**whole["metadata"], "uid": existing.metadata.uid}}
+
+
+def created(wanted: ApplicationInstance, template: ApplicationTemplate | None) -> dict[str, Any]:
+    """The manifest by which the instance comes to be."""
     return {
         "apiVersion": API_VERSION,
         "kind": wanted.kind,
@@ -54,8 +59,7 @@ def manifest(
             "name": wanted.name,
             "namespace": wanted.namespace,
             "labels": {MANAGED_BY_LABEL: MANAGED_BY},
-            "annotations": {LINGER_ANNOTATION: linger},
-            **({"uid": existing.metadata.uid} if existing else {}),
+            "annotations": {LINGER_ANNOTATION: str(linger_of(wanted, template))},
         },
         "spec": wanted.spec.to_json(),
     }

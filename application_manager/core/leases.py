@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-DEFAULT_DURATION = 15.0  # s, of a Lease that says none, and of a holder that has no Lease yet
-LEASE_PREFIX = "wayside-"
+from wayside.leases import DEFAULT_DURATION
+
 RAREST_LOOK = 5.0  # s between two looks at a Lease that is long overdue; a renewal also comes by watching
 _RARER = 0.25  # of the time that a Lease is overdue: what a lapse may be noticed late by, in proportion
 
@@ -120,11 +120,6 @@ class LeaseBook:
         kept = set(keys)
         for key in [key for key in self._observed if key not in kept]:
             del self._observed[key]
-
-
-def lease_name(holder: str) -> str:
-    """The name of the holder's Lease."""
-    return LEASE_PREFIX + holder
 
 
 def _identity(lease: Mapping[str, Any] | None) -> str:

@@ -10,18 +10,17 @@ from kubernetes.aio.client import Configuration
 
 from application_manager.client import LEASES, ApiError, Client, Resource
 from application_manager.core.leases import (
-    DEFAULT_DURATION,
     RAREST_LOOK,
     HealthyTime,
     LeaseBook,
     LeaseView,
-    lease_name,
 )
 from application_manager.core.policy import Policy
 from application_manager.leasewatch import LeaseWatch
 from application_manager.store import Entry
 from application_manager.world import World
 from tests.unit.manager_objects import task, template
+from wayside.leases import DEFAULT_DURATION, lease_name
 
 KEY = ("site", "det")
 

@@ -71,8 +71,8 @@ class ApplicationInstanceStatus(Model):
     objects: list[ObjectReference] = Field(
         default_factory=list,
         max_length=128,
-        description="The objects that belong to it. What joins them later is written before it is applied; those of a new "
-        "instance are told by their label and their controller reference until this is written.",
+        description="The objects that belong to it. What joins them later is written before it is applied; those of "
+        "a new instance are told by their label and their controller reference until this is written.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     demands: Demands = Field(default=Demands(), description="The live tasks that it serves.")

@@ -1,0 +1,19 @@
+"""What both programs know of a holder's Lease: how it is called, and how long a renewal of it holds."""
+
+from __future__ import annotations
+
+PREFIX = "wayside-"
+"""What the names of all holders' Leases begin with."""
+
+DEFAULT_DURATION = 15.0
+"""Seconds that a renewal holds, where the Lease does not say."""
+
+
+def lease_name(holder: str) -> str:
+    """The name of the holder's Lease."""
+    return PREFIX + holder
+
+
+def holder_of(name: str) -> str | None:
+    """Whose Lease has this name; None where it is no holder's."""
+    return name.removeprefix(PREFIX) if name.startswith(PREFIX) else None
