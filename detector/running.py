@@ -6,7 +6,7 @@ import asyncio
 import gc
 import logging
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from detector.replay.intake_writer import IntakeWriter
 from detector.rules.selection import RuleSet
 from detector.streams.zenoh import Network
 from wayside.api import Detector
+from wayside.api.detector import Stream
 
 _log = logging.getLogger(__name__)
 

@@ -37,8 +37,8 @@ WRITTEN = ("events.jsonl", "tasks.yaml", "manifests.yaml", "detector.log")
 """What comes out, beside the folder tasks."""
 DURATION_S = 22.5
 """Of the drive: by then all have parted, and the demo is no longer than it must be."""
-LINGERING_S = 3.5
-"""How long after the drive the last applications are watched going: the templates' linger, and a little."""
+PATIENCE_S = 8.0
+"""How long after the drive the last applications are waited for."""
 
 
 def main() -> int:
@@ -56,13 +56,13 @@ def main() -> int:
     with _detector(output) as detector, _vehicles() as drive, _events() as events:
         teller = Timeline(console, output / "tasks")
         until = None
-        while until is None or time.monotonic() < until:
+        while until is None or (teller.running and time.monotonic() < until):
             teller.look(events)
             if detector.poll() is not None:
                 console.print(f"[red]the detector ended early:[/] see {output / 'detector.log'}")
                 return 1
             if until is None and drive.poll() is not None:
-                until = time.monotonic() + LINGERING_S
+                until = time.monotonic() + PATIENCE_S
     teller.write_manifests(output / "manifests.yaml")
     return _verdict(console, output, teller.running, drive.wait())
 
