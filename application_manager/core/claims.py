@@ -7,15 +7,23 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 from application_manager.core import parameters, values
 from wayside.api import ApplicationTask, ApplicationTemplate
-from wayside.expressions import CompiledTemplate, Environment, InterpolationError, Kind, compile_template
+from wayside.expressions import (
+    CompiledTemplate,
+    Embedded,
+    Environment,
+    InterpolationError,
+    Kind,
+    compile_template,
+)
+from wayside.expressions.errors import position
 
 MAXIMUM_KEY_LENGTH = 1024  # characters, as ApplicationInstance's spec.key allows
 
@@ -114,37 +122,19 @@ def instance_key(template: ApplicationTemplate, complete: Mapping[str, Any]) -> 
 
 @lru_cache(maxsize=1024)
 def _compiled_key(source: str, declared: tuple[str, ...]) -> CompiledTemplate:
-    compiled = compile_template(source, Environment({"parameters": Kind.MAP}), path="spec.key")
-    check_paths(compiled, {"parameters": declared})
-    return compiled
+    environment, check = Environment({"parameters": Kind.MAP}), partial(unknown_members, {"parameters": declared})
+    return compile_template(source, environment, path="spec.key", check=check)
 
 
-def check_paths(compiled: CompiledTemplate, known: Mapping[str, tuple[str, ...]]) -> None:
-    """See that every `${name.member}` names a member that there is.
-
-    Raises InterpolationError for the first that does not, with all others in its `others`.
-    """
-    errors = []
-    for each in compiled.embedded:
-        for path in sorted(each.expression.paths, key=str):
-            members = known.get(str(path[0]))
-            if members is None or len(path) < 2 or path[1] in members:
-                continue
-            hint = f"there {'is' if len(members) == 1 else 'are'} {', '.join(members) or 'none'}"
-            if each.text.strip() != f"${{{each.expression.source}}}":
-                hint += "; write `$${` for a literal `${`"
-            errors.append(_unknown_member(each.text, each.offset, each.path, f"{path[0]}.{path[1]}", hint))
-    if errors:
-        raise _joined(errors)
-
-
-def _unknown_member(text: str, offset: int, path: str, name: str, hint: str) -> InterpolationError:
-    line_start = text.rfind("\n", 0, offset) + 1
-    line, column = text.count("\n", 0, offset) + 1, offset - line_start + 1
-    return InterpolationError(f"`{name}` is not known", path=path, line=line, column=column, hint=hint)
-
-
-def _joined(errors: list[InterpolationError]) -> InterpolationError:
-    first, *others = errors
-    first.others = tuple(others)
-    return first
+def unknown_members(known: Mapping[str, tuple[str, ...]], each: Embedded) -> Iterator[InterpolationError]:
+    """What is wrong with a `${name.member}` that names a member that there is not; `known` has those of each name."""
+    for path in sorted(each.expression.paths, key=str):
+        members = known.get(str(path[0]))
+        if members is None or len(path) < 2 or path[1] in members:
+            continue
+        hint = f"there {'is' if len(members) == 1 else 'are'} {', '.join(members) or 'none'}"
+        if each.text.strip() != f"${{{each.expression.source}}}":
+            hint += "; write `$${` for a literal `${`"
+        line, column = position(each.text, each.offset)
+        message = f"`{path[0]}.{path[1]}` is not known"
+        yield InterpolationError(message, path=each.path, line=line, column=column, hint=hint)

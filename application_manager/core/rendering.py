@@ -10,10 +10,11 @@ import copy
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 from application_manager.core import parameters, values
-from application_manager.core.claims import check_paths
+from application_manager.core.claims import unknown_members
 from application_manager.core.policy import Policy
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import API_VERSION, MANAGED_BY, MANAGED_BY_LABEL
@@ -62,14 +63,14 @@ class Renderer:
         self._manifests: list[CompiledTemplate] = []
         problems: list[str] = []
         known = {"parameters": tuple(sorted(template.spec.parameters)), "instance": _INSTANCE_VARIABLES}
+        check = partial(unknown_members, known)
         for index, manifest in enumerate(template.spec.manifests):
             path = f"spec.manifests[{index}]"
             kind_problem = policy.kind_problem(manifest["apiVersion"], manifest["kind"])
             if kind_problem:
                 problems.append(f"{path}.kind: {kind_problem}")
             try:
-                compiled = compile_template(manifest, _ENVIRONMENT, path=path)
-                check_paths(compiled, known)
+                compiled = compile_template(manifest, _ENVIRONMENT, path=path, check=check)
             except InterpolationError as error:
                 problems += [str(each) for each in (error, *error.others)]
             else:

@@ -147,6 +147,14 @@ def test_what_a_template_may_not_do_is_said_with_its_place(path: str, value: Any
         assert part in message
 
 
+def test_what_does_not_compile_and_what_there_is_not_are_told_together() -> None:
+    manifest = changed(DEPLOYMENT, "spec.replicas", "${parameters.n}")
+    manifest = changed(manifest, "spec.template.spec.containers.0.args", ["${1 +}", "${instance.nam}"])
+    message = refusal(manifest)
+    for part in ("`parameters.n` is not known", "args[0], line 1", "`instance.nam` is not known"):
+        assert part in message
+
+
 def test_all_problems_are_told_at_once() -> None:
     message = refusal(
         changed(DEPLOYMENT, "spec.replicas", "${parameters.n}"),

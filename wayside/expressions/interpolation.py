@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -96,12 +96,17 @@ class CompiledTemplate:
         return None if isinstance(result, _Dropped) else result
 
 
-def compile_template(value: Json, environment: Environment, *, path: str = "") -> CompiledTemplate:
+Check = Callable[[Embedded], Iterable[InterpolationError]]  # what else is wrong with an expression that compiles
+
+
+def compile_template(
+    value: Json, environment: Environment, *, path: str = "", check: Check = lambda _: ()
+) -> CompiledTemplate:
     """Compiles all texts and keys of `value`, which stands at `path`.
 
-    Raises InterpolationError for the first expression that does not compile, with all further ones in its `others`.
+    Raises InterpolationError for the first expression that is wrong, with all further ones in its `others`.
     """
-    compiler = _Compiler(environment)
+    compiler = _Compiler(environment, check)
     root = compiler.node(value, path)
     if compiler.errors:
         first = compiler.errors[0]
@@ -113,8 +118,9 @@ def compile_template(value: Json, environment: Environment, *, path: str = "") -
 class _Compiler:
     """Walks a value and collects the expressions and the errors in it."""
 
-    def __init__(self, environment: Environment) -> None:
+    def __init__(self, environment: Environment, check: Check) -> None:
         self.environment = environment
+        self.check = check
         self.embedded: list[Embedded] = []
         self.errors: list[InterpolationError] = []
 
@@ -175,6 +181,7 @@ class _Compiler:
             return ()
         embedded = Embedded(expression, path, text, start)
         self.embedded.append(embedded)
+        self.errors.extend(self.check(embedded))
         return (embedded,)
 
 
