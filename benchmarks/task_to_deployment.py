@@ -2,8 +2,8 @@
 
 Sequential: one task after the other, alternated with the raw calls: create the task, apply the instance, apply the
 Deployment, by the same client library, in a namespace that no manager looks at. Burst: many tasks at once, beside as
-many raw series at once, each twice and each first once. The managed Deployments' existence is told by a watch. Exits with 1 where
-the sequential ratio misses its target.
+many raw series at once, each twice and each first once. The managed Deployments' existence is told by a watch. Exits
+with 1 where the sequential ratio misses its target.
 
     python -m benchmarks.task_to_deployment [--sequential 60] [--burst 1000]
 
