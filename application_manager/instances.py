@@ -67,21 +67,20 @@ class InstanceWork:
             raise
 
     async def _reconcile(self, name: Name) -> None:
-        now = time.time()
-        instance, decision = self.world.instance(name), self.world.decide(name, now)
+        if await self._released(name):
+            return
+        # Decided only now: while the tasks were listed, the instance itself may have gone. From here to the first
+        # request nothing is waited for, so what was decided and what there is belong together.
+        instance, decision = self.world.instance(name), self.world.decide(name, time.time())
         if decision is None or (instance is None and not decision.wanted):
             self.world.records.pop(name, None)
             self.absent(name, decision)
             return
         if instance is not None and instance.metadata.deletion_timestamp is not None:
             return  # it is waited for: its deletion brings us back
-        if decision.release_time is not None and decision.release_time <= now:
-            if await self._released(name):
-                return
-            decision = self.world.decide(name, time.time()) or decision
         if decision.next_change is not None:
             self.again(name, decision.next_change)
-        await self._make(name, decision, self.world.instance(name))
+        await self._make(name, decision, instance)
 
     async def _make(self, name: Name, decision: Decision, existing: ApplicationInstance | None) -> None:
         wanted = drafting.draft(name, decision, existing)
@@ -161,19 +160,24 @@ class InstanceWork:
         self.done(name)
 
     async def _released(self, name: Name) -> bool:
-        """Delete the instance, if a fresh look at the tasks agrees that nobody wants it. Returns whether it is gone."""
+        """Delete the instance if its linger is over and a fresh look at the tasks agrees; whether it was deleted."""
         instance = self.world.instance(name)
-        if instance is None:
-            return True
+        if instance is None or instance.metadata.deletion_timestamp is not None or not self._over(name):
+            return False
         # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
         fields = f"spec.template={instance.spec.template}"
         listed, _ = await self.client.list(self.tasks, name[0], fields=fields)
         for raw in listed:
             self.observe(raw)
-        decision = self.world.decide(name, time.time())
-        if decision is None or decision.release_time is None or decision.release_time > time.time():
+        if not self._over(name):
             return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)
         self.recorder.say(instance, Reason.RELEASED, "no demand came within its linger", time.time())
         log.info("instance %s/%s: released", *name)
         return True
+
+    def _over(self, name: Name) -> bool:
+        """Whether the linger of an instance is over that nobody demands."""
+        now = time.time()
+        decision = self.world.decide(name, now)
+        return decision is not None and decision.release_time is not None and decision.release_time <= now
