@@ -13,7 +13,7 @@ from detector.engine.buffer import Buffer, Lane
 from detector.engine.clients import Clients
 from detector.engine.counters import Counters
 from detector.engine.messages import KeyReader
-from detector.engine.sample import SAMPLE_OVERHEAD, Arrival, Sample
+from detector.engine.sample import SAMPLE_OVERHEAD, Arrival, Stamped
 from wayside.api import Detector
 
 MAXIMUM_CLIENTS = 100_000
@@ -24,9 +24,6 @@ MAXIMUM_KEYS = 200_000
 
 MAXIMUM_LOST = 1_000
 """Of so many lost clients the newest samples are kept, for the case that they return; those lost first go first."""
-
-_new_sample = tuple.__new__
-"""Makes a Sample from a plain tuple at a third of the cost of calling the class: it is made for every message."""
 
 _STREAM = itemgetter(1)
 
@@ -52,35 +49,42 @@ class Inflow:
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
 
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
-        """The hot path: everything that is received comes through here. `times`: None for the receive times.
-
-        What `Lane.insert` and `Buffer.grew` do for a sample in order is written out here: a call costs as much as all
-        the rest.
-        """
-        lanes, buffer, number = self._lanes, self._buffer, self._number
+        """Everything that is received comes through here. `times`: None for the receive times, in order."""
         self._counters.samples.update(map(_STREAM, arrivals))
         if times is None:
-            times = [arrival.received for arrival in arrivals]
+            self._insert_in_order(arrivals)
+            return
         for time, (_, stream, key, payload) in zip(times, arrivals, strict=True):
-            lane = lanes.get(stream, _NO_LANES).get(key)
+            lane = self._lane(stream, key, time)
+            if lane is not None:
+                self._number += 1
+                self._buffer.grew(lane.insert(Stamped(time, self._number, payload, time, key)))
+
+    def _insert_in_order(self, arrivals: Sequence[Arrival]) -> None:
+        """The hot path. What `Lane.insert` and `Buffer.grew` do is written out: a call costs as much as the rest."""
+        lanes, buffer = self._lanes, self._buffer
+        for arrival in arrivals:
+            time, stream, key, payload = arrival
+            lane = lanes.get(stream, _NO_LANES).get(key) or self._lane(stream, key, time)
             if lane is None:
-                lane = self._route(stream, key, time)
-                if lane is None:
-                    self._counters.samples[stream] -= 1
-                    continue
-            number += 1
-            sample = _new_sample(Sample, (time, number, payload, time, key))
+                continue
             if time >= lane.latest and lane.maximum_bytes is None:
                 lane.latest = time
-                lane.samples.append(sample)
+                lane.samples.append(arrival)
                 size = len(payload) + SAMPLE_OVERHEAD
                 lane.bytes += size
                 buffer.bytes += size
                 if buffer.bytes > buffer.maximum_bytes:
                     buffer.shrink()
             else:
-                buffer.grew(lane.insert(sample))
-        self._number = number
+                buffer.grew(lane.insert(arrival))
+
+    def _lane(self, stream: str, key: str, time: int) -> Lane | None:
+        """The lane that takes a sample; None, and not counted among those taken in, where there is none for it."""
+        lane = self._lanes.get(stream, _NO_LANES).get(key) or self._route(stream, key, time)
+        if lane is None:
+            self._counters.samples[stream] -= 1
+        return lane
 
     def client_of(self, arrival: Arrival) -> str | None:
         """Whose the arrival is; None, and counted, where its key names no valid client."""

@@ -37,7 +37,7 @@ class Messages:
         self._streams = streams
         self._read_key = read_key
         self._counters = counters
-        self._decoded: dict[tuple[str, int], Any] = {}
+        self._decoded: dict[tuple[str, Sample], Any] = {}
 
     def forget(self) -> None:
         """Drop what was decoded: the tick is over."""
@@ -45,7 +45,7 @@ class Messages:
 
     def message(self, stream: str, sample: Sample) -> Any:
         """The decoded sample, or UNKNOWN where it cannot be read; that is counted."""
-        at = (stream, sample.number)
+        at = (stream, sample)
         message = self._decoded.get(at, _MISSING)
         if message is _MISSING:
             try:

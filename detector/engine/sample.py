@@ -20,20 +20,29 @@ class Arrival(NamedTuple):
     payload: bytes
     """The message as it came, undecoded."""
 
+    @property
+    def time(self) -> int:
+        """Its place on the engine's time axis, with clock Wall; nanoseconds."""
+        return self.received
 
-class Sample(NamedTuple):
-    """One message in the buffer."""
+
+class Stamped(NamedTuple):
+    """One message in the buffer, with clock Data: its time is the sender's stamp."""
 
     time: int
-    """Its place on the engine's time axis, in nanoseconds: the receive time, or with clock Data the stamp."""
+    """Its place on the engine's time axis, in nanoseconds: the stamp."""
     number: int
     """The order of arrival; tells apart samples of the same time."""
     payload: bytes
     """The message as it came, undecoded."""
     received: int
-    """When the intake took it, in nanoseconds since the epoch."""
+    """The stamp as well: with clock Data there is no other time."""
     key: str
     """The full key it came on."""
+
+
+Sample = Arrival | Stamped
+"""One message in the buffer. With clock Wall it is what the intake queued: nothing is made anew for every message."""
 
 
 class DecodeError(ValueError):

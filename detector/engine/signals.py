@@ -37,7 +37,7 @@ class Signals:
         self._clients = clients
         self._messages = messages
         self._stale_after = stale_after
-        self._extracted: dict[tuple[str, str, str], dict[int, Value | Unknown | None]] = {}
+        self._extracted: dict[tuple[str, str, str], dict[Sample, Value | Unknown | None]] = {}
         self._picked: dict[tuple[str, str, str], int] = {}
         """When the last sample came that an Age's `where` picks."""
         self._floor = floor
@@ -127,12 +127,12 @@ class Signals:
         """The samples in the window with their values, newest first, without those that `where` leaves out."""
         key = (rule, signal.name, client)
         known = self._extracted.get(key, {})
-        looked_at: dict[int, Value | Unknown | None] = {}
+        looked_at: dict[Sample, Value | Unknown | None] = {}
         values: list[tuple[Sample, Value | Unknown]] = []
         for sample in self._in_window(signal, lane, now):
-            number = sample.number
-            value = known[number] if number in known else self._extract(signal, lane, sample, counters)
-            looked_at[number] = value
+            # By the sample itself: its value follows from what it holds, so two that are equal have the same.
+            value = known[sample] if sample in known else self._extract(signal, lane, sample, counters)
+            looked_at[sample] = value
             if value is not None:
                 values.append((sample, value))
                 if newest_only:

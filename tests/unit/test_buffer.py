@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.buffer import Buffer, Lane
-from detector.engine.sample import SAMPLE_OVERHEAD, Sample
+from detector.engine.sample import SAMPLE_OVERHEAD, Sample, Stamped
 
 
 def a_lane(client: str = "car", stream: str = "s", duration: int = 10**9, maximum_bytes: int | None = None) -> Lane:
@@ -16,7 +16,7 @@ def a_lane(client: str = "car", stream: str = "s", duration: int = 10**9, maximu
 
 
 def a_sample(time: int, number: int = 0, payload: bytes = b"") -> Sample:
-    return Sample(time, number, payload, time, "k")
+    return Stamped(time, number, payload, time, "k")
 
 
 def held(buffer: Buffer) -> int:
