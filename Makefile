@@ -45,7 +45,7 @@ cluster: $(BIN)/.installed-dev ## the tests against a real control plane; builds
 	@$(BIN)/python -m pytest tests/cluster
 
 bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its baseline
-	@for benchmark in benchmarks/*.py; do echo "== $$benchmark"; $(BIN)/python $$benchmark || exit 1; done
+	@for each in $(basename $(notdir $(wildcard benchmarks/*.py))); do echo "== $$each"; $(BIN)/python -m benchmarks.$$each || exit 1; done
 
 crds: $(BIN)/.installed ## write crds/ anew from the models
 	@$(BIN)/python -m wayside.api crds
