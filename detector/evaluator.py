@@ -142,8 +142,8 @@ class Evaluator:
         now = self._now()
         events: list[Event] = []
         if now + _STALL < self._intake.last:
-            last = self._intake.last
-            events += self._take(self._intake.step_back(now), last)
+            events += self._take(self._intake.drain(self._intake.last), self._intake.last)
+            self._intake.step_back(now)
             events += self._gap(now, "the wall clock stepped back")
         else:
             if now - self._engine.next_tick() > _STALL and self._engine.on_wall_clock:

@@ -1,19 +1,24 @@
 """The one place where samples get their receive time.
 
-Stamping and queueing happen under one lock for all streams: the queue is in the order of the receive times, and those
-never repeat. The engine takes the same lock to move `last` up to its tick and to swap the queue, so nothing that is
-queued later can belong before the tick. Stamping outside the lock, or a queue per stream, would reorder samples.
+A message is stamped and queued by the thread that receives it, without a lock: taking one would cost more than all the
+rest. What several threads do at the same moment may therefore be queued out of order by a few microseconds, and a
+thread may be held up between stamping and queueing. So the times are settled when the queue is emptied: each is later
+than the one before and later than the last `until`. Nothing that is drained later can belong before a tick that ran.
 """
 
 from __future__ import annotations
 
+import operator
 import threading
 from collections.abc import Callable
+from itertools import islice
 
 from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
 
 _new_arrival = tuple.__new__
 """Makes an Arrival from a plain tuple at a third of the cost of calling the class: it is made for every message."""
+
+_RECEIVED = operator.itemgetter(0)
 
 
 class Intake:
@@ -22,51 +27,70 @@ class Intake:
     __slots__ = ("_last", "_lock", "_maximum_bytes", "_now", "_queue", "_room", "dropped")
 
     def __init__(self, now: Callable[[], int], *, maximum_bytes: int = 512 * 2**20) -> None:
-        """`now` gives nanoseconds since the epoch; `maximum_bytes` bounds what waits, overhead included."""
+        """`now` gives nanoseconds since the epoch; `maximum_bytes` bounds what waits, overhead included.
+
+        The bound is kept to within the few messages that threads queue at the very same moment.
+        """
         self._now = now
         self._maximum_bytes = maximum_bytes
         self._lock = threading.Lock()
         self._queue: list[Arrival] = []
+        """Stays the same list: appending to it and cutting off its beginning are each one step of the interpreter."""
         self._room = maximum_bytes
         self._last = 0
         self.dropped = 0
 
     def putter(self, stream: str) -> Callable[[str, bytes], None]:
         """A function that takes a message of the stream: its key and payload. Thread-safe; never waits."""
-        lock, now = self._lock, self._now
+        now, append = self._now, self._queue.append
 
         def put(key: str, payload: bytes) -> None:
             # This runs for every message, on the thread that receives it: each line here costs the vehicle's data rate.
-            with lock:
-                time = now()
-                if time <= self._last:
-                    time = self._last + 1
-                self._last = time
-                if self._room <= 0:
-                    self.dropped += 1
-                    return
-                self._room -= len(payload) + SAMPLE_OVERHEAD
-                self._queue.append(_new_arrival(Arrival, (time, stream, key, payload)))
+            if self._room <= 0:
+                self._drop()
+                return
+            size = len(payload) + SAMPLE_OVERHEAD
+            self._room -= size
+            append(_new_arrival(Arrival, (now(), stream, key, payload)))
 
         return put
 
     def drain(self, until: int) -> list[Arrival]:
-        """What was queued, in order. Everything that comes from now on is received after `until`."""
-        with self._lock:
-            self._last = max(self._last, until)
-            queue, self._queue = self._queue, []
-            self._room = self._maximum_bytes
-        return queue
+        """What was queued, in order. Everything that is drained later is received after `until`."""
+        arrivals = self._queue[:]
+        del self._queue[: len(arrivals)]
+        self._room = self._maximum_bytes
+        if arrivals:
+            if not _in_order(arrivals, self._last):
+                arrivals = _settled(arrivals, self._last)
+            self._last = arrivals[-1].received
+        self._last = max(self._last, until)
+        return arrivals
 
     @property
     def last(self) -> int:
-        """The newest receive time given, or the last `until` if that is later."""
+        """The newest receive time drained, or the last `until` if that is later."""
         return self._last
 
-    def step_back(self, to: int) -> list[Arrival]:
-        """The wall clock went back: empty the queue and go on from `to`."""
+    def step_back(self, to: int) -> None:
+        """The wall clock went back: what is drained from now on may be received as early as just after `to`."""
+        self._last = to
+
+    def _drop(self) -> None:
         with self._lock:
-            queue, self._queue = self._queue, []
-            self._room = self._maximum_bytes
-            self._last = to
-        return queue
+            self.dropped += 1
+
+
+def _in_order(arrivals: list[Arrival], last: int) -> bool:
+    """Whether the times are later than `last` and strictly increasing, as they nearly always are."""
+    times = list(map(_RECEIVED, arrivals))
+    return times[0] > last and all(map(operator.lt, times, islice(times, 1, None)))
+
+
+def _settled(arrivals: list[Arrival], last: int) -> list[Arrival]:
+    """The same with times that are later than `last` and strictly increasing."""
+    settled = []
+    for arrival in arrivals:
+        last = max(arrival.received, last + 1)
+        settled.append(arrival._replace(received=last))
+    return settled

@@ -1,7 +1,9 @@
 """The detector's place in the Zenoh network: samples come in, events go out.
 
-A subscriber's callback does nothing but hand key and bytes to the intake, so that the vehicle is never slowed. Events
-wait in a bounded queue for a thread of their own, so that the network never slows the evaluation.
+Each stream has a thread that does nothing but hand key and bytes of its samples to the intake, so that the vehicle is
+never slowed. It takes them from a channel and not by a callback: a burst is taken in one go, where callbacks would pass
+the interpreter's lock on for every message (`benchmarks/intake_rate.py`). Events wait in a bounded queue for a thread
+of their own, so that the network never slows the evaluation.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
+from typing import NoReturn
 
 import zenoh
 
@@ -23,6 +26,10 @@ Put = Callable[[str, bytes], None]
 """Takes a message: its key and payload. Thread-safe, and never waits."""
 
 EVENT_ENCODING = "application/cloudevents+json"
+_CHANNEL = 16_384
+"""So many samples of a stream wait for its thread while the evaluation holds the interpreter's lock. Once they are full
+Zenoh's own queues fill, and then it is the sender's congestion control that says whether it waits or drops."""
+
 _RETRY_SECONDS = (0.2, 0.5, 1.0, 2.0)
 """Waits between attempts to reach a router at the start; the last one repeats."""
 
@@ -45,12 +52,12 @@ class Network:
     ) -> None:
         """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
 
-        `on_failure` is told if the thread that publishes dies of an error. Raises KeyPatternError.
+        `on_failure` is told if a thread dies of an error. Raises KeyPatternError.
         """
         self._on_failure = on_failure
         self._config = config
         self._subscriptions = [
-            (zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression), _receiver(putter(stream.name)))
+            (stream.name, zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression), putter(stream.name))
             for stream in streams
         ]
         self._capacity = capacity
@@ -58,6 +65,7 @@ class Network:
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._session: zenoh.Session | None = None
+        self._receivers: list[threading.Thread] = []
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
         self.dropped_events = 0
         """Events that found the queue full, or that Zenoh refused."""
@@ -92,15 +100,29 @@ class Network:
             self._thread.join(timeout)
         if (session := self._session) is not None:
             self._session = None
-            session.close()  # type: ignore[no-untyped-call]  # also frees the thread from a put that waits
+            session.close()  # type: ignore[no-untyped-call]  # frees the threads: of a put that waits, and of receiving
+        for receiver in self._receivers:
+            receiver.join(timeout)
         if (left := len(self._events)) > 0:
             self.dropped_events += left
             log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
 
     def _join(self, session: zenoh.Session) -> None:
-        for expression, receive in self._subscriptions:
-            session.declare_subscriber(expression, receive)  # lives as long as the session
+        for name, expression, put in self._subscriptions:
+            subscriber = session.declare_subscriber(expression, zenoh.handlers.FifoChannel(_CHANNEL))
+            thread = threading.Thread(target=self._receive, args=(subscriber, put), name=f"stream {name}", daemon=True)
+            thread.start()
+            self._receivers.append(thread)
         self._session = session
+
+    def _receive(self, subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]], put: Put) -> None:
+        """Hands over what comes on a stream, until the session is closed."""
+        try:
+            _pump(subscriber.handler, put)
+        except Exception as error:  # noqa: BLE001  this thread's edge: without it, the stream would be silent for ever
+            if not self._stop.is_set():
+                log.critical("a stream's thread ended, nothing is received on it any more: %s", error)
+                self._on_failure(error)
 
     def _run(self) -> None:
         try:
@@ -166,15 +188,16 @@ def await_session(config: Zenoh, stop: threading.Event) -> zenoh.Session | None:
     return None
 
 
-def _receiver(put: Put) -> Callable[[zenoh.Sample], None]:
-    put_kind = zenoh.SampleKind.PUT
-
-    def receive(sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
-        if payload or sample.kind == put_kind:  # a deletion is no message; asking for the kind of each would cost more
-            put(str(sample.key_expr), payload)
-
-    return receive
+def _pump(samples: zenoh.handlers.Handler[zenoh.Sample], put: Put) -> NoReturn:
+    """Hands over every message; raises ZError once the session is closed and none is left."""
+    receive, try_receive, put_kind = samples.recv, samples.try_recv, zenoh.SampleKind.PUT
+    while True:
+        sample: zenoh.Sample | None = receive()
+        while sample is not None:
+            payload = sample.payload.to_bytes()
+            if payload or sample.kind == put_kind:  # a deletion is no message; asking each for its kind would cost more
+                put(str(sample.key_expr), payload)
+            sample = try_receive()
 
 
 def _settings(config: Zenoh) -> zenoh.Config:
