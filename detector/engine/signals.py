@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Final, cast
 
+from detector.engine.aggregates import Timed, calculated, distinct, is_number
 from detector.engine.buffer import NEVER, Buffer, Lane
 from detector.engine.clients import Clients, is_fresh
 from detector.engine.counters import RuleCounters
@@ -61,15 +62,11 @@ class Signals:
         lane = self._buffer.lane(client, signal.stream)
         if signal.aggregate is Aggregate.AGE:
             return self._age(rule, signal, lane, client, now, counters)
-        if signal.aggregate is Aggregate.COUNT:
-            return float(len(self._window(rule, signal, lane, client, now, counters))) if lane is not None else 0.0
-        value: Value | Unknown = UNKNOWN
-        if lane is not None and self._is_fresh(client, signal.stream, now):
-            if signal.aggregate is Aggregate.LAST:
-                newest = self._window(rule, signal, lane, client, now, counters, newest_only=True)
-                return newest[0][1] if newest else self._no_value(counters)
-            window = self._window(rule, signal, lane, client, now, counters)
-            value = _aggregated(signal.aggregate, _numbers(signal, window, counters))
+        always_known = signal.aggregate in _ALWAYS_KNOWN
+        if lane is None or not (always_known or self._is_fresh(client, signal.stream, now)):
+            return _ALWAYS_KNOWN[signal.aggregate] if always_known else self._no_value(counters)
+        window = self._window(rule, signal, lane, client, now, counters, at_most=_NEWEST.get(signal.aggregate))
+        value = _aggregated(signal, window, counters)
         return self._no_value(counters) if value is UNKNOWN else value
 
     def position(
@@ -108,7 +105,7 @@ class Signals:
         latest = NEVER if lane is None else lane.latest
         if lane is not None and signal.where is not None:
             key = (rule, signal.name, client)
-            picked = self._window(rule, signal, lane, client, now, counters, newest_only=True)
+            picked = self._window(rule, signal, lane, client, now, counters, at_most=1)
             # Kept beyond the buffer: what has left it was still the last one.
             latest = self._picked[key] = picked[0][0].time if picked else self._picked.get(key, NEVER)
         return (now - (self._clients.since(client) if latest == NEVER else latest)) / 1e9
@@ -122,9 +119,12 @@ class Signals:
         now: int,
         counters: RuleCounters,
         *,
-        newest_only: bool = False,
+        at_most: int | None = None,
     ) -> list[tuple[Sample, Value | Unknown]]:
-        """The samples in the window with their values, newest first, without those that `where` leaves out."""
+        """The samples in the window with their values, newest first, without those that `where` leaves out.
+
+        `at_most` so many of them are looked for.
+        """
         key = (rule, signal.name, client)
         known = self._extracted.get(key, {})
         looked_at: dict[Sample, Value | Unknown | None] = {}
@@ -135,7 +135,7 @@ class Signals:
             looked_at[sample] = value
             if value is not None:
                 values.append((sample, value))
-                if newest_only:
+                if len(values) == at_most:
                     break
         self._extracted[key] = looked_at
         return values
@@ -162,39 +162,55 @@ class Signals:
         return expression.evaluate_or_unknown(values, counters.note)
 
 
-def _numbers(
-    signal: CompiledSignal, window: list[tuple[Sample, Value | Unknown]], counters: RuleCounters
-) -> list[float]:
-    """The numbers among the values: what is unknown is left out, what is something else is an error as well."""
-    numbers = []
-    for _, value in window:
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            numbers.append(float(value))
-        elif value is not UNKNOWN:
-            counters.errors += 1
-            counters.last_error = f"signal {signal.name}: {signal.aggregate} needs numbers, is {value!r:.80}"
-    return numbers
+_NEWEST: Final = {Aggregate.LAST: 1, Aggregate.PREVIOUS: 2}
+"""How many samples from the newest on an aggregate looks at, where not at all."""
+
+_ALWAYS_KNOWN: Final[Mapping[Aggregate, Value]] = {Aggregate.COUNT: 0.0, Aggregate.ANY: False}
+"""The aggregates that a client without samples, or with a stale stream, has as well: what they are of nothing."""
 
 
-def _aggregated(aggregate: Aggregate, numbers: list[float]) -> float | Unknown:
-    if not numbers:
-        return UNKNOWN
+def _aggregated(
+    signal: CompiledSignal, window: Sequence[tuple[Sample, Value | Unknown]], counters: RuleCounters
+) -> Value | Unknown:
+    """The window's value; the window is given from the newest on."""
+    aggregate = signal.aggregate
     match aggregate:
-        case Aggregate.MIN:
-            result = min(numbers)
-        case Aggregate.MAX:
-            result = max(numbers)
-        case _:
-            result = _mean(numbers)
-    return UNKNOWN if math.isnan(result) else result
+        case Aggregate.COUNT:
+            return float(len(window))
+        case Aggregate.LAST | Aggregate.FIRST:
+            return window[0 if aggregate is Aggregate.LAST else -1][1] if window else UNKNOWN
+        case Aggregate.PREVIOUS:
+            return window[1][1] if len(window) > 1 else UNKNOWN
+    known = [(sample.time, value) for sample, value in reversed(window) if not isinstance(value, Unknown)]
+    match aggregate:
+        case Aggregate.DISTINCT:
+            return distinct([value for _, value in known])
+        case Aggregate.ALL | Aggregate.ANY:
+            truths = [value for _, value in _fitting(signal, known, _is_boolean, "booleans", counters)]
+            if aggregate is Aggregate.ANY:
+                return any(truths)
+            return all(truths) if truths else UNKNOWN
+    numbers = _fitting(signal, known, is_number, "numbers", counters)
+    return calculated(aggregate, cast("list[Timed]", numbers))
 
 
-def _mean(numbers: list[float]) -> float:
-    """The mean to the last digit; infinite where one of the numbers is, NaN where they are infinite both ways."""
-    infinite = [number for number in numbers if math.isinf(number)]
-    if infinite:
-        return sum(infinite)
-    try:
-        return math.fsum(numbers) / len(numbers)
-    except OverflowError:  # the sum is beyond what a double holds, the mean is not
-        return math.fsum(number / len(numbers) for number in numbers)
+def _fitting(
+    signal: CompiledSignal,
+    known: Sequence[tuple[int, Value]],
+    fits: Callable[[object], bool],
+    wanted: str,
+    counters: RuleCounters,
+) -> list[tuple[int, Value]]:
+    """The values of the kind that the aggregate takes; the others are left out, and counted as errors."""
+    fitting = []
+    for time, value in known:
+        if fits(value):
+            fitting.append((time, value))
+        else:
+            counters.errors += 1
+            counters.last_error = f"signal {signal.name}: {signal.aggregate} needs {wanted}, is {value!r:.80}"
+    return fitting
+
+
+def _is_boolean(value: object) -> bool:
+    return isinstance(value, bool)

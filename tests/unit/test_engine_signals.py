@@ -23,6 +23,9 @@ VALUE = "has(msg.z) ? msg.z / 0.0 : msg.v"
 
 BIG = "msg.v > 1"
 
+TRUTH = "has(msg.z) ? msg.z > 0 : type(msg.v) == bool ? msg.v : type(msg.v) == double ? msg.v > -1 : msg.v"
+"""A boolean, a text (which All and Any leave out), or unknown."""
+
 DETECTOR = a_detector(
     a_stream("speed", staleAfter="3s", buffer={"duration": "4s"}), a_stream("probe"), clientTimeout="1h"
 )
@@ -38,6 +41,18 @@ RULE = a_rule(
         {"name": "min", "stream": "speed", "aggregate": "Min", "over": "2s", "value": VALUE},
         {"name": "max_big", "stream": "speed", "aggregate": "Max", "over": "2s", "value": VALUE, "where": BIG},
         {"name": "mean", "stream": "speed", "aggregate": "Mean", "over": "2s", "value": VALUE},
+        {"name": "sum", "stream": "speed", "aggregate": "Sum", "over": "2s", "value": VALUE},
+        {"name": "deviation", "stream": "speed", "aggregate": "StdDev", "over": "2s", "value": VALUE},
+        {"name": "delta", "stream": "speed", "aggregate": "Delta", "over": "2s", "value": VALUE},
+        {"name": "rate_big", "stream": "speed", "aggregate": "Rate", "over": "2s", "value": VALUE, "where": BIG},
+        {"name": "rate", "stream": "speed", "aggregate": "Rate", "over": "2s", "value": VALUE},
+        {"name": "first", "stream": "speed", "aggregate": "First", "value": VALUE},
+        {"name": "first_over", "stream": "speed", "aggregate": "First", "over": "2s", "value": VALUE},
+        {"name": "previous", "stream": "speed", "aggregate": "Previous", "value": VALUE},
+        {"name": "previous_big", "stream": "speed", "aggregate": "Previous", "value": VALUE, "where": BIG},
+        {"name": "all", "stream": "speed", "aggregate": "All", "over": "2s", "value": TRUTH},
+        {"name": "any", "stream": "speed", "aggregate": "Any", "over": "2s", "value": TRUTH},
+        {"name": "distinct", "stream": "speed", "aggregate": "Distinct", "over": "2s", "value": VALUE},
         {"name": "age", "stream": "speed", "aggregate": "Age"},
         {"name": "age_big", "stream": "speed", "aggregate": "Age", "where": BIG},
     ],
@@ -64,6 +79,16 @@ class Sent:
         return self.payload.get("v")
 
     @property
+    def truth(self) -> bool | None:
+        """What TRUTH makes of it; None where that is unknown or a text."""
+        if not isinstance(self.payload, dict):
+            return None
+        if "z" in self.payload:
+            return bool(self.payload["z"] > 0)
+        value = self.payload.get("v")
+        return value if isinstance(value, bool) else value > -1 if isinstance(value, int | float) else None
+
+    @property
     def is_big(self) -> bool:
         """Whether BIG is true for it."""
         value = self.payload.get("v") if isinstance(self.payload, dict) else None
@@ -78,6 +103,7 @@ def expected(sent: list[Sent], now: float, since: float, gap: float | None) -> d
     big = [sample for sample in past if sample.is_big]
     known: dict[str, Any] = {
         "count": len(window),
+        "any": any(s.truth for s in window),
         "count_big": sum(sample.is_big for sample in window),
         "age": now - (past[-1].time if past else since),
         "age_big": now - (big[-1].time if big else since),
@@ -89,11 +115,70 @@ def expected(sent: list[Sent], now: float, since: float, gap: float | None) -> d
         known["min"] = min(numbers(window), default=None)
         known["max_big"] = max(numbers([sample for sample in window if sample.is_big]), default=None)
         known["mean"] = mean(numbers(window))
+        known["sum"] = total(numbers(window))
+        known["deviation"] = deviation(numbers(window))
+        known["delta"] = delta(of_numbers(window))
+        known["rate"] = rate(of_numbers(window))
+        known["rate_big"] = rate(of_numbers([sample for sample in window if sample.is_big]))
+        known["first"] = kept[0].value
+        known["first_over"] = window[0].value if window else None
+        known["previous"] = kept[-2].value if len(kept) > 1 else None
+        known["previous_big"] = ([None, None] + [sample for sample in kept if sample.is_big])[-2]
+        known["previous_big"] = known["previous_big"].value if known["previous_big"] else None
+        truths = [sample.truth for sample in window if sample.truth is not None]
+        known["all"] = all(truths) if truths else None
+        known["distinct"] = distinct([sample.value for sample in window]) or None
     return {name: value for name, value in known.items() if value is not None}
 
 
+def of_numbers(samples: list[Sent]) -> list[Sent]:
+    return [s for s in samples if isinstance(s.value, int | float) and not isinstance(s.value, bool)]
+
+
 def numbers(samples: list[Sent]) -> list[float]:
-    return [s.value for s in samples if isinstance(s.value, int | float) and not isinstance(s.value, bool)]
+    return [sample.value for sample in of_numbers(samples)]
+
+
+def total(values: list[float]) -> float | None:
+    infinite = {value for value in values if math.isinf(value)}
+    if infinite:
+        return infinite.pop() if len(infinite) == 1 else None
+    exact = sum(map(Fraction, values))
+    try:
+        return float(exact) if values else None
+    except OverflowError:
+        return math.inf if exact > 0 else -math.inf
+
+
+def deviation(values: list[float]) -> float | None:
+    if not values or any(map(math.isinf, values)):
+        return None
+    middle = sum(map(Fraction, values)) / len(values)
+    square = sum((Fraction(value) - middle) ** 2 for value in values) / len(values)
+    scale = max(1, math.isqrt(int(square)))
+    return scale * math.sqrt(square / scale**2)
+
+
+def delta(samples: list[Sent]) -> float | None:
+    if len(samples) < 2:
+        return None
+    return total([samples[-1].value, -samples[0].value])
+
+
+def rate(samples: list[Sent]) -> float | None:
+    difference = delta(samples)
+    if difference is None:
+        return None
+    return float(difference / (samples[-1].time - samples[0].time))
+
+
+def distinct(values: list[Any]) -> list[Any]:
+    found: list[Any] = []
+    for value in values:
+        plain = float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+        if plain is not None and not any(plain == other and type(plain) is type(other) for other in found):
+            found.append(plain)
+    return found
 
 
 def mean(values: list[float]) -> float | None:

@@ -28,14 +28,29 @@ class Aggregate(StrEnum):
     """How the samples of a window become one value."""
 
     LAST = "Last"
+    FIRST = "First"
+    PREVIOUS = "Previous"
     MIN = "Min"
     MAX = "Max"
     MEAN = "Mean"
+    SUM = "Sum"
     COUNT = "Count"
+    RATE = "Rate"
+    DELTA = "Delta"
+    STD_DEV = "StdDev"
+    ALL = "All"
+    ANY = "Any"
+    DISTINCT = "Distinct"
     AGE = "Age"
 
 
-WINDOWED = frozenset({Aggregate.MIN, Aggregate.MAX, Aggregate.MEAN, Aggregate.COUNT})
+OF_A_SAMPLE = frozenset({Aggregate.LAST, Aggregate.FIRST, Aggregate.PREVIOUS})
+"""The aggregates that are the value of one sample."""
+
+WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE})
+"""The aggregates that look at no value."""
+
+WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE}
 """The aggregates that need `over`."""
 
 
@@ -115,8 +130,8 @@ class Signal(Model):
 
     model_config = validations(
         (
-            "!(self.aggregate in ['Min', 'Max', 'Mean', 'Count']) || has(self.over)",
-            "the aggregates Min, Max, Mean and Count need a window: give over, e.g. over: 5s",
+            "self.aggregate in ['Last', 'First', 'Previous', 'Age'] || has(self.over)",
+            "all aggregates but Last, First, Previous and Age need a window: give over, e.g. over: 5s",
         ),
         (
             "(self.aggregate in ['Count', 'Age']) != has(self.value)",
@@ -135,20 +150,24 @@ class Signal(Model):
         default=None, description="CEL over msg, key and sample: only samples for which it is true count."
     )
     over: PositiveDuration | None = Field(
-        default=None, description="The window (t - over, t]. Needed by Min, Max, Mean and Count."
+        default=None,
+        description="The window (t - over, t]. Needed by all aggregates but Last, First, Previous and Age.",
     )
     aggregate: Aggregate = Field(
         default=Aggregate.LAST,
-        description="How samples become one value. Last: the newest. Age: seconds since the last one was received.",
+        description="How the samples become one value. Last, Previous, First: the newest, the one before, the oldest. "
+        "Min, Max, Mean, Sum, StdDev (of the population): of numbers. Delta: last - first; Rate: that per second. "
+        "All, Any: of booleans. Distinct: the list of different values. Count: how many samples. Age: seconds since "
+        "the last one was received.",
     )
 
     @model_validator(mode="after")
     def _complete(self) -> Signal:
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
-        if self.aggregate not in (Aggregate.COUNT, Aggregate.AGE) and self.value is None:
+        if self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
-        if self.aggregate in (Aggregate.COUNT, Aggregate.AGE) and self.value is not None:
+        if self.aggregate in WITHOUT_VALUE and self.value is not None:
             raise ValueError(f"aggregate {self.aggregate} looks at no value: remove value (where picks samples)")
         return self
 

@@ -1,0 +1,146 @@
+"""Aggregates: how the values of a window become one, or unknown.
+
+All take the values in order of time, the oldest first, without those that are unknown. Those that calculate take
+numbers only. Sums and differences are exact before they are rounded once, so that neither the order of a sum nor a
+counter of nanoseconds near 1e18 costs digits; beyond what a double holds they are infinite, as IEEE 754 says.
+
+Rate and Delta are (last - first)/(time between) and last - first, as the design says. StdDev is the population's
+(divided by n, so that of one value is 0), in two passes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from typing import Final
+
+from wayside.api.eventrule import Aggregate
+from wayside.expressions import UNKNOWN, Unknown, Value
+
+Number = float | int
+"""A double, or an integer beyond 2^53."""
+
+Timed = tuple[int, Number]
+"""A number and its sample's time in nanoseconds."""
+
+_SECOND = 10**9
+
+
+def is_number(value: object) -> bool:
+    """Whether aggregates calculate with the value: true and false are no numbers."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def calculated(aggregate: Aggregate, window: Sequence[Timed]) -> Number | Unknown:
+    """Min, Max, Mean, Sum, Rate, Delta or StdDev of the window; unknown with too few samples, or where it is NaN."""
+    if not window:
+        return UNKNOWN
+    result = _CALCULATED[aggregate](window)
+    return UNKNOWN if result is UNKNOWN or result != result else result  # noqa: PLR0124 (NaN differs from itself)
+
+
+def distinct(values: Sequence[Value]) -> list[Value] | Unknown:
+    """The different values, in order of their first appearance; unknown where there is none.
+
+    Equal are values of one type that hold the same, lists and maps included: 1 is not true, and not "1".
+    """
+    found: dict[object, Value] = {}
+    for value in values:
+        found.setdefault(_identity(value), value)
+    return list(found.values()) or UNKNOWN
+
+
+def _minimum(window: Sequence[Timed]) -> Number:
+    return min(number for _, number in window)
+
+
+def _maximum(window: Sequence[Timed]) -> Number:
+    return max(number for _, number in window)
+
+
+def _sum(window: Sequence[Timed]) -> Number:
+    """Infinite where one of the numbers is, NaN where they are infinite both ways."""
+    return _over([number for _, number in window], 1)
+
+
+def _mean(window: Sequence[Timed]) -> Number:
+    return _over([number for _, number in window], len(window))
+
+
+def _over(numbers: Sequence[Number], divisor: int) -> float:
+    """The sum of the numbers over the divisor; what only the sum is too large for is no matter."""
+    infinite = [number for number in numbers if math.isinf(number)]
+    if infinite:
+        return float(sum(infinite))
+    if not any(isinstance(number, int) for number in numbers):
+        try:
+            return math.fsum(numbers) / divisor
+        except OverflowError:
+            pass
+    return _double(sum(map(Fraction, numbers), Fraction()) / divisor)
+
+
+def _deviation(window: Sequence[Timed]) -> Number:
+    numbers = [float(number) for _, number in window]
+    scale = max(map(abs, numbers))
+    if math.isinf(scale):
+        return math.nan
+    if scale == 0:
+        return 0.0
+    scaled = [number / scale for number in numbers]  # so that no square overflows
+    mean = math.fsum(scaled) / len(scaled)
+    return scale * math.sqrt(math.fsum((number - mean) ** 2 for number in scaled) / len(scaled))
+
+
+def _delta(window: Sequence[Timed]) -> Number | Unknown:
+    if len(window) < 2:
+        return UNKNOWN
+    return _difference(window[-1][1], window[0][1])
+
+
+def _rate(window: Sequence[Timed]) -> Number | Unknown:
+    """Per second. Unknown where the samples are of one time, which only stamps can be."""
+    if len(window) < 2 or window[-1][0] == window[0][0]:
+        return UNKNOWN
+    first, last = window[0][1], window[-1][1]
+    between = Fraction(window[-1][0] - window[0][0], _SECOND)
+    if math.isinf(first) or math.isinf(last):
+        return float(last) - float(first)
+    return _double((Fraction(last) - Fraction(first)) / between)
+
+
+def _difference(last: Number, first: Number) -> float:
+    if math.isinf(first) or math.isinf(last):
+        return float(last) - float(first)
+    return _double(Fraction(last) - Fraction(first))
+
+
+def _double(exact: Fraction) -> float:
+    """Rounded once; infinite beyond what a double holds."""
+    try:
+        return float(exact)
+    except OverflowError:
+        return math.inf if exact > 0 else -math.inf
+
+
+def _identity(value: Value) -> object:
+    """What makes the value this one, as a key of a dictionary."""
+    if isinstance(value, list):
+        return (list, *map(_identity, value))
+    if isinstance(value, dict):
+        return (dict, *sorted(((str(key), _identity(part)) for key, part in value.items()), key=lambda each: each[0]))
+    if isinstance(value, bool | str | bytes) or value is None:
+        return (type(value), value)
+    return (float, value)  # a double and an integer that are the same number are one
+
+
+_CALCULATED: Final[Mapping[Aggregate, Callable[[Sequence[Timed]], Number | Unknown]]] = {
+    Aggregate.MIN: _minimum,
+    Aggregate.MAX: _maximum,
+    Aggregate.MEAN: _mean,
+    Aggregate.SUM: _sum,
+    Aggregate.RATE: _rate,
+    Aggregate.DELTA: _delta,
+    Aggregate.STD_DEV: _deviation,
+}
