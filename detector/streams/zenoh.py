@@ -8,7 +8,6 @@ of their own, so that the network never slows the evaluation.
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 from collections import deque
@@ -17,10 +16,14 @@ from typing import NoReturn
 
 import zenoh
 
-from wayside.api.detector import Stream, Zenoh, ZenohMode
+from detector.streams.session import Connections, NetworkError, await_session, open_session
+from wayside.api.detector import Stream
+from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.keys import KeyPattern
 
 log = logging.getLogger(__name__)
+
+__all__ = ["EVENT_ENCODING", "Network", "NetworkError", "Put", "open_session"]
 
 Put = Callable[[str, bytes], None]
 """Takes a message: its key and payload. Thread-safe, and never waits."""
@@ -29,13 +32,6 @@ EVENT_ENCODING = "application/cloudevents+json"
 _CHANNEL = 16_384
 """So many samples of a stream wait for its thread while the evaluation holds the interpreter's lock. Once they are full
 Zenoh's own queues fill, and then it is the sender's congestion control that says whether it waits or drops."""
-
-_RETRY_SECONDS = (0.2, 0.5, 1.0, 2.0)
-"""Waits between attempts to reach a router at the start; the last one repeats."""
-
-
-class NetworkError(ValueError):
-    """The Zenoh session cannot be had as configured; the text names the field and the reason."""
 
 
 class Network:
@@ -65,14 +61,15 @@ class Network:
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._session: zenoh.Session | None = None
+        self._connections: Connections | None = None
         self._receivers: list[threading.Thread] = []
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
         self.dropped_events = 0
         """Events that found the queue full, or that Zenoh refused."""
 
     def start(self) -> None:
-        """Opens the session: a peer's at once (raises NetworkError), a client's in the background until it succeeds."""
-        if self._config.mode is ZenohMode.PEER:
+        """Opens the session: a client's in the background until it succeeds, else at once (raises NetworkError)."""
+        if self._config.mode is not ZenohMode.CLIENT:
             self._join(open_session(self._config))
         self._thread.start()
 
@@ -87,9 +84,9 @@ class Network:
 
     @property
     def connected(self) -> bool:
-        """Whether a router or another peer is connected right now."""
-        session = self._session
-        return session is not None and bool(session.info.routers_zid() or session.info.peers_zid())
+        """Whether a router, a peer or a client is connected right now."""
+        connections = self._connections
+        return connections is not None and connections.any
 
     def close(self, timeout: float = 2.0) -> None:
         """Publishes what still waits, for at most `timeout` seconds, and leaves the network."""
@@ -100,6 +97,9 @@ class Network:
             self._thread.join(timeout)
         if (session := self._session) is not None:
             self._session = None
+            if self._connections is not None:
+                self._connections.close()
+                self._connections = None
             session.close()  # type: ignore[no-untyped-call]  # frees the threads: of a put that waits, and of receiving
         for receiver in self._receivers:
             receiver.join(timeout)
@@ -108,6 +108,7 @@ class Network:
             log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
 
     def _join(self, session: zenoh.Session) -> None:
+        self._connections = Connections(session)
         for name, expression, put in self._subscriptions:
             subscriber = session.declare_subscriber(expression, zenoh.handlers.FifoChannel(_CHANNEL))
             thread = threading.Thread(target=self._receive, args=(subscriber, put), name=f"stream {name}", daemon=True)
@@ -164,30 +165,6 @@ class Network:
             log.warning("event on %s was not published: %s", key, error)
 
 
-def open_session(config: Zenoh) -> zenoh.Session:
-    """Opens a session. A peer connects in the background; a client must reach a router now. Raises NetworkError."""
-    try:
-        return zenoh.open(_settings(config))
-    except zenoh.ZError as error:
-        raise NetworkError(
-            f"zenoh: no session as {config.mode} with connect {[*config.connect]}, listen {[*config.listen]}: {error}"
-        ) from error
-
-
-def await_session(config: Zenoh, stop: threading.Event) -> zenoh.Session | None:
-    """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
-    attempt = 0
-    while not stop.is_set():
-        try:
-            return open_session(config)
-        except NetworkError as error:
-            if attempt == 0:
-                log.warning("%s; trying on", error)
-        stop.wait(_RETRY_SECONDS[min(attempt, len(_RETRY_SECONDS) - 1)])
-        attempt += 1
-    return None
-
-
 def _pump(samples: zenoh.handlers.Handler[zenoh.Sample], put: Put) -> NoReturn:
     """Hands over every message; raises ZError once the session is closed and none is left."""
     receive, try_receive, put_kind = samples.recv, samples.try_recv, zenoh.SampleKind.PUT
@@ -198,22 +175,3 @@ def _pump(samples: zenoh.handlers.Handler[zenoh.Sample], put: Put) -> NoReturn:
             if payload or sample.kind == put_kind:  # a deletion is no message; asking each for its kind would cost more
                 put(str(sample.key_expr), payload)
             sample = try_receive()
-
-
-def _settings(config: Zenoh) -> zenoh.Config:
-    settings = zenoh.Config()
-    values: dict[str, object] = {
-        "mode": config.mode.value,
-        "connect/endpoints": [*config.connect],
-        # A peer goes on trying in the background. A client's open() would not return: `await_session` tries for it.
-        "connect/timeout_ms": -1 if config.mode is ZenohMode.PEER else 0,
-        "connect/exit_on_failure": config.mode is not ZenohMode.PEER,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
-        "scouting/multicast/enabled": config.scouting,
-    }
-    if config.listen:
-        values["listen/endpoints"] = [*config.listen]
-        values["listen/exit_on_failure"] = True
-    for path, value in values.items():
-        settings.insert_json5(path, json.dumps(value))
-    return settings

@@ -21,7 +21,7 @@ from tests.cluster.managed_world import condition, start_manager, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until
 from tests.unit.ros_messages import cdr, pose_stamped
-from wayside.api.detector import Zenoh, ZenohMode
+from wayside.api.zenoh import Zenoh, ZenohMode
 
 NEAR, BETWEEN, FAR = 100.0, 175.0, 250.0
 """Metres: starts an episode; keeps an open one and starts none; ends it."""

@@ -1,52 +1,26 @@
 """Samples arrive from real Zenoh sessions, in order and whenever the other side appears; events go out."""
 
 import socket
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
 import zenoh
 
-from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError, Put
-from wayside.api.detector import Encoding, Stream, Zenoh, ZenohMode
-
-
-class Arrivals:
-    """What the streams took in, to be waited for."""
-
-    def __init__(self) -> None:
-        self.seen: list[tuple[str, str, bytes]] = []
-        self._changed = threading.Condition()
-
-    def putter(self, stream: str) -> Put:
-        def put(key: str, payload: bytes) -> None:
-            with self._changed:
-                self.seen.append((stream, key, payload))
-                self._changed.notify_all()
-
-        return put
-
-    def wait_for(self, done: Callable[[list[tuple[str, str, bytes]]], bool]) -> None:
-        with self._changed:
-            assert self._changed.wait_for(lambda: done(self.seen), timeout=10), self.seen
+from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
+from tests.unit.networks import Arrivals, free_endpoint, stream
+from wayside.api.zenoh import Zenoh, ZenohMode
 
 
 @pytest.fixture
 def endpoint() -> str:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture
 def arrivals() -> Arrivals:
     return Arrivals()
-
-
-def stream(name: str = "pose", key: str = "vehicles/${client:*}/pose") -> Stream:
-    return Stream(name=name, key=key, encoding=Encoding.JSON)
 
 
 def session(mode: str, *, listen: str | None = None, connect: str | None = None) -> zenoh.Session:
@@ -94,7 +68,8 @@ def test_deletions_are_no_samples_but_empty_payloads_are(listening: Network, end
 def test_data_flows_once_the_router_exists_and_again_after_it_was_away(
     mode: ZenohMode, endpoint: str, arrivals: Arrivals
 ) -> None:
-    network = Network(Zenoh(mode=mode, connect=[endpoint]), [stream()], arrivals.putter)
+    listen = ["tcp/127.0.0.1:0"] if mode is ZenohMode.ROUTER else []
+    network = Network(Zenoh(mode=mode, connect=[endpoint], listen=listen), [stream()], arrivals.putter)
     network.start()
     assert not network.connected
     for text in (b"first", b"second"):

@@ -20,35 +20,7 @@ from wayside.api.base import (
     conditions_field,
     validations,
 )
-
-Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
-"""A Zenoh endpoint such as tcp/zenoh:7447."""
-
-
-class ZenohMode(StrEnum):
-    """How the detector takes part in the Zenoh network."""
-
-    CLIENT = "client"
-    PEER = "peer"
-
-
-class Zenoh(Model):
-    """The detector's Zenoh session."""
-
-    mode: ZenohMode = Field(default=ZenohMode.PEER, description="client (of a router) or peer.")
-    connect: list[Endpoint] = Field(
-        default_factory=list,
-        max_length=16,
-        description="Endpoints to connect to, e.g. tcp/zenoh:7447. Lost connections are sought again.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
-    )
-    listen: list[Endpoint] = Field(
-        default_factory=list,
-        max_length=16,
-        description="Endpoints to listen on, e.g. tcp/0.0.0.0:7447. A peer without any listens on a free port.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
-    )
-    scouting: bool = Field(default=False, description="Whether to look for others by multicast.")
+from wayside.api.zenoh import Zenoh
 
 
 class Client(Model):

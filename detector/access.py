@@ -1,0 +1,115 @@
+"""Certificates and credentials as programs need them: files and texts. They are read when a connection is made.
+
+A Secret is a folder named like it, in the folder that the environment variable `WAYSIDE_SECRETS` names (default:
+/etc/wayside/secrets), with a file for each of its keys: as Kubernetes mounts it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from wayside.api.access import Access
+
+SECRETS_VARIABLE = "WAYSIDE_SECRETS"
+SECRETS_FOLDER = "/etc/wayside/secrets"
+
+
+class AccessError(ValueError):
+    """A certificate or password that is not where the resource says; the text names the field, never a secret."""
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """PEM files that are there."""
+
+    ca: Path | None
+    certificate: Path | None
+    key: Path | None
+    verify_name: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Login:
+    """A username and its password."""
+
+    username: str
+    password: str
+
+    def __repr__(self) -> str:
+        return f"Login({self.username!r})"
+
+
+def tls_files(access: Access, field: str) -> TlsFiles | None:
+    """The files to use for TLS, None where none are given; `field` is where `access` stands. Raises AccessError."""
+    if access.tls is not None:
+        tls = access.tls
+        return TlsFiles(
+            _file(tls.ca, f"{field}.tls.ca"),
+            _file(tls.certificate, f"{field}.tls.certificate"),
+            _file(tls.key, f"{field}.tls.key"),
+            tls.verify_name,
+        )
+    if access.tls_secret is None:
+        return None
+    at = f"{field}.tlsSecret"
+    folder = _secret(access.tls_secret, at)
+    own = (folder / "tls.crt").exists()
+    return TlsFiles(
+        _file(folder / "ca.crt", at),
+        _file(folder / "tls.crt", at) if own else None,
+        _file(folder / "tls.key", at) if own else None,
+        verify_name=True,
+    )
+
+
+def login(access: Access, field: str) -> Login | None:
+    """The credentials to use, None where none are given; `field` is where `access` stands. Raises AccessError."""
+    given = access.credentials
+    if given is not None:
+        if given.password_file is not None:
+            return Login(given.username, _text(Path(given.password_file), f"{field}.credentials.passwordFile"))
+        variable = given.password_variable or ""
+        password = os.environ.get(variable)
+        if password is None:
+            raise AccessError(
+                f"{field}.credentials.passwordVariable: the environment variable {variable} is not set: set it"
+            )
+        return Login(given.username, password)
+    if access.credentials_secret is None:
+        return None
+    at = f"{field}.credentialsSecret"
+    folder = _secret(access.credentials_secret, at)
+    return Login(_text(folder / "username", at), _text(folder / "password", at))
+
+
+def _secret(name: str, field: str) -> Path:
+    folder = Path(os.environ.get(SECRETS_VARIABLE, SECRETS_FOLDER)) / name
+    if not folder.is_dir():
+        raise AccessError(f"{field}: the Secret {name} is not mounted at {folder}: mount it, or set {SECRETS_VARIABLE}")
+    return folder
+
+
+def _file(path: str | Path | None, field: str) -> Path | None:
+    if path is None:
+        return None
+    try:
+        with Path(path).open("rb"):
+            return Path(path)
+    except OSError as error:
+        raise _unreadable(Path(path), field, error) from error
+
+
+def _text(path: Path, field: str) -> str:
+    try:
+        return path.read_text(encoding="utf-8").removesuffix("\n")
+    except UnicodeDecodeError as error:
+        raise AccessError(f"{field}: {path} is no UTF-8 text: write it anew") from error
+    except OSError as error:
+        raise _unreadable(path, field, error) from error
+
+
+def _unreadable(path: Path, field: str, error: OSError) -> AccessError:
+    reason = error.strerror or type(error).__name__
+    return AccessError(f"{field}: {path} cannot be read: {reason}: put it there, or correct the field")

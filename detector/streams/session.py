@@ -1,0 +1,144 @@
+"""Zenoh sessions as a Detector configures them: how one is opened, and when its connections come and go."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+
+import zenoh
+
+from detector.access import AccessError, login, tls_files
+from wayside.api.zenoh import Zenoh, ZenohMode
+
+log = logging.getLogger(__name__)
+
+_RETRY_SECONDS = (0.2, 0.5, 1.0, 2.0)
+"""Waits between attempts to reach a router at the start; the last one repeats."""
+
+_FIELD = "spec.zenoh"
+
+
+class NetworkError(ValueError):
+    """The Zenoh session cannot be had as configured; the text names the field and the reason."""
+
+
+def open_session(config: Zenoh) -> zenoh.Session:
+    """Opens a session. A peer or router connects in the background; a client must reach a router now.
+
+    Raises NetworkError.
+    """
+    try:
+        return zenoh.open(_settings(config))
+    except AccessError as error:
+        raise NetworkError(str(error)) from error
+    except zenoh.ZError as error:
+        raise NetworkError(
+            f"zenoh: no session as {config.mode} with connect {[*config.connect]}, listen {[*config.listen]}: {error}"
+        ) from error
+
+
+def await_session(config: Zenoh, stop: threading.Event) -> zenoh.Session | None:
+    """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
+    attempt, said = 0, ""
+    while not stop.is_set():
+        try:
+            return open_session(config)
+        except NetworkError as error:
+            if str(error) != said:
+                said = str(error)
+                log.warning("%s; trying on", error)
+        stop.wait(_RETRY_SECONDS[min(attempt, len(_RETRY_SECONDS) - 1)])
+        attempt += 1
+    return None
+
+
+class Connections:
+    """Who is connected to a session right now: says in the log when the last one goes, and when one is back."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._lock = threading.Lock()
+        self._others: set[str] = set()
+        self._alone = False
+        self._router_left: float | None = None
+        self._closing = False
+        self._listener = session.info.declare_transport_events_listener(self._take, history=True)
+
+    @property
+    def any(self) -> bool:
+        """Whether a router, a peer or a client is connected."""
+        return bool(self._others)
+
+    def router_left_within(self, seconds: float) -> bool:
+        """Whether the connection to a router ended in the last seconds: what it says is gone may be there still."""
+        left = self._router_left
+        return left is not None and time.monotonic() - left <= seconds
+
+    def close(self) -> None:
+        """From now on, connections end because we end them: nothing is said about it."""
+        self._closing = True
+
+    def _take(self, event: zenoh.TransportEvent) -> None:
+        """Zenoh's thread calls it for every connection that opens or closes."""
+        other = str(event.transport.zid)
+        role = str(event.transport.whatami)
+        with self._lock:
+            if event.kind == zenoh.SampleKind.PUT:
+                self._others.add(other)
+                if self._alone:
+                    self._alone = False
+                    log.info("zenoh: connected again, to %s %s", role, other)
+                return
+            self._others.discard(other)
+            if event.transport.whatami == zenoh.WhatAmI.ROUTER:
+                self._router_left = time.monotonic()
+            if not self._others and not self._closing:
+                self._alone = True
+                log.warning("zenoh: the connection to %s %s is lost, nobody is connected; trying on", role, other)
+
+
+def _settings(config: Zenoh) -> zenoh.Config:
+    """Raises AccessError."""
+    waits = config.mode is ZenohMode.CLIENT
+    values: dict[str, object] = {
+        "mode": config.mode.value,
+        "connect/endpoints": [*config.connect],
+        # A peer goes on trying in the background. A client's open() would not return: `await_session` tries for it.
+        "connect/timeout_ms": 0 if waits else -1,
+        "connect/exit_on_failure": waits,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
+        "scouting/multicast/enabled": config.scouting,
+        "transport/shared_memory/enabled": config.shared_memory,
+        **_tls(config),
+    }
+    if config.listen:
+        values["listen/endpoints"] = [*config.listen]
+        values["listen/exit_on_failure"] = True
+    if (credentials := login(config, _FIELD)) is not None:
+        values["transport/auth/usrpwd/user"] = credentials.username
+        values["transport/auth/usrpwd/password"] = credentials.password
+    settings = zenoh.Config()
+    for path, value in values.items():
+        settings.insert_json5(path, json.dumps(value))
+    return settings
+
+
+def _tls(config: Zenoh) -> dict[str, object]:
+    """Raises AccessError."""
+    files = tls_files(config, _FIELD)
+    if files is None:
+        return {}
+    at = "transport/link/tls/"
+    values: dict[str, object] = {f"{at}verify_name_on_connect": files.verify_name}
+    if files.ca is not None:
+        values[f"{at}root_ca_certificate"] = str(files.ca)
+    if files.certificate is not None and files.key is not None:
+        values |= {
+            f"{at}connect_certificate": str(files.certificate),
+            f"{at}connect_private_key": str(files.key),
+            f"{at}listen_certificate": str(files.certificate),
+            f"{at}listen_private_key": str(files.key),
+            f"{at}enable_mtls": files.ca is not None,
+        }
+    return values

@@ -1,0 +1,69 @@
+"""Networks for tests: endpoints that are free, routers, and what the detector's streams took in."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import zenoh
+
+from detector.streams.zenoh import Put
+from wayside.api.detector import Encoding, Stream
+
+
+class Arrivals:
+    """What the streams took in, to be waited for."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, str, bytes]] = []
+        self._changed = threading.Condition()
+
+    def putter(self, stream: str) -> Put:
+        def put(key: str, payload: bytes) -> None:
+            with self._changed:
+                self.seen.append((stream, key, payload))
+                self._changed.notify_all()
+
+        return put
+
+    def wait_for(self, done: Callable[[list[tuple[str, str, bytes]]], bool]) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: done(self.seen), timeout=10), self.seen
+
+
+def stream(name: str = "pose", key: str = "vehicles/${client:*}/pose", **fields: Any) -> Stream:
+    return Stream(name=name, key=key, encoding=Encoding.JSON, **fields)
+
+
+def free_port() -> int:
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def free_endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+@contextmanager
+def router(**settings: Any) -> Iterator[zenoh.Session]:
+    """A Zenoh router with these settings, paths with __ for /."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    for path, value in settings.items():
+        config.insert_json5(path.replace("__", "/"), json.dumps(value))
+    with zenoh.open(config) as session:
+        yield session
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 10) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

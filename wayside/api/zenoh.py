@@ -1,0 +1,65 @@
+"""The detector's place in a Zenoh network."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from wayside.api.access import ACCESS_VALIDATIONS, Access
+from wayside.api.base import validations
+
+Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
+"""A Zenoh endpoint such as tcp/zenoh:7447."""
+
+_ENCRYPTED = ("tls/", "quic/")
+
+_NO_CERTIFICATE = (
+    "an endpoint to listen on with TLS needs a certificate: give tls.certificate and tls.key, or tlsSecret"
+)
+
+
+class ZenohMode(StrEnum):
+    """How the detector takes part in the Zenoh network."""
+
+    CLIENT = "client"
+    PEER = "peer"
+    ROUTER = "router"
+
+
+class Zenoh(Access):
+    """The detector's Zenoh session."""
+
+    model_config = validations(*ACCESS_VALIDATIONS)
+
+    mode: ZenohMode = Field(
+        default=ZenohMode.PEER, description="client (of a router), peer, or router (others may connect through it)."
+    )
+    connect: list[Endpoint] = Field(
+        default_factory=list,
+        max_length=16,
+        description="Endpoints to connect to, e.g. tcp/zenoh:7447 or tls/zenoh:7447. "
+        "Lost connections are sought again.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    listen: list[Endpoint] = Field(
+        default_factory=list,
+        max_length=16,
+        description="Endpoints to listen on, e.g. tcp/0.0.0.0:7447. Without any, a peer listens on a free port and a "
+        "router on 7447.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    scouting: bool = Field(default=False, description="Whether to look for others by multicast.")
+    shared_memory: bool = Field(
+        default=False,
+        description="Whether publishers on the same machine may hand samples over in shared memory; "
+        "the pods must then share /dev/shm.",
+    )
+
+    @model_validator(mode="after")
+    def _has_certificate(self) -> Zenoh:
+        listens = any(endpoint.startswith(_ENCRYPTED) for endpoint in self.listen)
+        if listens and self.tls_secret is None and (self.tls is None or self.tls.certificate is None):
+            raise ValueError(_NO_CERTIFICATE)
+        return self
