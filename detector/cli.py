@@ -17,8 +17,8 @@ from detector.checking import check_documents, summary
 from detector.cluster.errors import NoClusterError
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import is_intake_file, read_intake
+from detector.replay.latched import recorded_arrivals
 from detector.replay.progress import Progress
-from detector.replay.recordings import open_recordings
 from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
 from detector.replay.routing import Router
 from detector.rules.files import load_rules
@@ -160,7 +160,7 @@ def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] |
         typer.echo(warning, err=True)
     rule_set = loaded.rule_set
     router = Router(rule_set.detector.spec.streams)
-    arrivals = router.arrivals(open_recordings(recordings, router.wanted))
+    arrivals = recorded_arrivals(recordings, router, rule_set.detector)
     outcome = replay_arrivals(progress.watch(arrivals), rule_set.detector, rule_set.rules)
     if not outcome.samples:
         keys = ", ".join(router.unrouted) or "none"

@@ -22,20 +22,40 @@ _SLACK = 64
 class Lane:
     """The samples of one client on one stream, in order of time."""
 
-    __slots__ = ("bytes", "client", "duration", "evicted", "latest", "maximum_bytes", "samples", "stream")
+    __slots__ = (
+        "bytes", "capped", "client", "duration", "evicted", "latest", "maximum_bytes", "maximum_count", "samples",
+        "stream",
+    )  # fmt: skip
 
-    def __init__(self, client: str, stream: str, duration: int, maximum_bytes: int | None) -> None:
+    latched = False
+    """Whether what was said last holds until it is said anew; such lanes are the last that the cap over all empties."""
+
+    def __init__(
+        self,
+        client: str,
+        stream: str,
+        duration: int,
+        maximum_bytes: int | None = None,
+        maximum_count: int | None = None,
+    ) -> None:
         """`duration` is in nanoseconds."""
         self.client = client
         self.stream = stream
-        self.duration = duration
-        self.maximum_bytes = maximum_bytes
+        self.limit(duration, maximum_bytes, maximum_count)
         self.samples: deque[Sample] = deque()
         self.bytes = 0
         self.latest = NEVER
         """The greatest time of all samples that came, also of those that a cap pushed out."""
         self.evicted = 0
         """Samples that a cap pushed out before their time."""
+
+    def limit(self, duration: int, maximum_bytes: int | None, maximum_count: int | None) -> None:
+        """Keep to these from the next sample and tick on; `duration` is in nanoseconds."""
+        self.duration = duration
+        self.maximum_bytes = maximum_bytes
+        self.maximum_count = maximum_count
+        self.capped = maximum_bytes is not None or maximum_count is not None
+        """Whether samples have to come in through `insert`, since it looks at the caps."""
 
     @property
     def newest(self) -> Sample | None:
@@ -60,6 +80,10 @@ class Lane:
             while self.bytes > self.maximum_bytes and len(samples) > 1:
                 size -= self.drop_oldest()
                 self.evicted += 1
+        if self.maximum_count is not None:
+            while len(samples) > self.maximum_count:
+                size -= self.drop_oldest()
+                self.evicted += 1
         return size
 
     def drop_oldest(self) -> int:
@@ -75,8 +99,8 @@ class Lane:
             freed += self.drop_oldest()
         return freed
 
-    def clear(self) -> None:
-        """Forget all samples, and that there were any."""
+    def step_back(self, to: int) -> None:
+        """Time goes on from `to`, which is earlier: forget all samples, and that there were any."""
         self.samples.clear()
         self.bytes = 0
         self.latest = NEVER
@@ -140,11 +164,11 @@ class Buffer:
             if not lanes:
                 del self._lanes[client]
 
-    def clear(self) -> None:
-        """Forget all samples; the lanes stay."""
+    def step_back(self, to: int) -> None:
+        """Time goes on from `to`, which is earlier: forget all samples but latched ones; the lanes stay."""
         for lane in self:
-            lane.clear()
-        self.bytes = 0
+            lane.step_back(to)
+        self.bytes = sum(lane.bytes for lane in self)
 
     @property
     def evicted(self) -> int:
@@ -159,9 +183,18 @@ class Buffer:
         self._evicted_before += lane.evicted
 
     def shrink(self) -> None:
-        """Free the oldest samples over all lanes."""
+        """Free the oldest samples over all lanes, those of latched lanes only where nothing else is left."""
+        self._shrink(latched=False)
+        if self.bytes > self.maximum_bytes:
+            self._shrink(latched=True)
+
+    def _shrink(self, *, latched: bool) -> None:
         target = self.maximum_bytes - self.maximum_bytes // _SLACK
-        heads = [(lane.samples[0].time, index, lane) for index, lane in enumerate(self) if lane.samples]
+        heads = [
+            (lane.samples[0].time, index, lane)
+            for index, lane in enumerate(self)
+            if lane.samples and lane.latched is latched
+        ]
         heapq.heapify(heads)
         while self.bytes > target and heads:
             _, index, lane = heads[0]

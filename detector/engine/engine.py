@@ -16,11 +16,14 @@ from detector.engine.episodes import Reason
 from detector.engine.evaluation import Identity, RuleRun, same_semantics
 from detector.engine.events import Event
 from detector.engine.inflow import Inflow
+from detector.engine.lanes import lane_makers
 from detector.engine.messages import KeyReader, Messages
+from detector.engine.queries import BufferQueries
 from detector.engine.sample import Arrival, Decoder
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
 from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Ticks, Timeline, WallTimeline
+from detector.engine.transforms import Transforms, TransformStream
 from wayside.api import Detector
 from wayside.api.detector import Clock, Stream
 from wayside.rules import CompiledRule, compile_stream
@@ -71,13 +74,11 @@ class Engine:
         self._configure(detector, decoders, read_key)
         kept = {stream.name for stream in detector.spec.streams if _reads_like(stream, before.stream(stream.name))}
         self.buffer.keep(kept)
-        streams = {stream.name: stream for stream in detector.spec.streams}
         for lane in self.buffer:
-            stream = streams[lane.stream]
-            lane.duration = detector.spec.buffer_duration_ns(stream)
-            lane.maximum_bytes = None if stream.buffer.bytes is None else stream.buffer.bytes.bytes
+            self._lane_makers[lane.stream].limit(lane)
         if isinstance(self._timeline, DataTimeline):
             self._timeline.max_behind = _longest(detector)
+            self._timeline.latched = _latched(detector)
         times = (detector.spec.clock, detector.spec.lateness, detector.spec.max_ahead)
         if times != (before.clock, before.lateness, before.max_ahead):
             self._run(self._timeline.rest())
@@ -91,8 +92,10 @@ class Engine:
         self.detector = detector
         self.buffer.maximum_bytes = spec.buffer.bytes.bytes
         self.clients.configure({c.name: c.labels for c in spec.clients}, spec.client_timeout.ns)
-        self._inflow.configure(detector, read_key)
+        self._lane_makers = lane_makers(detector, decoders)
+        self._inflow.configure(detector, read_key, self._lane_makers)
         self._messages = Messages(decoders, compiled, read_key, self.counters)
+        self._transforms = Transforms(_transform_streams(detector), self.buffer, self._messages, self.counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
         self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after, self._floor)
 
@@ -178,6 +181,12 @@ class Engine:
         """The rules that are evaluated, by name."""
         return self._runs
 
+    def queries(self) -> BufferQueries:
+        """What is in the buffer now."""
+        return BufferQueries(
+            self.now, self._floor, self.buffer, self.clients, self._messages, self._stale_after, self._transforms
+        )
+
     def _run(self, steps: Iterable[Step]) -> list[Event]:
         events: list[Event] = []
         for step in steps:
@@ -204,11 +213,12 @@ class Engine:
                 views = Views(run.rule, time, self.clients, self.buffer, self._signals, self._stale_after, run.counters)
                 events += run.tick(time, views, self.clients)
         self._messages.forget()
+        self._transforms.forget()
         return events
 
     def _gap(self, time: int, backwards: bool) -> None:
         if backwards:
-            self.buffer.clear()
+            self.buffer.step_back(time)
         self._floor = time
         self._signals.gap(time)
         self.clients.gap(time)
@@ -231,6 +241,7 @@ class Engine:
                 arrival.stream, arrival.key, arrival.received, arrival.payload
             ),
             client_of=self._inflow.client_of,
+            latched=_latched(self.detector),
         )
 
 
@@ -239,13 +250,27 @@ def _longest(detector: Detector) -> int:
     return max(detector.spec.buffer_duration_ns(stream) for stream in detector.spec.streams)
 
 
+def _transform_streams(detector: Detector) -> list[TransformStream]:
+    return [
+        TransformStream(stream.name, stream.latched, stream.frame_prefix or "")
+        for stream in detector.spec.streams
+        if stream.carries_transforms
+    ]
+
+
+def _latched(detector: Detector) -> frozenset[str]:
+    """The streams whose samples hold until they are said anew."""
+    return frozenset(stream.name for stream in detector.spec.streams if stream.latched)
+
+
 def _reads_like(stream: Stream, before: Stream | None) -> bool:
     """Whether samples taken in before can be read as ones of the stream."""
-    return before is not None and (stream.key, stream.client, stream.encoding, stream.type) == (
+    return before is not None and (stream.key, stream.client, stream.encoding, stream.type, stream.latched) == (
         before.key,
         before.client,
         before.encoding,
         before.type,
+        before.latched,
     )
 
 

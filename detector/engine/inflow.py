@@ -12,6 +12,7 @@ from operator import itemgetter
 from detector.engine.buffer import Buffer, Lane
 from detector.engine.clients import Clients
 from detector.engine.counters import Counters
+from detector.engine.lanes import LaneMaker
 from detector.engine.messages import KeyReader
 from detector.engine.sample import SAMPLE_OVERHEAD, Arrival, Stamped
 from wayside.api import Detector
@@ -41,11 +42,10 @@ class Inflow:
         self._lost: dict[str, None] = {}
         """The lost clients of which samples are kept, in the order of their loss."""
 
-    def configure(self, detector: Detector, read_key: KeyReader) -> None:
-        """Take in the streams of this Detector from now on."""
-        self._detector = detector
+    def configure(self, detector: Detector, read_key: KeyReader, lane_makers: Mapping[str, LaneMaker]) -> None:
+        """Take in the streams of this Detector from now on; `lane_makers` has one for each."""
         self._read_key = read_key
-        self._streams = {stream.name: stream for stream in detector.spec.streams}
+        self._lane_makers = lane_makers
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
 
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
@@ -68,7 +68,7 @@ class Inflow:
             lane = lanes.get(stream, _NO_LANES).get(key) or self._lane(stream, key, time)
             if lane is None:
                 continue
-            if time >= lane.latest and lane.maximum_bytes is None:
+            if time >= lane.latest and not lane.capped:
                 lane.latest = time
                 lane.samples.append(arrival)
                 size = len(payload) + SAMPLE_OVERHEAD
@@ -113,16 +113,7 @@ class Inflow:
         if client not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS:
             self._counters.crowded[stream] += 1
             return None
-        spec = self._streams[stream]
-        limit = spec.buffer.bytes
-        lane = self._buffer.add(
-            Lane(
-                client,
-                stream,
-                self._detector.spec.buffer_duration_ns(spec),
-                None if limit is None else limit.bytes,
-            )
-        )
+        lane = self._buffer.add(self._lane_makers[stream].lane(client))
         if len(self._lanes[stream]) >= MAXIMUM_KEYS:
             self._lanes[stream].clear()
         self._lanes[stream][key] = lane
@@ -131,7 +122,7 @@ class Inflow:
         return lane
 
     def _read(self, stream: str, key: str) -> str | None:
-        whose = self._read_key(stream, key) if stream in self._streams else None
+        whose = self._read_key(stream, key) if stream in self._lane_makers else None
         if whose is None:
             self._counters.unnamed[stream] += 1  # also what still came in on a stream that the Detector no longer has
             return None

@@ -136,6 +136,9 @@ class DataTimeline:
     in a recording, a simulation that began again) shows in what follows: when samples in a row agree on another time,
     that time holds from then on. Two are enough, if they are of two clients or there is only one; one client among
     several must keep it up for `alone_after` while nobody contradicts.
+
+    A sample of a latched stream holds since long ago and says nothing of the time: it never moves it, and takes its
+    place at its stamp, or at the newest one where that is later.
     """
 
     def __init__(
@@ -150,11 +153,13 @@ class DataTimeline:
         maximum_bytes: int,
         stamp_of: Callable[[Arrival], int | None],
         client_of: Callable[[Arrival], str | None],
+        latched: frozenset[str] = frozenset(),
     ) -> None:
         """Times are in nanoseconds; `start` stands for now until the first stamp is seen.
 
         `maximum_bytes` bounds the payloads that wait; what comes when they are full is dropped and counted. `stamp_of`
-        and `client_of` give None where they cannot tell; the sample is then left out, and they count it.
+        and `client_of` give None where they cannot tell; the sample is then left out, and they count it. `latched` are
+        the names of the latched streams.
         """
         self._ticks = ticks
         self._lateness = lateness
@@ -173,6 +178,9 @@ class DataTimeline:
         self._some_client: str | None = None
         self._several_clients = False
         self._row: _Row | None = None
+        self._early: list[tuple[int, Arrival]] = []
+        """Latched samples that came before there was a time, with their stamps."""
+        self.latched = latched
         self.max_behind = max_behind
         self.now = start
         self.dropped_ahead = 0
@@ -188,6 +196,9 @@ class DataTimeline:
             client = self._client_of(arrival)
             stamp = None if client is None else self._stamp_of(arrival)
             if client is None or stamp is None:
+                continue
+            if arrival.stream in self.latched:
+                yield from self._hold(arrival, stamp)
                 continue
             self._know(client)
             newest = self._newest
@@ -225,8 +236,20 @@ class DataTimeline:
         """All that waits, at once: no tick of this axis comes any more."""
         yield from self._release(None)
 
+    def _hold(self, arrival: Arrival, stamp: int) -> Iterator[Step]:
+        """A sample of a latched stream."""
+        if self._newest is None:
+            self._early.append((stamp, arrival))
+        elif (place := min(stamp, self._newest)) <= self.now:
+            yield Insert((arrival,), (place,))
+        else:
+            self._wait(arrival, place)
+
     def _begin(self, stamp: int, backwards: bool) -> Gap:
         """Time begins, or begins anew, with this stamp."""
+        early, self._early = self._early, []
+        for latched_stamp, arrival in early:
+            self._wait(arrival, min(latched_stamp, stamp))
         self.now, self._ticked = stamp - 1, False
         return Gap(self.now, backwards)
 

@@ -46,6 +46,12 @@ class StreamBuffer(Model):
     bytes: PositiveQuantity | None = Field(
         default=None, description="The oldest samples beyond this size are forgotten."
     )
+    count: int | None = Field(
+        default=None, ge=1, le=1_000_000, description="The oldest samples beyond this number are forgotten."
+    )
+
+
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 class Stream(Model):
@@ -59,6 +65,10 @@ class Stream(Model):
         (
             "self.key.contains('${client:') != has(self.client)",
             "key must capture the client, as ${client:*}, or client must name it; not both",
+        ),
+        (
+            "!has(self.framePrefix) || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage')",
+            "framePrefix is for streams of type tf2_msgs/msg/TFMessage",
         ),
     )
 
@@ -94,6 +104,19 @@ class Stream(Model):
         default=StreamBuffer(), description="How much is kept; the Detector's buffer where absent."
     )
 
+    latched: bool = Field(
+        default=False,
+        description="What was said last holds until it is said anew, e.g. /tf_static, a map: the newest sample of each "
+        "key is kept beyond the buffer's duration, staleAfter is Never if not given, and a replay takes it first.",
+    )
+    frame_prefix: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=128,
+        description="Of a tf2_msgs/msg/TFMessage stream: what its frames' names begin with and lose, so that they are "
+        "the same for every client; ${client} in it is the client's name, e.g. ${client}/.",
+    )
+
     @model_validator(mode="after")
     def _coherent(self) -> Stream:
         if self.encoding is Encoding.CDR and self.type is None:
@@ -105,6 +128,8 @@ class Stream(Model):
             raise ValueError("key captures the client and client names one: remove one of them")
         if not captures and self.client is None:
             raise ValueError("key captures no client: write ${client:*} where its name stands, or give client")
+        if self.frame_prefix is not None and not self.carries_transforms:
+            raise ValueError("framePrefix is for streams of type tf2_msgs/msg/TFMessage: remove it")
         if self.stale_after is not None and self.stale_after != "Never":
             try:
                 PositiveDuration.parse(self.stale_after)
@@ -120,7 +145,12 @@ class Stream(Model):
     @property
     def never_stale(self) -> bool:
         """Whether the newest sample holds forever."""
-        return self.stale_after == "Never"
+        return self.stale_after == "Never" or (self.latched and self.stale_after is None)
+
+    @property
+    def carries_transforms(self) -> bool:
+        """Whether its samples feed the transform trees of their clients."""
+        return self.type == TRANSFORMS
 
 
 class Buffer(Model):

@@ -1,0 +1,96 @@
+"""Rotations and rigid transforms, as far as queries need them. Quaternions are (x, y, z, w), lengths are metres."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+_NEARLY_EQUAL = 1e-6
+"""Radians below which slerp divides by next to nothing: there, the straight line is as good."""
+
+
+class Pose(NamedTuple):
+    """A place and an orientation; also the transform that takes what is seen from there into the frame it is in."""
+
+    position: Vector
+    """Metres."""
+    orientation: Quaternion
+    """Of unit length."""
+
+    def apply(self, point: Vector) -> Vector:
+        """The point, given in the frame of this pose, in the frame that the pose is given in."""
+        return _added(self.position, rotated(self.orientation, point))
+
+    def after(self, other: Pose) -> Pose:
+        """First `other`, then this one."""
+        return Pose(self.apply(other.position), product(self.orientation, other.orientation))
+
+    def inverse(self) -> Pose:
+        """The way back."""
+        x, y, z, w = self.orientation
+        back = (-x, -y, -z, w)
+        px, py, pz = rotated(back, self.position)
+        return Pose((-px, -py, -pz), back)
+
+    def towards(self, other: Pose, share: float) -> Pose:
+        """Between this pose (share 0) and another (1): the position on the line, the orientation by slerp."""
+        place = tuple(a + (b - a) * share for a, b in zip(self.position, other.position, strict=True))
+        return Pose((place[0], place[1], place[2]), slerp(self.orientation, other.orientation, share))
+
+
+NO_MOTION = Pose((0.0, 0.0, 0.0), IDENTITY)
+
+
+def unit(quaternion: Quaternion) -> Quaternion | None:
+    """The quaternion at unit length; None where it is zero or not finite, and so is no orientation."""
+    length = math.hypot(*quaternion)
+    if not 1e-6 < length < math.inf:
+        return None
+    x, y, z, w = quaternion
+    return (x / length, y / length, z / length, w / length)
+
+
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """First b, then a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def rotated(quaternion: Quaternion, vector: Vector) -> Vector:
+    """The vector turned by a quaternion of unit length."""
+    x, y, z, w = quaternion
+    vx, vy, vz = vector
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx)
+
+
+def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
+    """On the shorter great circle from a (share 0) to b (1), at constant angular speed (Shoemake 1985)."""
+    cosine = sum(p * q for p, q in zip(a, b, strict=True))
+    sign = -1.0 if cosine < 0 else 1.0  # q and -q are the same orientation: take the one that is nearer
+    # An arccosine would lose half of the digits of a small angle.
+    angle = 2 * math.atan2(
+        math.hypot(*(p - sign * q for p, q in zip(a, b, strict=True))),
+        math.hypot(*(p + sign * q for p, q in zip(a, b, strict=True))),
+    )
+    if angle < _NEARLY_EQUAL:
+        first, second = 1 - share, share * sign
+    else:
+        first, second = math.sin((1 - share) * angle), math.sin(share * angle) * sign
+    mixed = tuple(p * first + q * second for p, q in zip(a, b, strict=True))
+    return unit((mixed[0], mixed[1], mixed[2], mixed[3])) or a
+
+
+def _added(a: Vector, b: Vector) -> Vector:
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])

@@ -1,0 +1,101 @@
+"""Lanes of latched streams: what was said last holds, however long ago, until it is said anew.
+
+What a sample speaks of is its key; of transforms (a /tf_static that several publishers share) the key and the frames.
+The newest sample about each is kept beyond the duration; caps push it out last of all.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Hashable
+
+from detector.engine.buffer import NEVER, Lane
+from detector.engine.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample, Stamped
+
+Topic = Callable[[str, bytes], Hashable]
+"""What a sample with that key and payload speaks of: a newer one about the same takes its place."""
+
+
+def by_key(key: str, payload: bytes) -> Hashable:
+    """A sample speaks of its key."""
+    return key
+
+
+def by_key_and_frames(decoder: Decoder) -> Topic:
+    """Transforms speak of their child frames; what cannot be read, of its key."""
+
+    def topic(key: str, payload: bytes) -> Hashable:
+        try:
+            return key, frozenset(each["child_frame_id"] for each in decoder.decode(payload)["transforms"])
+        except DecodeError:
+            return key
+
+    return topic
+
+
+class LatchedLane(Lane):
+    """The samples of one client on one latched stream. Not made for speed: such streams are rare and slow."""
+
+    __slots__ = ("_topic", "_topics")
+
+    latched = True
+
+    def __init__(
+        self,
+        client: str,
+        stream: str,
+        duration: int,
+        maximum_bytes: int | None = None,
+        maximum_count: int | None = None,
+        *,
+        topic: Topic,
+    ) -> None:
+        super().__init__(client, stream, duration, maximum_bytes, maximum_count)
+        self._topic = topic
+        self._topics: dict[Sample, Hashable] = {}
+
+    def limit(self, duration: int, maximum_bytes: int | None, maximum_count: int | None) -> None:
+        """See Lane. Every sample comes through `insert`."""
+        super().limit(duration, maximum_bytes, maximum_count)
+        self.capped = True
+
+    def insert(self, sample: Sample) -> int:
+        """See Lane."""
+        self._topics[sample] = self._topic(sample.key, sample.payload)
+        return super().insert(sample)
+
+    def drop_oldest(self) -> int:
+        """See Lane."""
+        self._topics.pop(self.samples[0], None)
+        return super().drop_oldest()
+
+    def expire(self, now: int) -> int:
+        """Forget what is older than the duration and was said anew since; returns the bytes freed."""
+        horizon = now - self.duration
+        if not self.samples or self.samples[0].time > horizon:
+            return 0
+        newest = {self._topics[sample]: sample for sample in self.samples}
+        return self._keep([s for s in self.samples if s.time > horizon or newest[self._topics[s]] is s])
+
+    def step_back(self, to: int) -> None:
+        """Time goes on from `to`: what was said still holds, and was not said after that."""
+        topics = {_not_after(sample, to): self._topics[sample] for sample in self.samples}
+        self._topics = topics
+        self._keep(list(topics))
+        self.latest = self.samples[-1].time if self.samples else NEVER
+
+    def _keep(self, samples: list[Sample]) -> int:
+        """Hold these and no others; returns the bytes freed."""
+        before = self.bytes
+        self.samples = deque(samples)
+        self._topics = {sample: self._topics[sample] for sample in samples}
+        self.bytes = sum(len(sample.payload) + SAMPLE_OVERHEAD for sample in samples)
+        return before - self.bytes
+
+
+def _not_after(sample: Sample, time: int) -> Sample:
+    if sample.time <= time:
+        return sample
+    if isinstance(sample, Stamped):
+        return sample._replace(time=time, received=time)
+    return sample._replace(received=time)

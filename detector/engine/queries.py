@@ -1,0 +1,261 @@
+"""What is in the buffer at a tick, as plugins ask for it: decoded samples by client, stream, time and frame.
+
+A view at a tick shows the samples up to its time and none later, and never changes anything. `newest`, `last` and
+`between` go by the time at which a sample came in (the engine's time axis, see docs/concepts.md); whatever compares
+data with data (`nearest`, `pose`, `tuples`, `transform`) goes by the senders' stamps. All times are nanoseconds since
+the epoch.
+"""
+
+from __future__ import annotations
+
+import heapq
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
+from operator import attrgetter
+from typing import Any, NamedTuple, Protocol
+
+from detector.engine.buffer import Buffer, Lane
+from detector.engine.clients import Clients, fresh_streams
+from detector.engine.geometry import Pose
+from detector.engine.messages import Messages
+from detector.engine.poses import pose_in
+from detector.engine.sample import Sample
+from detector.engine.transforms import Transforms
+from detector.engine.tuples import matched, nearest
+from wayside.expressions import UNKNOWN
+
+_STAMP = attrgetter("stamp")
+
+
+class DecodedSample(NamedTuple):
+    """One sample as a plugin sees it."""
+
+    client: str
+    stream: str
+    key: str
+    """The full Zenoh key it came on."""
+    time: int
+    """Its place on the engine's time axis, in nanoseconds since the epoch."""
+    stamp: int
+    """The sender's time in nanoseconds since the epoch; the receive time where the message carries none."""
+    message: Any
+    """Maps, lists, strings, booleans, None, bytes and doubles, as expressions see it."""
+
+
+class Queries(Protocol):
+    """The buffer at one tick. `client=None` means all clients; samples that cannot be decoded are left out, counted."""
+
+    @property
+    def now(self) -> int:
+        """The tick."""
+
+    def clients(self) -> list[str]:
+        """The known clients, sorted."""
+
+    def streams(self, client: str) -> list[str]:
+        """The client's streams that are not stale."""
+
+    def newest(self, client: str | None, stream: str, *, frame: str | None = None) -> DecodedSample | None:
+        """The sample that came last; with `frame`, of those whose header.frame_id it is."""
+
+    def last(self, client: str | None, stream: str, count: int, *, frame: str | None = None) -> list[DecodedSample]:
+        """The newest `count` samples, oldest first."""
+
+    def between(
+        self, client: str | None, stream: str, after: int, until: int, *, frame: str | None = None
+    ) -> list[DecodedSample]:
+        """The samples of (after, until], oldest first; like windows, not from before a gap in time."""
+
+    def nearest(self, client: str | None, stream: str, stamp: int, *, frame: str | None = None) -> DecodedSample | None:
+        """The sample whose stamp is nearest; of two equally near, the earlier one."""
+
+    def pose(self, client: str, stream: str, stamp: int, *, at: str = "") -> Pose | None:
+        """Where the client was at that time, between the samples before and after (position linear, orientation slerp).
+
+        None where there are no samples on both sides; at the very stamp of a sample, one is enough. `at` is the path to
+        the pose in the message; without it, pose, pose.pose or transform.
+
+        Raises:
+            PoseError: the messages hold no pose there.
+        """
+
+    def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
+        """Samples of several streams that belong together, oldest first; `slop` is in nanoseconds.
+
+        The first stream is the reference; how they are found stands in engine/tuples.py.
+        """
+
+    def transform(self, client: str, target: str, source: str, stamp: int | None = None) -> Pose:
+        """The pose of frame `source` in frame `target`: it takes points given in source into target.
+
+        `stamp` None: the newest time for which all the transforms between them are known.
+
+        Raises:
+            TransformError: an unknown frame, frames that are not connected, or a time beyond the transforms' stamps.
+        """
+
+
+class BufferQueries:
+    """The queries, answered from the engine's buffer; made anew for each tick."""
+
+    def __init__(
+        self,
+        now: int,
+        floor: int | None,
+        buffer: Buffer,
+        clients: Clients,
+        messages: Messages,
+        stale_after: Mapping[str, int | None],
+        transforms: Transforms,
+    ) -> None:
+        """`floor` is the time of the last gap, `now` the tick; nanoseconds."""
+        self._now = now
+        self._floor = floor
+        self._buffer = buffer
+        self._clients = clients
+        self._messages = messages
+        self._stale_after = stale_after
+        self._transforms = transforms
+        self._by_stamp: dict[tuple[str, str], list[tuple[int, int, Sample]]] = {}
+
+    @property
+    def now(self) -> int:
+        """The tick."""
+        return self._now
+
+    def clients(self) -> list[str]:
+        """See Queries."""
+        return list(self._clients)
+
+    def streams(self, client: str) -> list[str]:
+        """See Queries."""
+        return fresh_streams(client, self._stale_after, self._buffer, self._now)
+
+    def newest(self, client: str | None, stream: str, *, frame: str | None = None) -> DecodedSample | None:
+        """See Queries."""
+        return next(self._newest_first(client, stream, None, self._now, frame), None)
+
+    def last(self, client: str | None, stream: str, count: int, *, frame: str | None = None) -> list[DecodedSample]:
+        """See Queries."""
+        found = list(islice(self._newest_first(client, stream, None, self._now, frame), max(count, 0)))
+        return found[::-1]
+
+    def between(
+        self, client: str | None, stream: str, after: int, until: int, *, frame: str | None = None
+    ) -> list[DecodedSample]:
+        """See Queries."""
+        if self._floor is not None:
+            after = max(after, self._floor)
+        return list(self._newest_first(client, stream, after, min(until, self._now), frame))[::-1]
+
+    def nearest(self, client: str | None, stream: str, stamp: int, *, frame: str | None = None) -> DecodedSample | None:
+        """See Queries."""
+        best: DecodedSample | None = None
+        for name in self._names(client):
+            for of_client in self._nearest_of(name, stream, stamp, frame):
+                if best is None or _distance(of_client, stamp) < _distance(best, stamp):
+                    best = of_client
+        return best
+
+    def pose(self, client: str, stream: str, stamp: int, *, at: str = "") -> Pose | None:
+        """See Queries."""
+        samples = self._stamped(client, stream)
+        after = bisect_right(samples, stamp, key=lambda each: each[0])
+        before = self._decoded(client, stream, samples[after - 1]) if after else None
+        if before is None:
+            return None
+        if before.stamp == stamp:
+            return pose_in(before.message, at)
+        following = self._decoded(client, stream, samples[after]) if after < len(samples) else None
+        if following is None:
+            return None
+        share = (stamp - before.stamp) / (following.stamp - before.stamp)
+        return pose_in(before.message, at).towards(pose_in(following.message, at), share)
+
+    def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
+        """See Queries."""
+        if not streams:
+            raise ValueError("tuples: name at least one stream")
+        samples = [self._stamped(client, stream) for stream in streams]
+        found = []
+        for members in matched([[each[0] for each in of_stream] for of_stream in samples], slop):
+            decoded = [
+                self._decoded(client, stream, of_stream[index])
+                for stream, of_stream, index in zip(streams, samples, members, strict=True)
+            ]
+            complete = [each for each in decoded if each is not None]
+            if len(complete) == len(decoded):
+                found.append(tuple(complete))
+        return found
+
+    def transform(self, client: str, target: str, source: str, stamp: int | None = None) -> Pose:
+        """See Queries."""
+        return self._transforms.lookup(client, target, source, stamp, self._now)
+
+    def _names(self, client: str | None) -> list[str]:
+        return list(self._clients) if client is None else [client]
+
+    def _newest_first(
+        self, client: str | None, stream: str, after: int | None, until: int, frame: str | None
+    ) -> Iterator[DecodedSample]:
+        """Of several clients, merged by time; of equal times, the client with the greater name first."""
+        names = self._names(client)
+        lanes = [lane for name in names if (lane := self._buffer.lane(name, stream)) is not None]
+        if len(lanes) == 1:
+            yield from self._of_lane(lanes[0], after, until, frame)
+            return
+        streams = [self._of_lane(lane, after, until, frame) for lane in lanes]
+        yield from heapq.merge(*streams, key=lambda sample: (sample.time, sample.client), reverse=True)
+
+    def _of_lane(self, lane: Lane, after: int | None, until: int, frame: str | None) -> Iterator[DecodedSample]:
+        for sample in lane.newest_first(after, until):
+            stamp = self._messages.time(lane.stream, sample.key, sample.received, sample.payload)
+            decoded = None if stamp is None else self._decoded(lane.client, lane.stream, (stamp, 0, sample))
+            if decoded is not None and (frame is None or frame_of(decoded.message) == frame):
+                yield decoded
+
+    def _stamped(self, client: str, stream: str) -> list[tuple[int, int, Sample]]:
+        """The lane's samples with their stamps, in order of these, then of their times; computed once a tick."""
+        known = self._by_stamp.get((client, stream))
+        if known is None:
+            lane = self._buffer.lane(client, stream)
+            samples = [] if lane is None else list(lane.newest_first(None, self._now))[::-1]
+            known = []
+            for index, sample in enumerate(samples):
+                stamp = self._messages.time(stream, sample.key, sample.received, sample.payload)
+                if stamp is not None:
+                    known.append((stamp, index, sample))
+            known.sort(key=lambda each: each[:2])
+            self._by_stamp[client, stream] = known
+        return known
+
+    def _nearest_of(self, client: str, stream: str, stamp: int, frame: str | None) -> Iterator[DecodedSample]:
+        samples = self._stamped(client, stream)
+        if frame is not None:
+            of_frame: Callable[[tuple[int, int, Sample]], bool] = lambda each: (  # noqa: E731  a filter, named
+                (decoded := self._decoded(client, stream, each)) is not None and frame_of(decoded.message) == frame
+            )
+            samples = list(filter(of_frame, samples))
+        if samples:
+            decoded = self._decoded(client, stream, samples[nearest([each[0] for each in samples], stamp)])
+            if decoded is not None:
+                yield decoded
+
+    def _decoded(self, client: str, stream: str, stamped: tuple[int, int, Sample]) -> DecodedSample | None:
+        stamp, _, sample = stamped
+        message = self._messages.message(stream, sample)
+        if message is UNKNOWN:
+            return None
+        return DecodedSample(client, stream, sample.key, sample.time, stamp, message)
+
+
+def frame_of(message: Any) -> str | None:
+    """header.frame_id, where the message has one."""
+    header = message.get("header") if isinstance(message, dict) else None
+    frame = header.get("frame_id") if isinstance(header, dict) else None
+    return frame if isinstance(frame, str) else None
+
+
+def _distance(sample: DecodedSample, stamp: int) -> tuple[int, int]:
+    return abs(sample.stamp - stamp), sample.stamp

@@ -1,0 +1,68 @@
+"""What latched streams say is known from the beginning of a recording, wherever in it it was recorded.
+
+A recording that began after a map or a static transform was published holds it late, or not where its readers start. So
+the first sample about each thing on a latched stream is taken first, and not again at its own place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+from detector.assembly import inlets
+from detector.engine.lanes import latched_topics
+from detector.engine.latched import Topic
+from detector.engine.sample import Arrival
+from detector.replay.recordings import open_recordings
+from detector.replay.routing import Router
+from wayside.api import Detector
+
+
+def recorded_arrivals(recordings: Sequence[Path], router: Router, detector: Detector) -> Iterator[Arrival]:
+    """What the recordings hold for the Detector's streams, that of latched ones first.
+
+    Raises:
+        DetectorError: the Detector cannot run.
+        RecordingError: a recording is missing or damaged, or does not fit the streams.
+    """
+    arrivals = router.arrivals(open_recordings(recordings, router.wanted))
+    topics = latched_topics(detector, inlets(detector).decoders)
+    if not topics:
+        return arrivals
+    # Read once for these alone (a recording with an index skips the rest): the whole of it need not fit into memory.
+    latched = Router([stream for stream in detector.spec.streams if stream.latched])
+    return latched_first(arrivals, latched.arrivals(open_recordings(recordings, latched.wanted)), topics)
+
+
+def latched_first(
+    recorded: Iterable[Arrival], latched: Iterable[Arrival], topics: dict[str, Topic]
+) -> Iterator[Arrival]:
+    """The arrivals of a recording, those first that what was latched came with.
+
+    Args:
+        recorded: all arrivals in order.
+        latched: the same, or those of latched streams alone, in order.
+        topics: for each latched stream, what a sample speaks of.
+    """
+    first: dict[tuple[str, Hashable], Arrival] = {}
+    for arrival in latched:
+        if arrival.stream in topics:
+            first.setdefault(_about(arrival, topics), arrival)
+    rest = iter(recorded)
+    start = next(rest, None)
+    if start is None:
+        return
+    before = start.received - len(first)
+    for number, arrival in enumerate(first.values()):
+        yield arrival._replace(received=before + number)
+    taken: set[tuple[str, Hashable]] = set()
+    for arrival in chain((start,), rest):
+        if arrival.stream in topics and (about := _about(arrival, topics)) not in taken:
+            taken.add(about)
+        else:
+            yield arrival
+
+
+def _about(arrival: Arrival, topics: dict[str, Topic]) -> tuple[str, Hashable]:
+    return arrival.stream, topics[arrival.stream](arrival.key, arrival.payload)
