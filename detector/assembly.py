@@ -12,7 +12,7 @@ from detector.streams.codecs import UnknownTypeError, codec_for
 from detector.streams.codecs.fields import message_fields
 from wayside.api import Detector, EventRule
 from wayside.keys import KeyPattern
-from wayside.rules import CompiledRule, Fields, RuleError, RuleProblem, compile_rule, stream_problems
+from wayside.rules import CompiledRule, Fields, RuleError, RuleProblem, compile_rule, source_problems, stream_problems
 
 _CLIENT_NAME = re.compile(r"[A-Za-z0-9._:-]{1,63}")
 
@@ -68,6 +68,7 @@ def inlets(detector: Detector) -> Inlets:
         if known is not None:
             fields[stream.name] = known
         problems += stream_problems(stream, index, known)
+    problems += source_problems(detector)
     if problems:
         raise DetectorError(problems)
     patterns = {stream.name: KeyPattern.parse(stream.key) for stream in detector.spec.streams}

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, Inlets, inlets
+from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.rules import RuleError, compile_rule
@@ -20,6 +21,7 @@ def check_documents(documents: Sequence[Document]) -> list[Problem]:
     for document in documents:
         if isinstance(document.object, Detector):
             try:
+                problems += [document.problem(each.path, each.message) for each in plugin_problems(document.object)]
                 detectors.append((document.object, inlets(document.object)))
             except DetectorError as error:
                 problems += [document.problem(each.path, each.message) for each in error.problems]

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from detector.engine.engine import Engine
 from detector.engine.intake import Intake
 from detector.engine.timeline import DataTimeline
+from detector.streams.tally import Tally
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +42,12 @@ class Losses:
         self._engine = engine
         self._intake = intake
         self._monotonic = monotonic
+        self._tallies: list[Tally] = []
         self._said: dict[str, tuple[int, float]] = {}
+
+    def watch(self, tally: Tally) -> None:
+        """Say what it counts as well."""
+        self._tallies.append(tally)
 
     def say(self) -> None:
         """Log each kind of loss of which there is more, unless it was said within the last minute."""
@@ -75,6 +81,8 @@ class Losses:
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, also those that did not happen."""
         counters, timeline = self._engine.counters, self._engine.timeline
+        for tally in self._tallies:
+            yield from (Loss(entry.text, entry.count, entry.last) for entry in tally.entries())
         if self._intake is not None:
             full = "samples dropped, the intake being full: more come in than are evaluated"
             yield Loss(full, self._intake.dropped)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from detector.actions.deploy import DemandReconciler
-from detector.assembly import DetectorError, inlets, make_engine
+from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.demands import Demand
 from detector.engine.intake import Intake
 from detector.evaluator import Evaluator
@@ -19,9 +19,13 @@ from detector.event_log import EventLog
 from detector.outlet import LiveOutlet
 from detector.replay.intake_writer import IntakeWriter
 from detector.rules.selection import RuleSet
+from detector.sources.registry import plugin_problems
+from detector.sources.supervision import Sources
+from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
 from wayside.api import Detector
 from wayside.api.detector import Stream
+from wayside.api.source import ZENOH
 
 _log = logging.getLogger(__name__)
 
@@ -44,7 +48,8 @@ class Running:
         self._rule_set = rule_set
         self._restored = restored
         detector = rule_set.detector
-        entries = inlets(detector)
+        entries = _checked(detector)
+        self._tally = Tally()
         self._intake = Intake(time.time_ns)
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns())
         self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams)
@@ -60,9 +65,13 @@ class Running:
             on_failure=self._fail,
         )
 
+        self._evaluator.losses.watch(self._tally)
+        self._sources = Sources(self._intake.putter, self._tally)
+
     def __enter__(self) -> Running:
         self._evaluator.start(self._rule_set, self._restored)
         self._outlet.network.start()
+        self._sources.follow(self._rule_set.detector)
         _log.info(
             "Detector %s runs with %d rules and %d restored demands",
             self._rule_set.detector.name,
@@ -72,6 +81,7 @@ class Running:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._sources.close()
         self._evaluator.stop()
         self._outlet.network.close()
         if self._log is not None:
@@ -97,15 +107,17 @@ class Running:
             spec = detector.spec
             if spec.zenoh != before.zenoh or _keys(spec.streams) != _keys(before.streams):
                 await asyncio.to_thread(self._outlet.move, self._network(detector))
+            await asyncio.to_thread(self._sources.follow, detector)
 
     def _network(self, detector: Detector) -> Network:
         spec = detector.spec
-        return Network(spec.zenoh, spec.streams, self._intake.putter, on_failure=self._fail)
+        streams = [stream for stream in spec.streams if stream.source == ZENOH]
+        return Network(spec.zenoh, streams, self._intake.putter, on_failure=self._fail)
 
     def _good(self, wanted: Detector) -> Detector:
         """The changed Detector; the last one where it cannot run."""
         try:
-            inlets(wanted)
+            _checked(wanted)
         except DetectorError as error:
             _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.name, error)
             return self._rule_set.detector
@@ -144,6 +156,15 @@ def _unused(path: Path) -> Path:
     return free
 
 
+def _checked(detector: Detector) -> Inlets:
+    """What its streams need. Raises DetectorError, also where a plugin is missing or refuses its parameters."""
+    entries = inlets(detector)
+    problems = list(plugin_problems(detector))
+    if problems:
+        raise DetectorError(problems)
+    return entries
+
+
 def _keys(streams: Iterable[Stream]) -> list[tuple[str, str]]:
     """What the network has to know of the streams."""
-    return [(stream.name, stream.key) for stream in streams]
+    return [(stream.name, stream.key) for stream in streams if stream.source == ZENOH]

@@ -14,7 +14,7 @@ from application_manager.core.conditions import Aspect, updated
 from wayside.api import Detector, EventRule
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
-from wayside.rules import RuleError, compile_rule, stream_problems
+from wayside.rules import RuleError, compile_rule, source_problems, stream_problems
 
 Status = TypeVar("Status", EventRuleStatus, DetectorStatus)
 
@@ -48,6 +48,7 @@ def detector_status(detector: Detector, rules: Sequence[EventRule], now: float) 
     problems = [
         str(problem) for index, stream in enumerate(detector.spec.streams) for problem in stream_problems(stream, index)
     ]
+    problems += map(str, source_problems(detector))
     if problems:
         aspect = Aspect("Accepted", False, "DetectorInvalid", "; ".join(problems))
     else:

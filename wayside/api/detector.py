@@ -20,6 +20,7 @@ from wayside.api.base import (
     conditions_field,
     validations,
 )
+from wayside.api.source import ZENOH, DataSource
 from wayside.api.zenoh import Zenoh
 
 
@@ -78,6 +79,9 @@ class Stream(Model):
         max_length=512,
         description="The Zenoh key expression in key-format notation: ${client:*} captures the client's name, "
         "e.g. vehicles/${client:*}/pose. A ROS topic is the key without its leading slash.",
+    )
+    source: ObjectName = Field(
+        default=ZENOH, description="Where the samples come from: zenoh, or the name of one of the Detector's sources."
     )
     client: ClientName | None = Field(
         default=None, description="The client that the data belongs to, where the key captures none."
@@ -186,6 +190,12 @@ class DetectorSpec(Model):
     """Streams, buffer, time and rules of a detector."""
 
     zenoh: Zenoh = Field(default=Zenoh(), description="The Zenoh session.")
+    sources: list[DataSource] = Field(
+        default_factory=list,
+        max_length=16,
+        description="Where streams come from that do not come over Zenoh.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
     clients: list[Client] = Field(
         default_factory=list,
         max_length=1024,
@@ -220,7 +230,11 @@ class DetectorSpec(Model):
 
     @model_validator(mode="after")
     def _unique_names(self) -> DetectorSpec:
-        for field, names in (("streams", [s.name for s in self.streams]), ("clients", [c.name for c in self.clients])):
+        for field, names in (
+            ("streams", [s.name for s in self.streams]),
+            ("sources", [s.name for s in self.sources]),
+            ("clients", [c.name for c in self.clients]),
+        ):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
                 raise ValueError(f"{field}: the name {twice[0]!r} is used twice: names must be unique")

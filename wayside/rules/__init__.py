@@ -11,6 +11,7 @@ from wayside.rules.compiled import (
 )
 from wayside.rules.compiling import RuleError, RuleProblem, compile_rule, compile_stream, stream_problems
 from wayside.rules.fields import Fields
+from wayside.rules.sources import source_problems
 
 __all__ = [
     "ClientSubject",
@@ -25,5 +26,6 @@ __all__ = [
     "RuleProblem",
     "compile_rule",
     "compile_stream",
+    "source_problems",
     "stream_problems",
 ]

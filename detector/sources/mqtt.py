@@ -1,0 +1,130 @@
+"""The plugin `mqtt`: streams come from topics of an MQTT broker.
+
+A stream's key is its topic: `vehicles/${client:*}/pose` subscribes to `vehicles/+/pose`. Where the connection is lost
+the run fails, so it is the supervision that connects again, and counts it.
+"""
+
+from __future__ import annotations
+
+import ssl
+from typing import Annotated, ClassVar
+
+from paho.mqtt.client import Client, MQTTMessage
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.reasoncodes import ReasonCode
+from pydantic import BaseModel, Field, field_validator
+
+from detector.access import login, tls_files
+from detector.sources.base import Feed, Source, SourceError
+from wayside.api.access import Access
+
+_LOOK_EVERY = 0.2
+"""Seconds: how long a look for messages takes at most, and so how soon the source stops."""
+
+
+class MqttParameters(Access):
+    """Which broker, and how to take messages from it."""
+
+    host: str = Field(min_length=1, max_length=255, description="The broker's name or address.")
+    port: int | None = Field(default=None, ge=1, le=65535, description="Default: 1883, with TLS 8883.")
+    qos: Annotated[int, Field(ge=0, le=2)] = Field(
+        default=0, description="0: at most once, 1: at least once, 2: exactly once."
+    )
+    client_id: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=255,
+        description="Who the detector is to the broker. With it the broker keeps messages of qos 1 and 2 while the "
+        "detector is away.",
+    )
+    prefix: str = Field(
+        default="", max_length=255, description="What stands before the key in topics, e.g. / or plant1/."
+    )
+    keep_alive: int = Field(
+        default=15, ge=1, le=3600, description="Seconds after which a silent connection is tried, and given up."
+    )
+
+    @field_validator("prefix")
+    @classmethod
+    def _plain(cls, prefix: str) -> str:
+        if any(character in prefix for character in "+#"):
+            raise ValueError("is no filter: wildcards stand in the streams' keys")
+        return prefix
+
+
+class MqttSource(Source[MqttParameters]):
+    """Messages of an MQTT broker."""
+
+    Parameters: ClassVar[type[BaseModel]] = MqttParameters
+
+    def run(self, feed: Feed) -> None:
+        """Connect, subscribe, and take messages until the connection is lost. Raises SourceError, AccessError."""
+        parameters = self.parameters
+        filters = [(parameters.prefix + topic_filter(each.pattern.expression), parameters.qos) for each in feed.streams]
+        client = self._client()
+        refused: list[str] = []
+
+        def on_connect(client: Client, _: object, __: object, reason: ReasonCode, ___: object) -> None:
+            if reason.is_failure:
+                refused.append(f"the broker refuses the connection: {reason}")
+            else:
+                client.subscribe(filters)
+
+        def on_subscribe(_: object, __: object, ___: object, reasons: list[ReasonCode], ____: object) -> None:
+            for (topic, _qos), reason in zip(filters, reasons, strict=False):
+                if reason.is_failure:
+                    refused.append(f"the broker refuses the subscription to {topic}: {reason}")
+
+        def on_message(_: object, __: object, message: MQTTMessage) -> None:
+            feed.put(message.topic.removeprefix(parameters.prefix), bytes(message.payload))
+
+        client.on_connect, client.on_subscribe, client.on_message = on_connect, on_subscribe, on_message
+        try:
+            client.connect(parameters.host, self._port, keepalive=parameters.keep_alive)
+            while not feed.stopping:
+                result = client.loop(_LOOK_EVERY)
+                if refused:
+                    raise SourceError(refused[0])
+                if result != 0:
+                    raise SourceError(f"the connection to {parameters.host}:{self._port} is lost: {result.name}")
+        except OSError as error:
+            raise SourceError(f"no connection to {parameters.host}:{self._port}: {error}") from error
+        finally:
+            client.disconnect()
+
+    @property
+    def _port(self) -> int:
+        encrypted = self.parameters.tls is not None or self.parameters.tls_secret is not None
+        return self.parameters.port or (8883 if encrypted else 1883)
+
+    def _client(self) -> Client:
+        """Raises AccessError, SourceError."""
+        parameters = self.parameters
+        client = Client(
+            CallbackAPIVersion.VERSION2,
+            client_id=parameters.client_id or "",
+            clean_session=parameters.client_id is None,
+            protocol=MQTTProtocolVersion.MQTTv311,
+        )
+        client.connect_timeout = 1.5
+        if (credentials := login(parameters, "parameters")) is not None:
+            client.username_pw_set(credentials.username, credentials.password)
+        files = tls_files(parameters, "parameters")
+        if files is not None:
+            try:
+                context = ssl.create_default_context(cafile=files.ca)
+                context.check_hostname = files.verify_name
+                if files.certificate is not None:
+                    context.load_cert_chain(files.certificate, files.key)
+            except (ssl.SSLError, OSError) as error:
+                raise SourceError(f"parameters.tls: a certificate or key cannot be used: {error}") from error
+            client.tls_set_context(context)
+        return client
+
+
+def topic_filter(expression: str) -> str:
+    """A key expression as an MQTT topic filter that matches at least the same; the stream's key decides finally."""
+    chunks = expression.split("/")
+    if "**" in chunks:
+        chunks = [*chunks[: chunks.index("**")], "#"]
+    return "/".join("+" if "*" in chunk else chunk for chunk in chunks)

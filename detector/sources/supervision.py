@@ -1,0 +1,162 @@
+"""Runs sources: each on a thread of its own, started again when it fails, and left behind where it does not stop."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+
+from detector.sources.base import Feed, Put
+from detector.sources.registry import Make, prepare
+from detector.streams.tally import Cause, Tally
+from wayside.api import Detector
+from wayside.api.detector import Stream
+from wayside.api.source import DataSource
+
+log = logging.getLogger(__name__)
+
+_FIRST_PAUSE = 0.5
+_LONGEST_PAUSE = 30.0
+"""Seconds before a source that failed is run again: doubling from the first to the longest."""
+
+_STEADY = 60.0
+"""Seconds: a run that lasted this long was a good one, and after it the pauses begin anew."""
+
+
+class State(StrEnum):
+    """Where a source stands."""
+
+    RUNNING = "Running"
+    PAUSING = "Pausing"
+    """It failed, and is run again after a pause."""
+    FINISHED = "Finished"
+    """It has nothing more to deliver."""
+    STOPPED = "Stopped"
+
+
+class SourceThread:
+    """One source at work."""
+
+    def __init__(
+        self,
+        source: DataSource,
+        streams: tuple[Stream, ...],
+        putter: Callable[[str], Put],
+        tally: Tally,
+        *,
+        first_pause: float = _FIRST_PAUSE,
+    ) -> None:
+        """`first_pause` is in seconds. Raises PluginError, KeyPatternError."""
+        self.source = source
+        self.streams = streams
+        self.state = State.RUNNING
+        self.last_error = ""
+        self._make: Make = prepare(source)
+        self._tally = tally
+        self._first_pause = first_pause
+        self._feed = Feed(streams, putter, lambda key: tally.add(Cause.UNROUTED, source.name, last=key))
+        self._thread = threading.Thread(target=self._run, name=f"source {source.name}", daemon=True)
+
+    @property
+    def messages(self) -> int:
+        """How many messages it delivered."""
+        return self._feed.messages
+
+    def start(self) -> None:
+        """Begin; returns at once."""
+        self._thread.start()
+
+    def tell_to_stop(self) -> None:
+        """From now on nothing of it is taken; returns at once."""
+        self._feed.stop()
+
+    def join(self, timeout: float) -> None:
+        """Wait for its end, for at most `timeout` seconds; then it is left behind, which is said and counted."""
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            self._tally.add(Cause.LEFT_BEHIND, self.source.name)
+            log.error(
+                "source %s (%s) does not stop and is left behind: its run() must look at feed.stopping",
+                self.source.name,
+                self.source.plugin,
+            )
+
+    def _run(self) -> None:
+        pause = self._first_pause
+        while not self._feed.stopping:
+            self.state = State.RUNNING
+            began = time.monotonic()
+            try:
+                self._make().run(self._feed)
+            except BaseException as error:  # noqa: BLE001  somebody else's code, which must not end the detector
+                if self._feed.stopping:
+                    break
+                if time.monotonic() - began >= _STEADY:
+                    pause = self._first_pause
+                self._failed(error, pause)
+                self._feed.wait(pause)
+                pause = min(2 * pause, _LONGEST_PAUSE)
+            else:
+                break
+        if self._feed.stopping:
+            self.state = State.STOPPED
+        else:
+            self.state = State.FINISHED
+            log.info("source %s has nothing more to deliver, after %d messages", self.source.name, self.messages)
+
+    def _failed(self, error: BaseException, pause: float) -> None:
+        self.state = State.PAUSING
+        self.last_error = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        self._tally.add(Cause.FAILED, self.source.name, last=self.last_error)
+        log.warning("source %s failed, again in %g s: %s", self.source.name, pause, self.last_error)
+        log.debug("source %s", self.source.name, exc_info=error)
+
+
+class Sources:
+    """The sources of a Detector, which may change."""
+
+    def __init__(self, putter: Callable[[str], Put], tally: Tally, *, timeout: float = 2.0) -> None:
+        """`putter` gives what takes a stream's messages; `timeout`: seconds that sources have to stop."""
+        self._putter = putter
+        self._tally = tally
+        self._timeout = timeout
+        self._threads: dict[str, SourceThread] = {}
+
+    def follow(self, detector: Detector) -> None:
+        """Run the Detector's sources; those that are the same, with the same streams, go on. May wait for ends.
+
+        Raises:
+            PluginError: a source cannot be had; nothing has changed then.
+        """
+        wanted = {
+            source.name: (source, tuple(stream for stream in detector.spec.streams if stream.source == source.name))
+            for source in detector.spec.sources
+        }
+        new = {
+            name: SourceThread(source, streams, self._putter, self._tally)
+            for name, (source, streams) in wanted.items()
+            if (running := self._threads.get(name)) is None or (running.source, running.streams) != (source, streams)
+        }
+        self._stop({name: thread for name, thread in self._threads.items() if name not in wanted or name in new})
+        for name, thread in new.items():
+            self._threads[name] = thread
+            thread.start()
+
+    @property
+    def threads(self) -> Mapping[str, SourceThread]:
+        """The sources by name."""
+        return self._threads
+
+    def close(self) -> None:
+        """Stop all; returns when they have, or after the timeout."""
+        self._stop(dict(self._threads))
+
+    def _stop(self, threads: Mapping[str, SourceThread]) -> None:
+        for thread in threads.values():
+            thread.tell_to_stop()
+        deadline = time.monotonic() + self._timeout
+        for name, thread in threads.items():
+            thread.join(max(0.0, deadline - time.monotonic()))
+            del self._threads[name]

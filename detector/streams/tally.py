@@ -1,0 +1,52 @@
+"""What goes wrong before the intake, counted by cause and by stream or source. It outlives sessions and sources."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Cause(StrEnum):
+    """Why something did not reach the intake. The texts are those of the log."""
+
+    MISSED = "samples of stream {} lost before the detector, as their publishers number them"
+    UNROUTED = "messages of source {} dropped, their keys belonging to none of its streams"
+    FAILED = "times source {} failed and was to be started again"
+    LEFT_BEHIND = "times source {} did not stop and was left behind"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """How often something happened."""
+
+    cause: Cause
+    name: str
+    """The stream, or the source."""
+    count: int
+    last: str
+    """The reason of the last one, where there is one."""
+
+    @property
+    def text(self) -> str:
+        """What happened, in words."""
+        return self.cause.value.format(self.name)
+
+
+class Tally:
+    """Counts, thread-safe. There is an entry for each cause and each stream or source: their number is bounded."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: dict[tuple[Cause, str], tuple[int, str]] = {}
+
+    def add(self, cause: Cause, name: str, count: int = 1, last: str = "") -> None:
+        """It happened `count` times more to the stream or source of that name."""
+        with self._lock:
+            before, _ = self._counts.get((cause, name), (0, ""))
+            self._counts[cause, name] = before + count, last
+
+    def entries(self) -> list[Entry]:
+        """All that happened so far, in order of cause and name."""
+        with self._lock:
+            return [Entry(*key, *value) for key, value in sorted(self._counts.items())]

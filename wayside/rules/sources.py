@@ -1,0 +1,34 @@
+"""Whether a Detector's streams and sources fit together. What a plugin asks for, its own program checks."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+
+from wayside.api import Detector
+from wayside.api.source import ZENOH
+from wayside.rules.compiling import RuleProblem
+
+
+def source_problems(detector: Detector) -> Iterator[RuleProblem]:
+    """Sources that are named wrongly, streams of sources that are not there, and sources without streams."""
+    names = [source.name for source in detector.spec.sources]
+    for index, source in enumerate(detector.spec.sources):
+        if source.name == ZENOH:
+            yield RuleProblem(
+                ("spec", "sources", index, "name"),
+                f"{ZENOH} is the session of spec.zenoh, which is there without being named: choose another name",
+            )
+        elif not any(stream.source == source.name for stream in detector.spec.streams):
+            yield RuleProblem(
+                ("spec", "sources", index, "name"),
+                f"no stream comes from {source.name}: write source: {source.name} in those that do, or remove it",
+            )
+    for index, stream in enumerate(detector.spec.streams):
+        if stream.source in (ZENOH, *names):
+            continue
+        close = difflib.get_close_matches(stream.source, names, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join([ZENOH, *names])}"
+        yield RuleProblem(
+            ("spec", "streams", index, "source"), f"Detector {detector.name} has no source {stream.source}; {hint}"
+        )
