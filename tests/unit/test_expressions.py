@@ -119,7 +119,7 @@ def test_decoded_messages_need_no_conversion() -> None:
     msg = Message(Point(1, float("nan")), np.array([1, 2], dtype=np.uint8), np.float32(0.5))
     assert evaluate("msg.point.x + msg.ranges[1] + msg.stamp", msg=msg) == 3.5
     assert evaluate("msg.ranges.map(r, r * 2)", msg=msg) == [2.0, 4.0]
-    assert evaluate("[has(msg.point), has(msg.data), has(msg.nothing)]", msg=msg) == [True, False, False]
+    assert evaluate("[has(msg.point), has(msg.data), has(msg.nothing)]", msg=msg) == [True, True, False]
     assert ENVIRONMENT.compile("msg.point.y > 3").evaluate_or_unknown({"msg": msg}) is UNKNOWN
 
 

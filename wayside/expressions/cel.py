@@ -21,9 +21,11 @@ from cel_expr_python import cel
 
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
+from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
+from wayside.expressions.handles import holding, value_of
 from wayside.expressions.numbers import MAX_EXACT, doubled
-from wayside.expressions.projection import missing_path, project, tree
-from wayside.expressions.syntax import Path, parse, paths
+from wayside.expressions.projection import Leaf, missing_path, normalise, project, tree
+from wayside.expressions.syntax import Node, Path, arguments, nothing_but_arguments, parse, paths
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
 
 Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int | bool, "Value"]
@@ -31,6 +33,7 @@ Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CACHE_SIZE = 1024
+_ORDERING = frozenset({"_<_", "_<=_", "_>_", "_>=_"})
 
 
 class Kind(enum.Enum):
@@ -82,7 +85,9 @@ class Environment:
             if name in _RESERVED.split():
                 raise ValueError(f"variable {name!r}: a word that CEL reserves; choose another name")
         self.variables: Mapping[str, Kind] = MappingProxyType(dict(variables))
-        self._env = cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables.items()})
+        self._env = cel.NewEnv(
+            variables={name: _TYPES[kind] for name, kind in variables.items()}, functions=list(DECLARATIONS)
+        )
         self._cache: dict[tuple[str, Kind], Expression] = {}
 
     def compile(self, source: str, *, result: Kind = Kind.DYN) -> Expression:
@@ -101,15 +106,24 @@ class Environment:
         rewritten = doubled(source)
         try:
             program = self._env.compile(rewritten.text)
-            read = paths(parse(program.serialize()), frozenset(self.variables))
+            read, leaves = self._reads(parse(program.serialize()))
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
             raise diagnose(str(error), source, rewritten, self.variables) from None
         _check_static(program.return_type(), result, source)
-        expression = Expression(source, program, read, result)
+        expression = Expression(source, program, read, leaves, result)
         if len(self._cache) >= _CACHE_SIZE:
             self._cache.clear()  # a bound against rules that come and go for months; refilling costs 50 µs each
         self._cache[source, result] = expression
         return expression
+
+    def _reads(self, node: Node) -> tuple[frozenset[Path], Mapping[Path, Leaf]]:
+        """The paths that are read, and how; a path goes into a function unread only where CEL knows no type of it."""
+        names = frozenset(self.variables)
+        leaves = dict.fromkeys(arguments(node, names, _ORDERING), Leaf.ORDERED)
+        for path in nothing_but_arguments(node, names, TAKING_HANDLES):
+            if len(path) > 1 or self.variables[str(path[0])] is Kind.DYN:
+                leaves[path] = Leaf.HANDED
+        return paths(node, names), leaves
 
 
 class Expression:
@@ -117,13 +131,15 @@ class Expression:
 
     __slots__ = ("_program", "_read", "names", "paths", "result", "source")
 
-    def __init__(self, source: str, program: cel.Expression, read: frozenset[Path], result: Kind) -> None:
+    def __init__(
+        self, source: str, program: cel.Expression, read: frozenset[Path], leaves: Mapping[Path, Leaf], result: Kind
+    ) -> None:
         self.source = source
         self.paths = read
         self.names = frozenset(str(path[0]) for path in read)
         self.result = result
         self._program = program
-        self._read = tree(read)
+        self._read = tree(read, leaves)
 
     def __repr__(self) -> str:
         return f"Expression({self.source!r})"
@@ -163,6 +179,10 @@ class Expression:
         return value
 
     def _run(self, values: Mapping[str, object], *, known: bool) -> Value:
+        with holding():
+            return self._run_holding(values, known=known)
+
+    def _run_holding(self, values: Mapping[str, object], *, known: bool) -> Value:
         try:
             data = project(self._read, values, known=known)
         except RecursionError:
@@ -214,6 +234,9 @@ def _plain(value: object) -> Value:
     if value is None or isinstance(value, (bool, float, str)):
         return value
     if isinstance(value, int):
+        held = value_of(value)
+        if held is not value:
+            return bytes(held) if isinstance(held, bytes | bytearray | memoryview) else _plain(normalise(held))
         return float(value) if -MAX_EXACT <= value <= MAX_EXACT else value
     if isinstance(value, list):
         return [_plain(item) for item in value]
@@ -235,11 +258,16 @@ def _describe(value: object) -> str:
     return names.get(type(value), f"a value of type {type(value).__name__}")
 
 
+_BYTES = "use byteCount, checksum, allZero, numberAt or utf8"
 _ABSENT = ("no value for ", "no key ", "no index ")
 _CLEANING: Final = (
     (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
     (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
     (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list"),
+    (
+        re.compile(r"^\w+: No matching overloads found : (.*uint64.*)$"),
+        rf"the operation does not take bytes: \1; {_BYTES}",
+    ),
     (re.compile(r"^\w+: No matching overloads found : (.*)$"), r"the operation does not take these types: \1"),
     (re.compile(r"^[A-Z_]+: (.*?)(?: \[[A-Z_]+\])?$", re.DOTALL), r"\1"),
 )

@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection
 
 from wayside.expressions.errors import ExpressionError, position
+from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.lexer import TokenKind, tokens
 from wayside.expressions.numbers import Doubled
 
@@ -88,7 +89,10 @@ def _explain(text: str, source: str, at: int, names: Collection[str]) -> tuple[s
 def _undeclared(name: str, source: str, at: int, names: Collection[str]) -> tuple[str, str | None]:
     name = name.removeprefix(".").split(".")[0]
     if _is_call(source, at, name):
-        return f"there is no function `{name}`", None
+        if name in FUNCTIONS:
+            return f"`{name}` does not take so many arguments", _takes(name)
+        near = difflib.get_close_matches(name, FUNCTIONS, n=1)
+        return f"there is no function `{name}`", f"did you mean `{near[0]}`?" if near else None
     message = f"`{name}` is not declared here"
     if name in _WORDS:
         return message, _WORDS[name]
@@ -102,6 +106,8 @@ def _undeclared(name: str, source: str, at: int, names: Collection[str]) -> tupl
 def _overload(function: str, arguments: str) -> tuple[str, str | None]:
     operator = function.replace("_", "").replace("@", "") if function.startswith(("_", "-", "!", "@")) else function
     message = f"`{operator}` does not take {arguments}"
+    if operator in FUNCTIONS:
+        return message, _takes(operator)
     if operator == "%":
         return message, "`%` takes integers only: double(int(a) % int(b))"
     if "double" in arguments and re.search(r"\bu?int\b", arguments):
@@ -111,6 +117,11 @@ def _overload(function: str, arguments: str) -> tuple[str, str | None]:
     if operator == "?:":
         return message, "it takes a boolean, and two values of one type"
     return message, None
+
+
+def _takes(function: str) -> str:
+    known = FUNCTIONS[function]
+    return f"it takes {known.usage()}: {known.types()}"
 
 
 def _is_call(source: str, at: int, name: str) -> bool:

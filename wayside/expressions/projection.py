@@ -5,7 +5,9 @@ So the paths that an expression reads form a tree, and only what lies on it is c
 
 * integers become doubles, up to 2^53; beyond, they stay integers, which support only equality, `in` and order;
 * numpy arrays and tuples become lists, numpy scalars plain ones, dataclasses (decoded ROS messages) maps;
-* NUL, at which CEL would cut a string, becomes `␀` (U+2400); bytes are absent: CEL would cut them as well.
+* NUL, at which CEL would cut a string, becomes `␀` (U+2400);
+* bytes, which CEL would cut as well, become handles (see `handles`), and so do the lists and maps that are nothing but
+  arguments of functions.
 
 With `known=True`, null and NaN are absent too: left out of maps, so that a read of them is an error in CEL, which `&&`,
 `||` and `?:` treat as unknown. In lists they become null, so that no index shifts: order and arithmetic are unknown.
@@ -16,32 +18,46 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import difflib
+import enum
 from collections.abc import Iterable, Mapping
 from typing import Final, cast
 
 from wayside.expressions.errors import EvaluationError
+from wayside.expressions.handles import hand
 from wayside.expressions.numbers import MAX_EXACT
 from wayside.expressions.syntax import Path, Step
 
-Tree = Mapping[Step, "Tree | None"]
+_ABSENT: Final = object()
+
+
+class Leaf(enum.Enum):
+    """What is read of a value, beside all of it."""
+
+    HANDED = "handed"
+    """Its handle, where it is a list, a map or bytes."""
+    ORDERED = "ordered"
+    """All of it, but bytes are absent: a handle would be greater than every number."""
+
+
+Tree = Mapping[Step, "Tree | Leaf | None"]
 """What is read below a value; None: all of it."""
 
-_ABSENT: Final = object()
 _FIELD_NAMES: Final[dict[type, frozenset[str]]] = {}
 
 
-def tree(paths: Iterable[Path]) -> Tree:
-    """The tree of the given paths; a path swallows all that go on below it."""
-    root: dict[Step, Tree | None] = {}
+def tree(paths: Iterable[Path], leaves: Mapping[Path, Leaf] | None = None) -> Tree:
+    """The tree of the given paths; a path swallows all that go on below it. `leaves` says how some of them are read."""
+    leaves = leaves or {}
+    root: dict[Step, Tree | Leaf | None] = {}
     for path in sorted(paths, key=len):  # the shorter first: it swallows the longer
         node = root
         for step in path[:-1]:
             below = node.setdefault(step, {})
-            if below is None:
+            if below is None or isinstance(below, Leaf):
                 break
-            node = cast("dict[Step, Tree | None]", below)
+            node = cast("dict[Step, Tree | Leaf | None]", below)
         else:
-            node.setdefault(path[-1], None)
+            node.setdefault(path[-1], leaves.get(path))
     return root
 
 
@@ -57,7 +73,7 @@ def project(read: Tree, values: Mapping[str, object], *, known: bool) -> dict[st
 
 
 def normalise(value: object) -> object:
-    """A decoded value as CEL takes it, the whole of it, null and NaN kept; None where it is absent (bytes)."""
+    """A decoded value as CEL takes it, the whole of it, null and NaN kept; bytes are null in lists, absent in maps."""
     result = _convert(value, known=False)
     return None if result is _ABSENT else result
 
@@ -77,9 +93,13 @@ def missing_path(paths: Iterable[Path], values: Mapping[str, object]) -> str | N
     return None
 
 
-def _project(below: Tree | None, value: object, known: bool) -> object:
+def _project(below: Tree | Leaf | None, value: object, known: bool) -> object:
     if below is None:
         return _convert(value, known)
+    if below is Leaf.HANDED:
+        return _hand(value, known)
+    if below is Leaf.ORDERED:
+        return _ABSENT if isinstance(value, (bytes, bytearray, memoryview)) else _convert(value, known)
     if type(value) is dict or isinstance(value, Mapping):  # the abstract class is slow to ask
         return _members([(key, value[key], sub) for key, sub in below.items() if key in value], known)
     if isinstance(value, (list, tuple)) or _is_array(value):
@@ -90,7 +110,7 @@ def _project(below: Tree | None, value: object, known: bool) -> object:
     return _convert(value, known)
 
 
-def _members(members: Iterable[tuple[Step, object, Tree | None]], known: bool) -> dict[Step, object]:
+def _members(members: Iterable[tuple[Step, object, Tree | Leaf | None]], known: bool) -> dict[Step, object]:
     result: dict[Step, object] = {}
     for key, value, below in members:
         kept = _project(below, value, known)
@@ -136,7 +156,8 @@ def _convert_rare(value: object, known: bool) -> object:
     if _is_array(value):  # numpy: before the plain types, of which its scalars are subclasses
         return _convert(value.tolist(), known)  # type: ignore[attr-defined]
     if isinstance(value, (bytes, bytearray, memoryview)):
-        return _ABSENT
+        handle = hand(value)
+        return _ABSENT if handle is None else handle
     if isinstance(value, (datetime.datetime, datetime.timedelta)):
         return value
     if _is_record(value):
@@ -147,6 +168,19 @@ def _convert_rare(value: object, known: bool) -> object:
     if isinstance(value, (list, tuple, set, frozenset)):
         return _convert(list(value), known)
     raise EvaluationError(f"a value of type {type(value).__name__} cannot enter an expression: decode it to plain data")
+
+
+def _hand(value: object, known: bool) -> object:
+    """A handle for what is large, the value itself where it is a number or a text."""
+    if (
+        isinstance(value, (list, tuple, Mapping))
+        or (_is_array(value) and hasattr(value, "__len__"))
+        or _is_record(value)
+    ):
+        handle = hand(value)
+        if handle is not None:
+            return handle
+    return _convert(value, known)
 
 
 def _integer(value: int) -> int | float:

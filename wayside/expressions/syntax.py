@@ -78,20 +78,40 @@ def parse(serialized: bytes) -> Node:
 
 def paths(node: Node, variables: frozenset[str]) -> frozenset[Path]:
     """The longest literal paths below `variables` that the tree reads; loop variables of the same name do not count."""
-    return frozenset(_paths(node, variables))
+    return frozenset(path for path, _ in _paths(node, variables))
 
 
-def _paths(node: Node, free: frozenset[str]) -> Iterator[Path]:
+def arguments(node: Node, variables: frozenset[str], functions: frozenset[str]) -> frozenset[Path]:
+    """Of these paths, the ones that are arguments of the functions."""
+    return frozenset(path for path, caller in _paths(node, variables) if caller in functions)
+
+
+def nothing_but_arguments(node: Node, variables: frozenset[str], functions: frozenset[str]) -> frozenset[Path]:
+    """Of these, the ones that are no part of what else is read."""
+    found = set(_paths(node, variables))
+    passed = {path for path, caller in found if caller in functions}
+    others = {path for path, caller in found if caller not in functions}
+    return frozenset(
+        path
+        for path in passed
+        if not any(path[: len(other)] == other or other[: len(path)] == path for other in others | passed - {path})
+    )
+
+
+def _paths(node: Node, free: frozenset[str], caller: str = "") -> Iterator[tuple[Path, str]]:
+    """The paths, each with the function whose argument it is, if it is one itself."""
     path = _path(node, free)
     if path is not None:
-        yield path
+        yield path, caller
         return
     match node:
         case Select(operand):
             yield from _paths(operand, free)
-        case Call(_, target, arguments):
-            for part in (target, *arguments) if target is not None else arguments:
-                yield from _paths(part, free)
+        case Call(function, target, arguments):
+            if target is not None:
+                yield from _paths(target, free)
+            for part in arguments:
+                yield from _paths(part, free, function)
         case Collection(_, elements):
             for part in elements:
                 yield from _paths(part, free)

@@ -1,0 +1,29 @@
+"""The functions that expressions have beyond CEL's own: one table of what there is, with units.
+
+Each module of this package holds functions of one kind, as plain Python that raises ValueError for arguments that have
+no answer; the evaluation is unknown then. `docs/rules.md` tells users of them, and a test holds the two together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+from wayside.expressions.functions import angles, comparing, motion, numbers, octets, places
+from wayside.expressions.functions.declaring import Function
+
+FUNCTIONS: Final[Mapping[str, Function]] = MappingProxyType(
+    {
+        function.name: function
+        for module in (numbers, angles, places, motion, comparing, octets)
+        for function in module.FUNCTIONS
+    }
+)
+"""By name."""
+
+DECLARATIONS: Final = [function.declaration() for function in FUNCTIONS.values()]
+"""As CEL takes them."""
+
+TAKING_HANDLES: Final = frozenset(name for name, function in FUNCTIONS.items() if function.takes_handles)
+"""The functions that take lists, maps or bytes, unread."""

@@ -1,0 +1,69 @@
+"""Compares lists of objects, such as what two sensors saw of one scene, without CEL's bound on iterations.
+
+Objects are matched by their places alone. `path` names where an object has its coordinates, such as
+`bbox.center.position`; see `members.place` for where they are looked for without it.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+
+from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.members import Place, place, sequence
+
+
+def unmatched(items: object, others: object, within: float, path: str = "") -> list[float]:
+    """The indices of the items of one list that have no item of the other within that many metres."""
+    if within < 0:
+        raise ValueError(f"within {within:g} is negative: give metres from 0 on")
+    places = _places(items, "items", path)
+    by_x = sorted(_places(others, "others", path))
+    xs = [each[0] for each in by_x]
+    return [float(index) for index, here in enumerate(places) if not _has_neighbour(here, by_x, xs, within)]
+
+
+def count_unmatched(items: object, others: object, within: float, path: str = "") -> float:
+    """How many of them there are."""
+    return float(len(unmatched(items, others, within, path)))
+
+
+def nearest(items: object, x: float, y: float, path: str = "") -> float:
+    """Metres in the plane from (x, y) to the nearest item; infinite where the list is empty."""
+    return min((math.hypot(px - x, py - y) for px, py, _ in _places(items, "items", path)), default=math.inf)
+
+
+def _places(items: object, what: str, path: str) -> list[Place]:
+    return [place(item, f"{what}[{index}]", path) for index, item in enumerate(sequence(items, what))]
+
+
+def _has_neighbour(here: Place, by_x: list[Place], xs: list[float], within: float) -> bool:
+    # A little wider than asked: the distance decides, rounded as it is.
+    reach = within * (1 + 1e-9)
+    first, last = bisect_left(xs, here[0] - reach), bisect_right(xs, here[0] + reach)
+    return any(math.dist(here, there) <= within for there in by_x[first:last])
+
+
+FUNCTIONS = (
+    function(
+        "unmatched",
+        Yields.LIST,
+        "the indices of the items that have none of the others within so many metres",
+        (unmatched, "items:list others:list within"),
+        (unmatched, "items:list others:list within path:text"),
+    ),
+    function(
+        "countUnmatched",
+        Yields.NUMBER,
+        "how many these are",
+        (count_unmatched, "items:list others:list within"),
+        (count_unmatched, "items:list others:list within path:text"),
+    ),
+    function(
+        "nearest",
+        Yields.NUMBER,
+        "metres from (x, y) to the nearest item of a list; infinite where it is empty",
+        (nearest, "items:list x y"),
+        (nearest, "items:list x y path:text"),
+    ),
+)

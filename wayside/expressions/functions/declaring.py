@@ -1,0 +1,147 @@
+"""How a function is declared: its parameters by name, so that errors can say what it takes.
+
+CEL finds the implementation by the types that arrive. A parameter for a list, a map or bytes therefore has two: the
+thing itself, where the expression writes it (`[[0, 0], [4, 0]]`), and its handle, where it comes from a value.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+from cel_expr_python import cel
+
+from wayside.expressions.handles import value_of
+
+
+class Takes(enum.Enum):
+    """What a parameter takes, as a user would say it."""
+
+    NUMBER = "number"
+    TEXT = "text"
+    BYTES = "bytes"
+    LIST = "list"
+    MAP = "map"
+
+
+class Yields(enum.Enum):
+    """What a function yields."""
+
+    NUMBER = "number"
+    BOOLEAN = "boolean"
+    TEXT = "text"
+    LIST = "list"
+
+
+_TAKES = {
+    Takes.NUMBER: (cel.Type.DOUBLE,),
+    Takes.TEXT: (cel.Type.STRING,),
+    Takes.BYTES: (cel.Type.BYTES, cel.Type.UINT),
+    Takes.LIST: (cel.Type.List(cel.Type.DYN), cel.Type.UINT),
+    Takes.MAP: (cel.Type.Map(cel.Type.STRING, cel.Type.DYN), cel.Type.UINT),
+}
+_UNREAD = frozenset({Takes.BYTES, Takes.LIST, Takes.MAP})
+_YIELDS = {
+    Yields.NUMBER: cel.Type.DOUBLE,
+    Yields.BOOLEAN: cel.Type.BOOL,
+    Yields.TEXT: cel.Type.STRING,
+    Yields.LIST: cel.Type.List(cel.Type.DYN),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter: its name tells the unit where the meaning does not."""
+
+    name: str
+    takes: Takes
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """One way to call a function."""
+
+    parameters: tuple[Parameter, ...]
+    implementation: Callable[..., object]
+
+
+@dataclass(frozen=True, slots=True)
+class Function:
+    """A function of expressions."""
+
+    name: str
+    yields: Yields
+    summary: str
+    """What it yields, with the unit."""
+    signatures: tuple[Signature, ...]
+
+    @property
+    def takes_handles(self) -> bool:
+        """Whether it takes a list, a map or bytes."""
+        return any(p.takes in _UNREAD for signature in self.signatures for p in signature.parameters)
+
+    def usage(self) -> str:
+        """The ways to call it, as in `inside(x, y, polygon)`."""
+        return " or ".join(
+            f"{self.name}({', '.join(p.name for p in signature.parameters)})" for signature in self.signatures
+        )
+
+    def types(self) -> str:
+        """The parameters' types, as in `number, number, list`."""
+        return " or ".join(", ".join(p.takes.value for p in s.parameters) for s in self.signatures)
+
+    def declaration(self) -> cel.FunctionDecl:
+        """As CEL takes it."""
+        return cel.FunctionDecl(self.name, list(self._overloads()))
+
+    def _overloads(self) -> Iterator[cel.Overload]:
+        for number, signature in enumerate(self.signatures):
+            call = _called(self, signature)
+            for types in itertools.product(*(_TAKES[parameter.takes] for parameter in signature.parameters)):
+                identifier = "_".join((self.name, str(number), *(each.name().split("<")[0].lower() for each in types)))
+                yield cel.Overload(identifier, _YIELDS[self.yields], list(types), False, call)
+
+
+def _called(function: Function, signature: Signature) -> Callable[..., object]:
+    """The implementation, given the values behind handles; NaN, which is unknown, does not get in."""
+
+    def call(*arguments: object) -> object:
+        values = [value_of(argument) for argument in arguments]
+        for parameter, value in zip(signature.parameters, values, strict=True):
+            if isinstance(value, float) and math.isnan(value):
+                raise ValueError(f"no value for {parameter.name} of {function.name}: it is not a number")
+            if parameter.takes in _UNREAD and not _fits(parameter.takes, value):
+                article = "" if parameter.takes is Takes.BYTES else "a "
+                raise ValueError(f"{function.name}: {parameter.name} must be {article}{parameter.takes.value}")
+        return signature.implementation(*values)
+
+    return call
+
+
+def _fits(takes: Takes, value: object) -> bool:
+    if takes is Takes.BYTES:
+        return isinstance(value, bytes | bytearray | memoryview)
+    if takes is Takes.LIST:
+        return isinstance(value, list | tuple) or hasattr(value, "tolist")  # numpy's: a list in all that matters
+    return isinstance(value, Mapping) or dataclasses.is_dataclass(value)
+
+
+def function(name: str, yields: Yields, summary: str, *ways: tuple[Callable[..., object], str]) -> Function:
+    """A function by its ways to be called: an implementation, and the parameters as in `x y polygon:list`."""
+    return Function(
+        name,
+        yields,
+        summary,
+        tuple(
+            Signature(tuple(map(_parameter, parameters.split())), implementation) for implementation, parameters in ways
+        ),
+    )
+
+
+def _parameter(text: str) -> Parameter:
+    name, _, takes = text.partition(":")
+    return Parameter(name, Takes(takes) if takes else Takes.NUMBER)

@@ -1,0 +1,82 @@
+"""Reads numbers out of messages as functions get them: maps, records of decoded messages, lists of coordinates.
+
+What is absent, null or NaN raises ValueError with a text that says so and begins `no value for`: unknown, not wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+_ABSENT: Final = object()
+
+_PLACES: Final = (("position",), ("pose", "position"), ("pose", "pose", "position"), ("center", "position"))
+"""Where an object has its coordinates, if not itself."""
+
+Place = tuple[float, float, float]
+"""Metres along x, y and z."""
+
+
+def sequence(value: object, what: str) -> Sequence[object]:
+    """A list, a tuple or numpy's array."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return value
+    raise ValueError(f"{what} must be a list")
+
+
+def number(value: object, what: str) -> float:
+    """The value as a double."""
+    if value is None or value is _ABSENT or value != value:  # noqa: PLR0124 (NaN alone differs from itself)
+        raise ValueError(f"no value for {what}")
+    if isinstance(value, bool) or not hasattr(value, "__float__"):
+        raise ValueError(f"{what} must be a number")
+    return float(value)
+
+
+def member(value: object, name: str) -> object:
+    """The field of a map or a record; a sentinel where it has none."""
+    if isinstance(value, Mapping):
+        return value.get(name, _ABSENT)
+    return getattr(value, name, _ABSENT) if hasattr(value, "__dataclass_fields__") else _ABSENT
+
+
+def pair(point: object, names: tuple[str, str], what: str) -> tuple[float, float]:
+    """Two coordinates: a list of two numbers, or a map with the names."""
+    if isinstance(point, list | tuple):
+        if len(point) < 2:
+            raise ValueError(f"{what} must have two numbers, has {len(point)}")
+        return number(point[0], f"{what}[0]"), number(point[1], f"{what}[1]")
+    first, second = (number(member(point, name), f"{what}.{name}") for name in names)
+    return first, second
+
+
+def place(item: object, what: str, path: str = "") -> Place:
+    """Where an object is: at `path` (as in `bbox.center.position`), or where objects usually say it.
+
+    That is x, y and z (0 where absent) of the object itself, of its position, pose.position, pose.pose.position or
+    center.position; or a list of two or three numbers.
+    """
+    at = item
+    if path:
+        for name in path.split("."):
+            at = member(at, name)
+            if at is _ABSENT or at is None:
+                raise ValueError(f"no value for {path} of {what}")
+    if isinstance(at, list | tuple):
+        x, y = pair(at, ("x", "y"), what)
+        return x, y, number(at[2], f"{what}[2]") if len(at) > 2 else 0.0
+    if not path and member(at, "x") is _ABSENT:
+        at = next((found for steps in _PLACES if (found := _below(item, steps)) is not _ABSENT), item)
+    z = member(at, "z")
+    x, y = pair(at, ("x", "y"), what)
+    return x, y, 0.0 if z is _ABSENT or z is None else number(z, f"{what}.z")
+
+
+def _below(item: object, steps: tuple[str, ...]) -> object:
+    for step in steps:
+        item = member(item, step)
+        if item is _ABSENT or item is None:
+            return _ABSENT
+    return item

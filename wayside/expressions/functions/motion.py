@@ -1,0 +1,65 @@
+"""Motion: when two that go on as they do will meet, and how near they will come."""
+
+from __future__ import annotations
+
+import math
+
+from wayside.expressions.functions.declaring import Yields, function
+
+
+def time_to_collision(gap: float, closing_speed: float) -> float:
+    """Seconds until a gap (m) is closed at a speed (m/s): 0 where there is none, infinite where it does not close."""
+    if gap <= 0:
+        return 0.0
+    return gap / closing_speed if closing_speed > 0 else math.inf
+
+
+def time_to_contact(dx: float, dy: float, vx: float, vy: float, radius: float) -> float:
+    """Seconds until two on straight ways are `radius` metres apart; infinite where they never are.
+
+    dx, dy (m) and vx, vy (m/s) are the place and the velocity of the one, seen from the other. The first root of
+    |d + v t| = radius, in the form that does not cancel.
+    """
+    if radius < 0:
+        raise ValueError(f"radius {radius:g} is negative")
+    if not all(map(math.isfinite, (dx, dy, vx, vy, radius))):
+        raise ValueError("an argument of timeToCollision is infinite")
+    apart = math.hypot(dx, dy)
+    if apart <= radius:
+        return 0.0
+    speed = math.hypot(vx, vy)
+    if speed == 0:
+        return math.inf
+    ahead = -(dx * (vx / speed) + dy * (vy / speed))  # metres to go to the nearest point
+    aside = abs(dx * (vy / speed) - dy * (vx / speed))  # metres apart, there
+    if ahead <= 0 or aside > radius:
+        return math.inf
+    reach = math.sqrt((radius - aside) * (radius + aside))
+    return max(0.0, (apart - radius) * ((apart + radius) / (ahead + reach)) / speed)
+
+
+def closest_approach(dx: float, dy: float, vx: float, vy: float) -> float:
+    """Metres at which two on straight ways will be nearest to each other, from now on."""
+    speed = math.hypot(vx, vy)
+    apart = math.hypot(dx, dy)
+    if speed == 0 or dx * (vx / speed) + dy * (vy / speed) >= 0:
+        return apart
+    return abs(dx * (vy / speed) - dy * (vx / speed))
+
+
+FUNCTIONS = (
+    function(
+        "timeToCollision",
+        Yields.NUMBER,
+        "seconds until the gap (m) is closed at closingSpeed (m/s), or until two bodies on straight ways are radius "
+        "(m) apart, the one at dx, dy (m) with vx, vy (m/s) as seen from the other; infinite where that never happens",
+        (time_to_collision, "gap closingSpeed"),
+        (time_to_contact, "dx dy vx vy radius"),
+    ),
+    function(
+        "closestApproach",
+        Yields.NUMBER,
+        "how near two bodies on straight ways will come, metres; arguments as for timeToCollision",
+        (closest_approach, "dx dy vx vy"),
+    ),
+)

@@ -1,0 +1,60 @@
+"""Plain mathematics: what CEL lacks, of numbers and of lists of numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.members import number, sequence
+
+
+def of_list(calculate: Callable[[list[float]], float]) -> Callable[[object], float]:
+    """A calculation over the numbers of a list; null and NaN are left out, and without any there is no value."""
+
+    def calculated(values: object) -> float:
+        items = sequence(values, "values")
+        known = [
+            number(item, f"values[{index}]")
+            for index, item in enumerate(items)
+            if item is not None and item == item  # noqa: PLR0124 (NaN alone differs from itself)
+        ]
+        if not known:
+            raise ValueError("no value for values: none of the list is known")
+        return calculate(known)
+
+    return calculated
+
+
+def square_root(x: float) -> float:
+    """Of a number that is not negative."""
+    if x < 0:
+        raise ValueError(f"sqrt of {x:g}: give a number from 0 on")
+    return math.sqrt(x)
+
+
+def _sum(values: list[float]) -> float:
+    try:
+        return math.fsum(values)
+    except (OverflowError, ValueError):  # beyond a double, or infinite both ways
+        return sum(values)
+
+
+def _mean(values: list[float]) -> float:
+    return _sum(values) / len(values)
+
+
+FUNCTIONS = (
+    function("abs", Yields.NUMBER, "the number without its sign", (abs, "x")),
+    function("sqrt", Yields.NUMBER, "the square root; x ≥ 0", (square_root, "x")),
+    function("hypot", Yields.NUMBER, "√(x² + y²), √(x² + y² + z²)", (math.hypot, "x y"), (math.hypot, "x y z")),
+    function("sin", Yields.NUMBER, "the sine", (math.sin, "radians")),
+    function("cos", Yields.NUMBER, "the cosine", (math.cos, "radians")),
+    function("atan2", Yields.NUMBER, "the angle of (x, y), radians in [-π, π]", (math.atan2, "y x")),
+    function("smaller", Yields.NUMBER, "the smaller of two numbers", (min, "x y")),
+    function("larger", Yields.NUMBER, "the larger of two numbers", (max, "x y")),
+    function("minimum", Yields.NUMBER, "the smallest number of a list", (of_list(min), "values:list")),
+    function("maximum", Yields.NUMBER, "the largest number of a list", (of_list(max), "values:list")),
+    function("mean", Yields.NUMBER, "the mean of a list", (of_list(_mean), "values:list")),
+    function("sum", Yields.NUMBER, "the sum of a list", (of_list(_sum), "values:list")),
+)

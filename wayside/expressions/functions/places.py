@@ -1,0 +1,143 @@
+"""Places: distances in metres, bearings in degrees, and what lies inside a polygon.
+
+On the Earth the ellipsoid is WGS 84. The edges of a polygon of latitudes and longitudes are straight in these, which
+for edges up to a few kilometres is the straight way on the ground to within centimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+
+from wayside import geodesy
+from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.members import pair, place, sequence
+
+Point = tuple[float, float]
+
+
+def wgs84_distance(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:
+    """Metres along the ellipsoid between two places given in degrees."""
+    _check(latitude1, longitude1)
+    _check(latitude2, longitude2)
+    return geodesy.distance(latitude1, longitude1, latitude2, longitude2)
+
+
+def wgs84_bearing(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:
+    """Degrees in [0, 360), clockwise from north, at the first place, of the great circle: up to 0.2 degrees off."""
+    _check(latitude1, longitude1)
+    _check(latitude2, longitude2)
+    phi1, phi2 = math.radians(latitude1), math.radians(latitude2)
+    difference = math.radians(math.remainder(longitude2 - longitude1, 360.0))
+    east = math.sin(difference) * math.cos(phi2)
+    north = math.cos(phi1) * math.sin(phi2) - math.sin(phi1) * math.cos(phi2) * math.cos(difference)
+    bearing = math.degrees(math.atan2(east, north)) % 360.0
+    return 0.0 if bearing == 360.0 else bearing  # what is just below 0 rounds up
+
+
+def inside(x: float, y: float, polygon: object) -> bool:
+    """Whether (x, y) lies in the polygon, a list of corners [x, y] or {x, y}; on its edges and corners counts."""
+    return _contains(_corners(polygon, ("x", "y")), (x, y))
+
+
+def inside_wgs84(latitude: float, longitude: float, polygon: object) -> bool:
+    """The same of degrees, with corners [latitude, longitude]; a polygon may lie across the antimeridian."""
+    _check(latitude, longitude)
+    corners = _corners(polygon, ("latitude", "longitude"))
+    for corner in corners:
+        _check(*corner)
+    unrolled = [corners[0]]
+    for here, there in corners[1:]:
+        before = unrolled[-1][1]
+        step = there - before
+        unrolled.append((here, there - 360.0 * round(step / 360.0)))
+    west, east = min(point[1] for point in unrolled), max(point[1] for point in unrolled)
+    turns = range(math.ceil((west - longitude) / 360.0), math.floor((east - longitude) / 360.0) + 1)
+    return any(_contains(unrolled, (latitude, longitude + 360.0 * turn)) for turn in turns)
+
+
+def count_inside(items: object, polygon: object, path: str = "") -> float:
+    """How many objects of a list lie in the polygon."""
+    corners = _corners(polygon, ("x", "y"))
+    places = [place(item, f"items[{i}]", path) for i, item in enumerate(sequence(items, "items"))]
+    return float(sum(_contains(corners, (x, y)) for x, y, _ in places))
+
+
+def _corners(polygon: object, names: tuple[str, str]) -> list[Point]:
+    corners = [pair(corner, names, f"polygon[{i}]") for i, corner in enumerate(sequence(polygon, "polygon"))]
+    if len(corners) < 3:
+        raise ValueError(f"a polygon has three corners or more, this one has {len(corners)}")
+    if not all(map(math.isfinite, (number for corner in corners for number in corner))):
+        raise ValueError("a corner of the polygon is infinite")
+    return corners
+
+
+def _contains(corners: Sequence[Point], point: Point) -> bool:
+    """Even-odd: a ray to the right crosses the edges an odd number of times. Exact, so that edges belong to it."""
+    x, y = point
+    odd = False
+    ax, ay = corners[-1]
+    for bx, by in corners:
+        if min(ay, by) <= y <= max(ay, by) and x <= max(ax, bx):
+            side = _side(ax, ay, bx, by, x, y)
+            if side == 0 and min(ax, bx) <= x:
+                return True
+            if (ay > y) != (by > y) and (side > 0) == (by > ay):
+                odd = not odd
+        ax, ay = bx, by
+    return odd
+
+
+def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
+    """Above 0 where (x, y) lies left of the way from a to b, 0 on its line; exact by fractions in doubt."""
+    left, right = (bx - ax) * (y - ay), (by - ay) * (x - ax)
+    value = left - right
+    if abs(value) > 4e-16 * (abs(left) + abs(right)) and math.isfinite(value):
+        return value
+    exact = (Fraction(bx) - Fraction(ax)) * (Fraction(y) - Fraction(ay)) - (Fraction(by) - Fraction(ay)) * (
+        Fraction(x) - Fraction(ax)
+    )
+    return (exact > 0) - (exact < 0)
+
+
+def _check(latitude: float, longitude: float) -> None:
+    if not -90 <= latitude <= 90:
+        raise ValueError(f"latitude {latitude:g} is beyond ±90 degrees")
+    if not -360 <= longitude <= 360:
+        raise ValueError(f"longitude {longitude:g} is beyond ±360 degrees")
+
+
+FUNCTIONS = (
+    function(
+        "wgs84Distance",
+        Yields.NUMBER,
+        "the way along the Earth's surface (ellipsoid WGS 84), metres",
+        (wgs84_distance, "latitude1 longitude1 latitude2 longitude2"),
+    ),
+    function(
+        "wgs84Bearing",
+        Yields.NUMBER,
+        "the direction from the first place to the second, degrees in [0, 360) clockwise from north",
+        (wgs84_bearing, "latitude1 longitude1 latitude2 longitude2"),
+    ),
+    function(
+        "inside",
+        Yields.BOOLEAN,
+        "whether the place lies inside the polygon or on its edge; same unit for all",
+        (inside, "x y polygon:list"),
+    ),
+    function(
+        "insideWgs84",
+        Yields.BOOLEAN,
+        "the same, degrees; corners are [latitude, longitude]",
+        (inside_wgs84, "latitude longitude polygon:list"),
+    ),
+    function(
+        "countInside",
+        Yields.NUMBER,
+        "how many objects of a list lie inside the polygon or on its edge",
+        (count_inside, "items:list polygon:list"),
+        (count_inside, "items:list polygon:list path:text"),
+    ),
+)
