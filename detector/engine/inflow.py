@@ -63,21 +63,29 @@ class Inflow:
     def _insert_in_order(self, arrivals: Sequence[Arrival]) -> None:
         """The hot path. What `Lane.insert` and `Buffer.grew` do is written out: a call costs as much as the rest."""
         lanes, buffer = self._lanes, self._buffer
+        held, cap = buffer.bytes, buffer.maximum_bytes
         for arrival in arrivals:
             time, stream, key, payload = arrival
-            lane = lanes.get(stream, _NO_LANES).get(key) or self._lane(stream, key, time)
-            if lane is None:
-                continue
+            try:
+                lane = lanes[stream][key]
+            except KeyError:
+                found = self._lane(stream, key, time)
+                if found is None:
+                    continue
+                lane = found
             if time >= lane.latest and not lane.capped:
                 lane.latest = time
                 lane.samples.append(arrival)
                 size = len(payload) + SAMPLE_OVERHEAD
                 lane.bytes += size
-                buffer.bytes += size
-                if buffer.bytes > buffer.maximum_bytes:
-                    buffer.shrink()
             else:
-                buffer.grew(lane.insert(arrival))
+                size = lane.insert(arrival)
+            held += size
+            if held > cap:
+                buffer.bytes = held
+                buffer.shrink()
+                held = buffer.bytes
+        buffer.bytes = held
 
     def _lane(self, stream: str, key: str, time: int) -> Lane | None:
         """The lane that takes a sample; None, and not counted among those taken in, where there is none for it."""

@@ -16,8 +16,8 @@ from wayside.keys import KeyPattern
 P = TypeVar("P", bound=BaseModel)
 """The model of a source's parameters."""
 
-Put = Callable[[str, bytes], None]
-"""Takes a message: its key and payload. Thread-safe, and never waits."""
+Put = Callable[[Sequence[tuple[str, bytes]]], None]
+"""Takes messages that came together: the key and the payload of each. Thread-safe, and never waits."""
 
 _MAXIMUM_KEYS = 100_000
 """So many keys' streams are remembered; beyond, they are looked up anew."""
@@ -66,14 +66,14 @@ class Feed:
             self._on_unrouted(key)
             return
         for put in routes:
-            put(key, payload)
+            put([(key, payload)])
         self.messages += 1
 
     def deliver(self, stream: str, key: str, payload: bytes) -> None:
         """Deliver a message to one stream of the source. Raises KeyError if it is none."""
         put = self._puts[stream]
         if not self._stop.is_set():
-            put(key, payload)
+            put([(key, payload)])
             self.messages += 1
 
     @property

@@ -6,7 +6,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import Any
 
@@ -24,9 +24,9 @@ class Arrivals:
         self._changed = threading.Condition()
 
     def putter(self, stream: str) -> Put:
-        def put(key: str, payload: bytes) -> None:
+        def put(messages: Sequence[tuple[str, bytes]]) -> None:
             with self._changed:
-                self.seen.append((stream, key, payload))
+                self.seen += [(stream, key, payload) for key, payload in messages]
                 self._changed.notify_all()
 
         return put

@@ -28,7 +28,7 @@ def test_many_threads_at_once_get_receive_times_that_strictly_increase_in_the_or
         put = intake.putter(stream)
         begin.wait()
         for number in range(2_000):
-            put(f"k/{number}", b"x")
+            put([(f"k/{number}", b"x")])
 
     threads = [threading.Thread(target=publish, args=(f"s{index}",)) for index in range(8)]
     for thread in threads:
@@ -59,7 +59,7 @@ def test_a_clock_that_stands_still_or_goes_back_does_not_repeat_a_time() -> None
     put = intake.putter("s")
     for now in (100, 100, 40, 101, 500):
         clock.now = now
-        put("k", b"")
+        put([("k", b"")])
     assert [arrival.received for arrival in intake.drain(0)] == [100, 101, 102, 103, 500]
 
 
@@ -67,7 +67,7 @@ def test_what_comes_after_a_drain_is_later_than_its_tick() -> None:
     intake = Intake(Clock(100))
     put = intake.putter("s")
     assert intake.drain(1_000) == []
-    put("k", b"")
+    put([("k", b"")])
     assert [arrival.received for arrival in intake.drain(1_000)] == [1_001]
     assert intake.last == 1_001
 
@@ -76,10 +76,10 @@ def test_a_full_queue_drops_what_comes_and_counts_it() -> None:
     intake = Intake(Clock(0), maximum_bytes=2 * SAMPLE_OVERHEAD)
     put = intake.putter("s")
     for key in "abcd":
-        put(key, b"")
+        put([(key, b"")])
     assert intake.dropped == 2
     assert [arrival.key for arrival in intake.drain(0)] == ["a", "b"]
-    put("e", b"")
+    put([("e", b"")])
     assert [arrival.key for arrival in intake.drain(0)] == ["e"]
     assert intake.dropped == 2
 
@@ -87,12 +87,12 @@ def test_a_full_queue_drops_what_comes_and_counts_it() -> None:
 def test_the_bytes_that_wait_are_bounded_over_all_streams() -> None:
     intake = Intake(Clock(0), maximum_bytes=10 + 2 * SAMPLE_OVERHEAD)
     first, second = intake.putter("s"), intake.putter("t")
-    first("a", b"12345")
-    second("b", b"67890")
-    first("c", b"")
+    first([("a", b"12345")])
+    second([("b", b"67890")])
+    first([("c", b"")])
     assert intake.dropped == 1
     assert [arrival.key for arrival in intake.drain(0)] == ["a", "b"]
-    first("d", b"1")
+    first([("d", b"1")])
     assert intake.dropped == 1
 
 
@@ -100,9 +100,27 @@ def test_after_a_step_back_of_the_clock_time_goes_on_from_there() -> None:
     clock = Clock(1_000)
     intake = Intake(clock)
     put = intake.putter("s")
-    put("a", b"")
+    put([("a", b"")])
     clock.now = 200
     assert [arrival.received for arrival in intake.drain(0)] == [1_000]
     intake.step_back(200)
-    put("b", b"")
+    put([("b", b"")])
     assert [arrival.received for arrival in intake.drain(0)] == [201]
+
+
+def test_messages_that_come_together_follow_each_other_from_their_common_time_on() -> None:
+    clock = Clock(100)
+    intake = Intake(clock)
+    put = intake.putter("s")
+    put([("a", b""), ("b", b""), ("c", b"")])
+    clock.now = 101
+    put([("d", b"")])
+    clock.now = 500
+    put([("e", b"")])
+    assert [(arrival.key, arrival.received) for arrival in intake.drain(0)] == [
+        ("a", 100),
+        ("b", 101),
+        ("c", 102),
+        ("d", 103),
+        ("e", 500),
+    ]
