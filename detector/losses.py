@@ -102,6 +102,9 @@ class Losses:
         for name, rule in counters.rules.items():
             yield Loss(f"evaluation errors in EventRule {name}", rule.errors, rule.last_error)
             yield Loss(f"times a sample had no position for EventRule {name}", rule.misplaced, rule.last_misplaced)
+            yield Loss(
+                f"looks at pairs left out for EventRule {name}, more than maxPairs being near", rule.crowded_pairs
+            )
 
 
 def _line(loss: Loss, count: int) -> str:

@@ -29,3 +29,18 @@ def subject_text(clients: Sequence[str], element: str | None = None) -> str:
     """
     text = "+".join(map(encode, clients)) if clients else FLEET
     return text if element is None else f"{text}~{encode(element)}"
+
+
+def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
+    """The clients and the element of a subject's text, as `subject_text` makes it.
+
+    Raises:
+        ValueError: no subject reads like this.
+    """
+    is_fleet = text == FLEET or text.startswith(f"{FLEET}~")
+    head, mark, tail = text.removeprefix(FLEET).partition("~")
+    clients = () if is_fleet else tuple(map(decode, head.split("+")))
+    element = decode(tail) if mark else None
+    if subject_text(clients, element) != text or "" in clients or element == "":
+        raise ValueError(f"{text!r} is no subject: expected car1, car1+car2 or {FLEET}, and perhaps ~element")
+    return clients, element

@@ -29,6 +29,9 @@ class RuleCounters:
     """Looks at a client whose newest sample says no place: absent, no number, infinite."""
     last_misplaced: str = ""
 
+    crowded_pairs: int = 0
+    """Pairs within reach that were not looked at, there being more than `maxPairs`; each at each evaluation."""
+
     def note(self, reason: Reason, message: str) -> None:
         """Count an expression's unknown result."""
         if reason is Reason.ERROR:

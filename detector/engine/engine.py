@@ -18,10 +18,12 @@ from detector.engine.events import Event
 from detector.engine.inflow import Inflow
 from detector.engine.lanes import lane_makers
 from detector.engine.messages import KeyReader, Messages
+from detector.engine.positions import Positions
 from detector.engine.queries import BufferQueries
 from detector.engine.sample import Arrival, Decoder
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
+from detector.engine.subjects import subject_of
 from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Ticks, Timeline, WallTimeline
 from detector.engine.transforms import Transforms, TransformStream
 from wayside.api import Detector
@@ -98,6 +100,7 @@ class Engine:
         self._transforms = Transforms(_transform_streams(detector), self.buffer, self._messages, self.counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
         self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after, self._floor)
+        self._positions = Positions(self.buffer, self._messages, self._stale_after, self._floor)
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later."""
@@ -210,7 +213,16 @@ class Engine:
         events: list[Event] = []
         for run in self._runs.values():
             if run.due(time):
-                views = Views(run.rule, time, self.clients, self.buffer, self._signals, self._stale_after, run.counters)
+                views = Views(
+                    run.rule,
+                    time,
+                    self.clients,
+                    self.buffer,
+                    self._signals,
+                    self._positions,
+                    self._stale_after,
+                    run.counters,
+                )
                 events += run.tick(time, views, self.clients)
         self._messages.forget()
         self._transforms.forget()
@@ -221,6 +233,7 @@ class Engine:
             self.buffer.step_back(time)
         self._floor = time
         self._signals.gap(time)
+        self._positions.gap(time)
         self.clients.gap(time)
         for run in self._runs.values():
             run.gap(time)
@@ -276,11 +289,13 @@ def _reads_like(stream: Stream, before: Stream | None) -> bool:
 
 def _ended_while_away(demand: Demand, now: int) -> Event:
     """The end of an episode whose rule changed or went while the detector was not running."""
+    subject = subject_of(demand.subjects, demand.subject)
     return Event(
         holder=demand.holder,
         rule=demand.rule,
         subject=demand.subject,
         subjects=demand.subjects,
+        element=None if subject is None else subject.element,
         episode=demand.episode,
         onset_time=demand.onset_time,
         start_time=demand.start_time,

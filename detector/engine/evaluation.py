@@ -13,10 +13,11 @@ from detector.engine.counters import RuleCounters
 from detector.engine.demands import Demand
 from detector.engine.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
 from detector.engine.events import Event
-from detector.engine.scopes import Candidate, Members, Views, candidates, snapshot
+from detector.engine.scopes import Candidate, Views, candidates
+from detector.engine.snapshots import snapshot
+from detector.engine.subjects import Subject, fits, subject_of
 from wayside.expressions import UNKNOWN, Expression, InterpolationError
-from wayside.names import subject_text
-from wayside.rules import CompiledDeploy, CompiledRule, PairSubject
+from wayside.rules import CompiledDeploy, CompiledRule
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,7 @@ class Episode:
     """An open episode. Times are nanoseconds since the epoch."""
 
     id: str
-    members: Members
+    subject: Subject
     onset: int
     start: int
     values: Mapping[str, Any]
@@ -55,8 +56,8 @@ class RuleRun:
         self._timing = _timing(rule)
         self.version = 0
         """Changes whenever the demands do."""
-        self._states: dict[Members, SubjectState] = {}
-        self._open: dict[Members, Episode] = {}
+        self._states: dict[Subject, SubjectState] = {}
+        self._open: dict[Subject, Episode] = {}
 
     def due(self, now: int) -> bool:
         """Whether the rule is evaluated at this tick."""
@@ -68,7 +69,7 @@ class RuleRun:
         for candidate in candidates(self.rule, views, clients, self._in_progress()):
             self.counters.evaluations += 1
             events += self._subject(now, candidate)
-        self._states = {members: state for members, state in self._states.items() if not state.idle_at(now)}
+        self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}
         yield from sorted(events, key=lambda event: event.subject)
 
     def gap(self, time: int) -> None:
@@ -79,14 +80,13 @@ class RuleRun:
 
     def can_restore(self, demand: Demand) -> bool:
         """Whether the demand's episode is one of this rule, as it is now."""
-        wanted = 2 if isinstance(self.rule.subject, PairSubject) else 1
-        members = demand.subjects
+        subject = subject_of(demand.subjects, demand.subject)
         return (
             self.rule.enabled
             and self.rule.digest == demand.rule_digest
-            and len(members) == wanted
-            and list(members) == sorted(set(members))
-            and members not in self._open
+            and subject is not None
+            and fits(self.rule, subject)
+            and subject not in self._open
         )
 
     def restore(self, demands: list[Demand]) -> None:
@@ -95,11 +95,14 @@ class RuleRun:
         Where an action is not what it was, its demand holds until it is rendered anew, at the next evaluation.
         """
         first = demands[0]
+        subject = subject_of(first.subjects, first.subject)
+        if subject is None:
+            return
         deploys = {deploy.action: (deploy.template, deploy.priority) for deploy in self.rule.deploys}
-        self._states[first.subjects] = SubjectState(is_open=True)
-        self._open[first.subjects] = Episode(
+        self._states[subject] = SubjectState(is_open=True)
+        self._open[subject] = Episode(
             first.episode,
-            first.subjects,
+            subject,
             first.onset_time,
             first.start_time,
             first.values,
@@ -125,8 +128,8 @@ class RuleRun:
 
     def end_all(self, now: int, reason: Reason) -> Iterator[Event]:
         """End every open episode, in order of the subjects, and forget what was pending."""
-        for members in sorted(self._open):
-            yield self._ended(now, self._open.pop(members), reason, {})
+        for subject in sorted(self._open, key=lambda each: each.text):
+            yield self._ended(now, self._open.pop(subject), reason, {})
         self._states.clear()
 
     def demands(self) -> Iterator[Demand]:
@@ -135,33 +138,32 @@ class RuleRun:
             for episode in self._open.values():
                 yield from episode.demands.values()
 
-    def _in_progress(self) -> Iterator[Members]:
-        return (members for members, state in self._states.items() if state.is_open or state.onset is not None)
+    def _in_progress(self) -> Iterator[Subject]:
+        return (subject for subject, state in self._states.items() if state.is_open or state.onset is not None)
 
     def _lost(self, now: int, clients: Clients) -> Iterator[Event]:
-        for members in [m for m in self._states if any(member not in clients for member in m)]:
-            state = self._states[members]
+        for subject in [s for s in self._states if any(client not in clients for client in s.clients)]:
+            state = self._states[subject]
             if state.is_open:
                 state.end(now, self._timing)
-                yield self._ended(now, self._open.pop(members), Reason.CLIENT_LOST, {})
+                yield self._ended(now, self._open.pop(subject), Reason.CLIENT_LOST, {})
             else:
                 state.gap()
 
     def _subject(self, now: int, candidate: Candidate) -> Iterator[Event]:
-        state = self._states.get(candidate.members)
+        state = self._states.get(candidate.subject)
         if state is None:
-            state = self._states[candidate.members] = SubjectState()
+            state = self._states[candidate.subject] = SubjectState()
         variables = candidate.variables
         when = self._truth(self.rule.when, variables)
         until = negation(when) if self.rule.until is None else self._truth(self.rule.until, variables)
-        in_scope = True if self.rule.subject.where is None else self._truth(self.rule.subject.where, variables)
-        match state.step(now, self._timing, Observation(in_scope, candidate.near, when, until)):
+        match state.step(now, self._timing, Observation(candidate.in_scope, candidate.near, when, until)):
             case Started(onset):
                 yield self._started(now, onset, candidate)
             case Ended(reason):
-                yield self._ended(now, self._open.pop(candidate.members), reason, snapshot(self.rule, candidate))
+                yield self._ended(now, self._open.pop(candidate.subject), reason, snapshot(self.rule, candidate))
             case None:
-                episode = self._open.get(candidate.members)
+                episode = self._open.get(candidate.subject)
                 if episode is not None and (episode.outdated or len(episode.demands) < len(self.rule.deploys)):
                     episode.variables = variables
                     self._render(episode)
@@ -171,11 +173,10 @@ class RuleRun:
         return value if isinstance(value, bool) else UNKNOWN
 
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
-        members = candidate.members
-        subject = subject_text(members)
-        identifier = _episode_id(self._identity.holder, self.rule.name, subject, now)
-        episode = Episode(identifier, members, onset, now, snapshot(self.rule, candidate), candidate.variables)
-        self._open[members] = episode
+        subject = candidate.subject
+        identifier = _episode_id(self._identity.holder, self.rule.name, subject.text, now)
+        episode = Episode(identifier, subject, onset, now, snapshot(self.rule, candidate), candidate.variables)
+        self._open[subject] = episode
         self.counters.started += 1
         self._render(episode)
         return self._event(episode, None, None, episode.values)
@@ -189,8 +190,8 @@ class RuleRun:
         return Event(
             holder=self._identity.holder,
             rule=self.rule.name,
-            subject=subject_text(episode.members),
-            subjects=episode.members,
+            subject=episode.subject.text,
+            subjects=episode.subject.clients,
             episode=episode.id,
             onset_time=episode.onset,
             start_time=episode.start,
@@ -198,6 +199,7 @@ class RuleRun:
             reason=reason,
             values=values,
             classification=self.rule.classification,
+            element=episode.subject.element,
         )
 
     def _render(self, episode: Episode) -> None:
@@ -226,8 +228,8 @@ class RuleRun:
             detector=self._identity.detector,
             holder=self._identity.holder,
             namespace=self._identity.namespace,
-            subject=subject_text(episode.members),
-            subjects=episode.members,
+            subject=episode.subject.text,
+            subjects=episode.subject.clients,
             episode=episode.id,
             onset_time=episode.onset,
             start_time=episode.start,

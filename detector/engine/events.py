@@ -31,6 +31,8 @@ class Event:
     reason: Reason | None
     values: Mapping[str, JsonValue]
     classification: Mapping[str, JsonValue] | None
+    element: str | None = None
+    """The element of `each` that the rule was evaluated for."""
 
     @property
     def started(self) -> bool:
@@ -49,6 +51,7 @@ class Event:
             "rule": self.rule,
             "episode": self.episode,
             "subjects": list(self.subjects),
+            **({} if self.element is None else {"element": self.element}),
             "onsetTime": format_time(self.onset_time),
             "startTime": format_time(self.start_time),
         }

@@ -2,39 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
-
-import numpy as np
 
 from detector.engine.buffer import Buffer
 from detector.engine.clients import Clients, fresh_streams
 from detector.engine.counters import RuleCounters
-from detector.engine.episodes import Truth
-from detector.engine.signals import Position, Signals
-from wayside.expressions import UNKNOWN
-from wayside.rules import ClientSubject, CompiledRule, PairSubject
+from detector.engine.episodes import Truth, both
+from detector.engine.nearness import Search, near_pairs
+from detector.engine.positions import Place, Positions, described, distance, point
+from detector.engine.signals import Signals
+from detector.engine.subjects import Subject
+from wayside.expressions import UNKNOWN, Expression
+from wayside.rules import ClientSubject, CompiledElement, CompiledRule, FleetSubject, PairSubject
 
-Members = tuple[str, ...]
-"""The clients of a subject: one, or two in order of their names."""
-
-_FEW = 32
-"""Up to so many clients, looking at every pair is faster than building a tree."""
-
-_ROUNDING = 1 + 1e-9
-"""The tree is asked for a little more than wanted, lest it round a pair away that is just within reach."""
+CLOSING_NS = 1_000_000_000
+"""Over so long the closing speed is measured, in nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """A subject to evaluate the rule for."""
 
-    members: Members
+    subject: Subject
     variables: Mapping[str, Any]
     """What the conditions see; what is unknown is left out."""
+    in_scope: Truth
+    """What `where` says, and the roles of a pair; false ends an open episode."""
     near: Truth
     """Whether an episode may start; unknown for a pair of which one's position is."""
 
@@ -49,6 +44,7 @@ class Views:
         clients: Clients,
         buffer: Buffer,
         signals: Signals,
+        positions: Positions,
         stale_after: Mapping[str, int | None],
         counters: RuleCounters,
     ) -> None:
@@ -57,9 +53,11 @@ class Views:
         self._clients = clients
         self._buffer = buffer
         self._signals = signals
+        self._positions = positions
         self._stale_after = stale_after
         self._counters = counters
         self._views: dict[str, dict[str, Any]] = {}
+        self._earlier: dict[str, Place | None] = {}
 
     def of(self, client: str) -> dict[str, Any]:
         """client, labels, streams and the known signals."""
@@ -77,90 +75,109 @@ class Views:
             self._views[client] = view
         return view
 
-    def positions(self, subject: PairSubject) -> dict[str, Position]:
-        """Where the clients are whose position is known, in metres."""
-        found = {}
-        for client in self._clients:
-            position = self._signals.position(self._rule.name, subject.position, client, self._now, self._counters)
-            if position is not None:
-                found[client] = position
-        return found
+    def place(self, subject: PairSubject, client: str) -> Place | None:
+        """Where the client is, if that is known."""
+        return self._positions.now(subject.position, client, self._now, self._counters)
+
+    def earlier_place(self, subject: PairSubject, client: str) -> Place | None:
+        """Where the client was a second ago, if that is known; looked up once a tick."""
+        if client not in self._earlier:
+            then = self._now - CLOSING_NS
+            self._earlier[client] = self._positions.then(subject.position, client, then, self._counters)
+        return self._earlier[client]
+
+    def truth(self, expression: Expression | None, variables: Mapping[str, Any]) -> Truth:
+        """What a condition says; one that is absent holds."""
+        if expression is None:
+            return True
+        value = expression.evaluate_or_unknown(variables, self._counters.note)
+        return value if isinstance(value, bool) else UNKNOWN
+
+    def left_out(self, pairs: int) -> None:
+        """So many pairs within reach were left out."""
+        self._counters.crowded_pairs += pairs
 
 
-def candidates(rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Members]) -> Iterator[Candidate]:
+def candidates(rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Subject]) -> Iterator[Candidate]:
     """The subjects to look at: all that may start an episode, and those that have one or are about to."""
     match rule.subject:
-        case ClientSubject():
-            for client in clients:
-                yield Candidate((client,), views.of(client), near=True)
-        case PairSubject() as subject:
-            yield from _pairs(subject, views, clients, pending)
+        case ClientSubject() as each:
+            for element in rule.elements:
+                for client in clients:
+                    variables = _with(views.of(client), element)
+                    in_scope = views.truth(each.where, variables)
+                    yield Candidate(Subject((client,), element.name), variables, in_scope, near=True)
+        case PairSubject() as pairs:
+            yield from _pairs(rule, pairs, views, clients, pending)
+        case FleetSubject() as fleet:
+            for element in rule.elements:
+                seen = ((client, _with(views.of(client), element)) for client in clients)
+                members = [views.of(client) for client, view in seen if views.truth(fleet.members, view) is True]
+                yield Candidate(
+                    Subject((), element.name), {"members": members, **element.variables}, in_scope=True, near=True
+                )
 
 
-def _pairs(subject: PairSubject, views: Views, clients: Clients, pending: Iterable[Members]) -> Iterator[Candidate]:
-    positions = views.positions(subject)
-    near = set(near_pairs(positions, subject.within))
-    known = {members for members in pending if all(member in clients for member in members)}
-    for members in sorted(near | known):
-        a, b = members
-        variables: dict[str, Any] = {"a": _member(views, a, positions), "b": _member(views, b, positions)}
-        placed = a in positions and b in positions
-        if placed:
-            variables["distance"] = math.dist(positions[a], positions[b])
-        yield Candidate(members, variables, near=members in near if placed else UNKNOWN)
+def _with(view: dict[str, Any], element: CompiledElement) -> dict[str, Any]:
+    """What one client is seen as, and the element."""
+    return {**view, **element.variables} if element.variables else view
 
 
-def _member(views: Views, client: str, positions: Mapping[str, Position]) -> dict[str, Any]:
+def _pairs(
+    rule: CompiledRule, subject: PairSubject, views: Views, clients: Clients, pending: Iterable[Subject]
+) -> Iterator[Candidate]:
+    places = {client: place for client in clients if (place := views.place(subject, client)) is not None}
+    points = {client: point(subject.position, place) for client, place in places.items()}
+
+    def between(a: str, b: str) -> float:
+        return distance(subject.position, places[a], places[b])
+
+    in_progress = {each for each in pending if all(client in clients for client in each.clients)}
+    for element in rule.elements:
+        a_truth = _role(subject.a, element, views, clients)
+        b_truth = _role(subject.b, element, views, clients)
+        roles = (None, None) if not subject.ordered else (_possible(a_truth), _possible(b_truth))
+        found = near_pairs(Search(points, between, *roles), subject.within, subject.maximum)
+        views.left_out(found.left_out)
+        near = {Subject(pair, element.name) for pair in found.pairs}
+        for each in sorted(near | {one for one in in_progress if one.element == element.name}):
+            a, b = each.clients
+            variables: dict[str, Any] = {
+                "a": _member(views, subject, a, places),
+                "b": _member(views, subject, b, places),
+                **element.variables,
+            }
+            placed = a in places and b in places
+            if placed:
+                variables["distance"] = between(a, b)
+                if subject.closing_speed:
+                    _closing_speed(views, subject, a, b, variables)
+            in_scope = both(both(a_truth[a], b_truth[b]), views.truth(subject.where, variables))
+            yield Candidate(each, variables, in_scope, near=each in near if placed else UNKNOWN)
+
+
+def _role(where: Expression | None, element: CompiledElement, views: Views, clients: Clients) -> dict[str, Truth]:
+    """Of each client, whether it can have the role."""
+    if where is None:
+        return dict.fromkeys(clients, True)
+    return {client: views.truth(where, _with(views.of(client), element)) for client in clients}
+
+
+def _possible(role: Mapping[str, Truth]) -> list[str]:
+    """Who has the role, or may have it."""
+    return [client for client, truth in role.items() if truth is not False]
+
+
+def _member(views: Views, subject: PairSubject, client: str, places: Mapping[str, Place]) -> dict[str, Any]:
     view = views.of(client)
-    if client in positions and "position" not in view:
-        view["position"] = dict(zip("xyz", positions[client], strict=True))
+    if client in places and "position" not in view:
+        view["position"] = described(subject.position, places[client])
     return view
 
 
-def near_pairs(positions: Mapping[str, Position], within: float) -> Iterator[tuple[str, str]]:
-    """The pairs of names, each in order, that are at most `within` metres apart."""
-    names = sorted(positions)
-    if len(names) <= _FEW:
-        for a, b in combinations(names, 2):
-            if math.dist(positions[a], positions[b]) <= within:
-                yield a, b
-        return
-    # Not at the top: it takes half a second to import, which a detector of few clients does not owe.
-    from scipy.spatial import cKDTree  # noqa: PLC0415
-
-    tree = cKDTree(np.array([positions[name] for name in names]))
-    for i, j in tree.query_pairs(within * _ROUNDING):
-        # The tree rounds in its own way; this is what expressions see as distance.
-        if math.dist(positions[names[i]], positions[names[j]]) <= within:
-            yield names[i], names[j]
-
-
-def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
-    """The values that go into the event: signals, positions and the distance, where known."""
-    variables = candidate.variables
-    if isinstance(rule.subject, ClientSubject):
-        return _signals_of(rule, variables)
-    values: dict[str, Any] = {}
-    if "distance" in variables:
-        values["distance"] = variables["distance"]
-    for role in ("a", "b"):
-        view = variables[role]
-        values[role] = {"client": view["client"], **_signals_of(rule, view)}
-        if "position" in view:
-            values[role]["position"] = view["position"]
-    return values
-
-
-def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
-    return {signal.name: _without_bytes(view[signal.name]) for signal in rule.signals if signal.name in view}
-
-
-def _without_bytes(value: Any) -> Any:
-    """Neither an event nor a task can carry bytes, which CEL yields where it is asked to: null stands for them."""
-    if isinstance(value, bytes):
-        return None
-    if isinstance(value, list):
-        return [_without_bytes(item) for item in value]
-    if isinstance(value, dict):
-        return {key: _without_bytes(child) for key, child in value.items()}
-    return value
+def _closing_speed(views: Views, subject: PairSubject, a: str, b: str, variables: dict[str, Any]) -> None:
+    """Minus the change of distance over the last second, in m/s; unknown where one's place a second ago is."""
+    a_place, b_place = views.earlier_place(subject, a), views.earlier_place(subject, b)
+    if a_place is not None and b_place is not None:
+        change = variables["distance"] - distance(subject.position, a_place, b_place)
+        variables["closingSpeed"] = -change / (CLOSING_NS / 1e9)

@@ -13,17 +13,11 @@ from detector.engine.messages import Messages
 from detector.engine.sample import Sample
 from wayside.api.eventrule import Aggregate
 from wayside.expressions import UNKNOWN, Expression, Unknown, Value
-from wayside.rules import CompiledPosition, CompiledSignal
-
-Position = tuple[float, float, float]
-"""Metres."""
-
-_FARTHEST = 1e12
-"""No frame reaches this far, in metres; from 1e154 on the squares of distances are no numbers any more."""
+from wayside.rules import CompiledSignal
 
 
 class Signals:
-    """Computes the signals and positions of clients at a tick; values of samples are kept while they are looked at."""
+    """Computes the signals of clients at a tick; values of samples are kept while they are looked at."""
 
     def __init__(
         self,
@@ -68,28 +62,6 @@ class Signals:
         window = self._window(rule, signal, lane, client, now, counters, at_most=_NEWEST.get(signal.aggregate))
         value = _aggregated(signal, window, counters)
         return self._no_value(counters) if value is UNKNOWN else value
-
-    def position(
-        self, rule: str, position: CompiledPosition, client: str, now: int, counters: RuleCounters
-    ) -> Position | None:
-        """Where the client is, in metres, by the newest sample; None where that is not known or makes no sense."""
-        lane = self._buffer.lane(client, position.stream)
-        sample = None if lane is None else lane.newest
-        if lane is None or sample is None or not self._is_fresh(client, position.stream, now):
-            self._no_value(counters)
-            return None
-        axes = []
-        for axis, expression in (("x", position.x), ("y", position.y), ("z", position.z)):
-            value = 0.0 if expression is None else self._evaluate(expression, lane, sample, counters)
-            if not isinstance(value, int | float):
-                counters.misplace(f"{axis} of {client} is absent, NaN, no number, or cannot be read")
-                return None
-            if not abs(value) <= _FARTHEST:
-                self._no_value(counters)
-                counters.misplace(f"{axis} of {client} is {value:g} m, where nobody is")
-                return None
-            axes.append(float(value))
-        return axes[0], axes[1], axes[2]
 
     def _is_fresh(self, client: str, stream: str, now: int) -> bool:
         return is_fresh(client, stream, self._stale_after[stream], self._buffer, now)

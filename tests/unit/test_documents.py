@@ -90,7 +90,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         ),
         (
             "  when: a\n  scope: {client: {}, pairs: {position: {stream: s, x: a, y: b}, within: 3}}",
-            "f.yaml:6:10: spec.scope: exactly one of client and pairs must be given",
+            "f.yaml:6:10: spec.scope: exactly one of client, pairs and fleet must be given",
             [],
         ),
         ("  when: a\n  evaluation: {every: 5ms}", "f.yaml:6:15: spec.evaluation: every: 5ms", ["give 10ms or more"]),

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from itertools import combinations
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from detector.engine.demands import Demand
-from detector.engine.scopes import near_pairs
 from tests.unit.driving import POSITION, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at, compiled
 
 SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
@@ -118,33 +114,6 @@ def test_a_pair_in_three_dimensions() -> None:
         until=1,
     )
     assert told == ["near a+b started 1"]
-
-
-coordinates = st.floats(-1e4, 1e4) | st.integers(-300, 300).map(float) | st.sampled_from([1e12, -1e12])
-positions = st.tuples(coordinates, coordinates, st.sampled_from([0.0, 1.0]))
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(positions, max_size=48), st.sampled_from([0.5, 100.0, 250.0, 1e6]))
-def test_the_pairs_within_reach_are_the_same_for_few_clients_and_for_many(
-    placed: list[tuple[float, float, float]], within: float
-) -> None:
-    named = {f"car{index}": position for index, position in enumerate(placed)}
-    expected = {
-        tuple(sorted((a, b)))
-        for a, b in combinations(named, 2)
-        if sum((p - q) ** 2 for p, q in zip(named[a], named[b], strict=True)) ** 0.5 <= within * (1 + 1e-12)
-    }
-    assert set(near_pairs(named, within)) <= expected
-    certain = {
-        tuple(sorted((a, b)))
-        for a, b in combinations(named, 2)
-        if sum((p - q) ** 2 for p, q in zip(named[a], named[b], strict=True)) ** 0.5 <= within * (1 - 1e-12)
-    }
-    assert certain <= set(near_pairs(named, within))
-    if len(named) > 32:  # one more far away makes a tree of it, one less a loop
-        few = dict(list(named.items())[:32])
-        assert {pair for pair in near_pairs(named, within) if set(pair) <= few.keys()} == set(near_pairs(few, within))
 
 
 def test_events_of_a_tick_come_by_rule_and_then_by_subject_whatever_the_order_of_arrival() -> None:

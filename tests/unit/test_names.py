@@ -2,10 +2,11 @@
 
 import re
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wayside.names import decode, encode, subject_text
+from wayside.names import decode, encode, parse_subject, subject_text
 
 texts = st.text(st.characters(exclude_categories=["Cs"]), min_size=1)
 subjects = st.tuples(st.lists(texts, max_size=3), st.none() | texts)
@@ -34,3 +35,15 @@ def test_subjects_read_as_the_design_says() -> None:
     assert subject_text([]) == "~fleet"
     assert subject_text([], "a/b") == "~fleet~a%2Fb"
     assert subject_text(["urn:car~1"]) == "urn%3Acar%7E1"
+
+
+@given(subjects)
+def test_a_subjects_text_tells_its_clients_and_element(subject: tuple[list[str], str | None]) -> None:
+    clients, element = subject
+    assert parse_subject(subject_text(clients, element)) == (tuple(clients), element)
+
+
+@pytest.mark.parametrize("text", ["", "~", "~x", "~fleetx", "a+", "+", "a b", "a~b~c", "%zz", "%FF"])
+def test_what_is_no_subject_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"is no subject|can't decode"):
+        parse_subject(text)

@@ -22,6 +22,7 @@ from wayside.api.base import (
     validations,
 )
 from wayside.api.classification import Classification
+from wayside.api.scopes import ClientScope, Each, Scope
 
 
 class Aggregate(StrEnum):
@@ -52,59 +53,6 @@ WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE})
 
 WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE}
 """The aggregates that need `over`."""
-
-
-class Position(Model):
-    """Where a client is, in metres of one common frame."""
-
-    stream: ObjectName = Field(description="The stream whose newest sample tells the position.")
-    x: Expression = Field(description="CEL over msg: metres along the first axis, e.g. msg.pose.position.x.")
-    y: Expression = Field(description="CEL over msg: metres along the second axis.")
-    z: Expression | None = Field(default=None, description="CEL over msg: metres along the third axis; 0 where absent.")
-
-
-class ClientScope(Model):
-    """The rule is evaluated once for each client."""
-
-    where: Expression | None = Field(
-        default=None,
-        description="CEL over client, labels and streams: only clients for which it is true. "
-        "Turning false ends an open episode, reason OutOfScope.",
-    )
-
-
-class PairsScope(Model):
-    """The rule is evaluated once for each unordered pair of clients; a is the one with the smaller name."""
-
-    position: Position = Field(description="Where a client is.")
-    within: float = Field(
-        gt=0,
-        le=1_000_000,
-        description="Metres. Only pairs at most this far apart can start an episode; a pair with an open episode "
-        "is always evaluated.",
-    )
-    where: Expression | None = Field(
-        default=None,
-        description="CEL over a, b and distance: only pairs for which it is true. "
-        "Turning false ends an open episode, reason OutOfScope.",
-    )
-
-
-class Scope(Model):
-    """Whom the rule is about: exactly one of the fields."""
-
-    model_config = validations(
-        ("has(self.client) != has(self.pairs)", "exactly one of client and pairs must be given"),
-    )
-
-    client: ClientScope | None = Field(default=None, description="Each client on its own. The default.")
-    pairs: PairsScope | None = Field(default=None, description="Each pair of clients near each other.")
-
-    @model_validator(mode="after")
-    def _exactly_one(self) -> Scope:
-        if (self.client is None) == (self.pairs is None):
-            raise ValueError("exactly one of client and pairs must be given")
-        return self
 
 
 class Evaluation(Model):
@@ -205,6 +153,7 @@ class EventRuleSpec(Model):
     )
     dry_run: bool = Field(default=False, description="true: events are published, but no action runs.")
     scope: Scope = Field(default=Scope(client=ClientScope()), description="Whom the rule is about.")
+    each: Each | None = Field(default=None, description="Evaluate the rule once for each of these elements.")
     evaluation: Evaluation = Field(default=Evaluation(), description="When the rule is evaluated.")
     signals: list[Signal] = Field(
         default_factory=list,
@@ -282,4 +231,4 @@ class EventRule(Kind):
     def semantics(self) -> dict[str, Any]:
         """The fields that decide which episodes there are; another value of any of them ends open episodes."""
         spec = self.spec.to_json()
-        return {field: spec.get(field) for field in ("scope", "signals", "when", "until", "for")}
+        return {field: spec.get(field) for field in ("scope", "each", "signals", "when", "until", "for")}

@@ -3,10 +3,12 @@
 from wayside.rules.compiled import (
     ClientSubject,
     CompiledDeploy,
+    CompiledElement,
     CompiledPosition,
     CompiledRule,
     CompiledSignal,
     CompiledStream,
+    FleetSubject,
     PairSubject,
 )
 from wayside.rules.compiling import RuleError, RuleProblem, compile_rule, compile_stream, stream_problems
@@ -16,11 +18,13 @@ from wayside.rules.sources import source_problems
 __all__ = [
     "ClientSubject",
     "CompiledDeploy",
+    "CompiledElement",
     "CompiledPosition",
     "CompiledRule",
     "CompiledSignal",
     "CompiledStream",
     "Fields",
+    "FleetSubject",
     "PairSubject",
     "RuleError",
     "RuleProblem",

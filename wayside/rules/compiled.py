@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,12 +24,16 @@ class CompiledSignal:
 
 @dataclass(frozen=True, slots=True)
 class CompiledPosition:
-    """How a client's position is computed; metres."""
+    """How a client's position is computed."""
 
     stream: str
-    x: Expression
-    y: Expression
-    z: Expression | None
+    axes: Mapping[str, Expression]
+    """x and y, perhaps z, in metres; or latitude and longitude, in degrees (WGS 84)."""
+
+    @property
+    def geographic(self) -> bool:
+        """Whether it is on the Earth, else in a flat frame."""
+        return "latitude" in self.axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +50,36 @@ class PairSubject:
     position: CompiledPosition
     within: float
     where: Expression | None
+    a: Expression | None = None
+    b: Expression | None = None
+    maximum: int = 10_000
+    """At most so many pairs within reach are looked at in one evaluation."""
+    closing_speed: bool = False
+    """Whether any expression asks for it."""
+
+    @property
+    def ordered(self) -> bool:
+        """Whether (car1, car2) and (car2, car1) are two subjects."""
+        return self.a is not None or self.b is not None
+
+
+@dataclass(frozen=True, slots=True)
+class FleetSubject:
+    """The rule is about all members together."""
+
+    members: Expression
+
+
+CompiledSubject = ClientSubject | PairSubject | FleetSubject
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledElement:
+    """One of the elements that the rule is evaluated for; a rule without `each` has one without a name."""
+
+    name: str | None = None
+    variables: Mapping[str, Any] = field(default_factory=dict)
+    """The element's map under its variable's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +99,7 @@ class CompiledRule:
     """A rule, ready to be evaluated."""
 
     name: str
-    subject: ClientSubject | PairSubject
+    subject: CompiledSubject
     signals: tuple[CompiledSignal, ...]
     when: Expression
     until: Expression | None
@@ -78,6 +113,7 @@ class CompiledRule:
     classification: dict[str, Any] | None
     digest: str
     """Of the fields that decide which episodes there are: open episodes end when it changes."""
+    elements: tuple[CompiledElement, ...] = (CompiledElement(),)
 
 
 @dataclass(frozen=True, slots=True)

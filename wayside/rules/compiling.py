@@ -7,12 +7,12 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from wayside.api import Detector, EventRule
 from wayside.api.detector import Stream
 from wayside.api.documents import FieldPath, field_text
-from wayside.api.eventrule import PairsScope, Signal
+from wayside.api.eventrule import Signal
 from wayside.expressions import (
     CompiledTemplate,
     Embedded,
@@ -26,23 +26,20 @@ from wayside.expressions import (
 )
 from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.compiled import (
-    ClientSubject,
     CompiledDeploy,
-    CompiledPosition,
     CompiledRule,
     CompiledSignal,
     CompiledStream,
+    CompiledSubject,
     PairSubject,
 )
 from wayside.rules.fields import Fields, unknown_fields
+from wayside.rules.scopes import closing_speed_problem, compile_elements, compile_subject, known_members
 from wayside.rules.variables import (
-    MEMBER_OF_CLIENT,
     RESERVED,
     SAMPLE_MEMBERS,
-    client_environment,
     condition_environment,
     is_taken,
-    pairs_environment,
     sample_environment,
     stamp_environment,
 )
@@ -126,14 +123,18 @@ class _RuleCompiler:
 
     def compile(self) -> CompiledRule | None:
         """The compiled rule, or None where problems forbid it."""
-        subject = self._subject()
+        subject = compile_subject(self)
+        elements = compile_elements(self, self.spec.each)
         signals = [self._signal(index, signal) for index, signal in enumerate(self.spec.signals)]
         environment = condition_environment(self.spec)
-        when = self._condition(("spec", "when"), self.spec.when, environment)
-        until = self._condition(("spec", "until"), self.spec.until, environment)
+        when = self.condition(("spec", "when"), self.spec.when, environment)
+        until = self.condition(("spec", "until"), self.spec.until, environment)
         deploys = [
             self._deploy(index, action.name, environment) for index, action in enumerate(self.spec.actions)
         ]  # fmt: skip
+        if subject is not None:
+            embedded = [each.expression for deploy in deploys if deploy for each in deploy.parameters.embedded]
+            subject = self._closing(subject, (when, until, *embedded))
         if self.problems or subject is None or when is None:
             return None
         spec = self.spec
@@ -152,46 +153,23 @@ class _RuleCompiler:
             deploys=tuple(deploy for deploy in deploys if deploy is not None),
             classification=None if spec.classification is None else spec.classification.to_json(),
             digest=_digest(self.rule),
+            elements=elements,
         )
-
-    def _subject(self) -> ClientSubject | PairSubject | None:
-        scope = self.spec.scope
-        if scope.pairs is not None:
-            return self._pairs(scope.pairs)
-        assert scope.client is not None  # noqa: S101  the model holds exactly one
-        return ClientSubject(
-            self._condition(("spec", "scope", "client", "where"), scope.client.where, client_environment())
-        )
-
-    def _pairs(self, pairs: PairsScope) -> PairSubject | None:
-        at: FieldPath = ("spec", "scope", "pairs")
-        position = pairs.position
-        stream = self._stream((*at, "position", "stream"), position.stream)
-        axes = {}
-        for axis in ("x", "y", "z"):
-            source = getattr(position, axis)
-            if source is not None:
-                axes[axis] = self._sample((*at, "position", axis), source, stream, Kind.DOUBLE)
-        where = self._condition((*at, "where"), pairs.where, pairs_environment())
-        x, y = axes["x"], axes["y"]
-        if x is None or y is None:
-            return None
-        return PairSubject(CompiledPosition(position.stream, x, y, axes.get("z")), pairs.within, where)
 
     def _signal(self, index: int, signal: Signal) -> CompiledSignal | None:
         at: FieldPath = ("spec", "signals", index)
         if signal.name in RESERVED:
-            self._problem((*at, "name"), f"{signal.name} is a name that every scope gives itself: choose another")
+            self.problem((*at, "name"), f"{signal.name} is a name that every scope gives itself: choose another")
         elif is_taken(signal.name):
-            self._problem((*at, "name"), f"{signal.name} is a word of CEL itself: choose another name")
-        stream = self._stream((*at, "stream"), signal.stream)
-        value = self._sample((*at, "value"), signal.value, stream, Kind.DYN)
-        where = self._sample((*at, "where"), signal.where, stream, Kind.BOOL)
+            self.problem((*at, "name"), f"{signal.name} is a word of CEL itself: choose another name")
+        stream = self.stream((*at, "stream"), signal.stream)
+        value = self.sample((*at, "value"), signal.value, stream, Kind.DYN)
+        where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL)
         over = None if signal.over is None else signal.over.ns
         if stream is not None and over is not None:
-            kept = self.detector.spec.buffer_duration_ns(stream)
+            kept = self.kept_ns(stream)
             if over > kept:
-                self._problem(
+                self.problem(
                     (*at, "over"),
                     f"{signal.over} is longer than the {kept / 1e9:g} s that Detector {self.detector.name} keeps of "
                     f"stream {stream.name}: shorten it, or raise the stream's buffer.duration",
@@ -206,37 +184,40 @@ class _RuleCompiler:
             parameters = compile_template(dict(deploy.parameters), environment)
         except InterpolationError as error:
             for each in (error, *error.others):
-                self._problem((*at, _parameter_of(each)), str(each))
+                self.problem((*at, _parameter_of(each)), str(each))
             return None
         for embedded in parameters.embedded:
             self._members((*at, _parameter_of(embedded)), embedded.expression.paths)
         return CompiledDeploy(action, deploy.template, deploy.priority, _canonical(deploy.parameters), parameters)
 
-    def _stream(self, path: FieldPath, name: str) -> Stream | None:
+    def stream(self, path: FieldPath, name: str) -> Stream | None:
+        """The Detector's stream of that name; None, and a problem, where it has none."""
         stream = self.detector.spec.stream(name)
         if stream is None:
             names = [stream.name for stream in self.detector.spec.streams]
             close = difflib.get_close_matches(name, names, n=1)
             hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(names)}"
-            self._problem(path, f"Detector {self.detector.name} has no stream {name}; {hint}")
+            self.problem(path, f"Detector {self.detector.name} has no stream {name}; {hint}")
         return stream
 
-    def _condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
+    def condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
+        """A boolean expression; None where there is none, or it is wrong."""
         expression = self._expression(path, source, environment, Kind.BOOL)
         if expression is not None:
             self._members(path, expression.paths)
         return expression
 
-    def _sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind) -> Expression | None:
+    def sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind) -> Expression | None:
+        """An expression over one sample; None where there is none, or it is wrong."""
         expression = self._expression(path, source, sample_environment(), kind)
         if expression is None:
             return None
         known: Fields = dict.fromkeys(SAMPLE_MEMBERS)
         for text in unknown_fields(expression.paths, "sample", known):
-            self._problem(path, text)
+            self.problem(path, text)
         if stream is not None and stream.name in self.fields:
             for text in unknown_fields(expression.paths, "msg", self.fields[stream.name]):
-                self._problem(path, f"{text} (stream {stream.name}, type {stream.type})")
+                self.problem(path, f"{text} (stream {stream.name}, type {stream.type})")
         return expression
 
     def _expression(
@@ -248,19 +229,33 @@ class _RuleCompiler:
             return environment.compile(source, result=kind)
         except ExpressionError as error:
             for each in (error, *error.others):
-                self._problem(path, str(each))
+                self.problem(path, str(each))
             return None
 
-    def _members(self, path: FieldPath, paths: Iterable[Path]) -> None:
-        """A pair's a and b are maps: CEL itself does not know what is in them."""
-        if self.spec.scope.pairs is None:
-            return
-        members: dict[str, Fields | None] = dict.fromkeys((*MEMBER_OF_CLIENT, *(s.name for s in self.spec.signals)))
-        members["position"] = dict.fromkeys(("x", "y", "z"))
-        for text in sorted({*unknown_fields(paths, "a", members), *unknown_fields(paths, "b", members)}):
-            self._problem(path, text)
+    def kept_ns(self, stream: Stream) -> int:
+        """How long the Detector keeps the stream's samples, in nanoseconds."""
+        return self.detector.spec.buffer_duration_ns(stream)
 
-    def _problem(self, path: FieldPath, message: str) -> None:
+    def _members(self, path: FieldPath, paths: Iterable[Path]) -> None:
+        """A pair's a and b and the element of `each` are maps: CEL itself does not know what is in them."""
+        for name, members in known_members(self.spec):
+            for text in unknown_fields(paths, name, members):
+                self.problem(path, text)
+
+    def _closing(self, subject: CompiledSubject, conditions: Iterable[Expression | None]) -> CompiledSubject:
+        """The subject, with the closing speed where any expression asks for it."""
+        if not isinstance(subject, PairSubject):
+            return subject
+        asking = [expression.names for expression in (*conditions, subject.where) if expression is not None]
+        if not any("closingSpeed" in names for names in asking):
+            return subject
+        stream = self.detector.spec.stream(subject.position.stream)
+        if stream is not None and (problem := closing_speed_problem(stream, self.kept_ns(stream))) is not None:
+            self.problem(("spec", "scope", "pairs", "position", "stream"), problem)
+        return replace(subject, closing_speed=True)
+
+    def problem(self, path: FieldPath, message: str) -> None:
+        """Say what is wrong with a field."""
         self.problems.append(RuleProblem(path, message))
 
 

@@ -7,8 +7,10 @@ from functools import cache, lru_cache
 from wayside.api.eventrule import EventRuleSpec
 from wayside.expressions import Environment, ExpressionError, Kind
 
-RESERVED = frozenset({"client", "labels", "streams", "position", "a", "b", "distance"})
-"""Names that the scopes give; no signal may take them."""
+RESERVED = frozenset(
+    {"client", "labels", "streams", "position", "a", "b", "distance", "closingSpeed", "members", "msg", "key", "sample"}
+)
+"""Names that the scopes and samples give; neither a signal nor the element of `each` may take them."""
 
 MEMBER_OF_CLIENT = ("client", "labels", "streams")
 
@@ -42,20 +44,45 @@ def is_taken(name: str) -> bool:
 
 
 @lru_cache(maxsize=256)
-def client_environment(signals: tuple[str, ...] = ()) -> Environment:
-    """For a client scope: client, labels, streams (those that are not stale) and the signals."""
+def client_environment(signals: tuple[str, ...] = (), element: str | None = None) -> Environment:
+    """For one client: client, labels, streams (those that are not stale), the signals and the element of `each`."""
     fixed = {"client": Kind.STRING, "labels": Kind.MAP, "streams": Kind.LIST}
-    return Environment({**fixed, **dict.fromkeys(signals, Kind.DYN)})
+    return Environment({**fixed, **dict.fromkeys(signals, Kind.DYN), **_element(element)})
 
 
-@cache
-def pairs_environment() -> Environment:
-    """For a pairs scope: a and b (maps of what a client scope has, and position), distance in metres."""
-    return Environment({"a": Kind.MAP, "b": Kind.MAP, "distance": Kind.DOUBLE})
+@lru_cache(maxsize=256)
+def pairs_environment(element: str | None = None) -> Environment:
+    """For a pair: a and b (maps of what a client scope has, and position), distance in metres, closingSpeed in m/s."""
+    return Environment(
+        {"a": Kind.MAP, "b": Kind.MAP, "distance": Kind.DOUBLE, "closingSpeed": Kind.DOUBLE, **_element(element)}
+    )
+
+
+@lru_cache(maxsize=256)
+def fleet_environment(element: str | None = None) -> Environment:
+    """For the fleet: members (a list of maps of what a client scope has)."""
+    return Environment({"members": Kind.LIST, **_element(element)})
+
+
+def _element(name: str | None) -> dict[str, Kind]:
+    return {} if name is None or name in RESERVED or is_taken(name) else {name: Kind.MAP}
+
+
+def element_of(spec: EventRuleSpec) -> str | None:
+    """The variable of the element of `each`."""
+    return None if spec.each is None else spec.each.as_
+
+
+def signal_names(spec: EventRuleSpec) -> tuple[str, ...]:
+    """The signals that expressions can name."""
+    return tuple(signal.name for signal in spec.signals if not is_taken(signal.name))
 
 
 def condition_environment(spec: EventRuleSpec) -> Environment:
     """For `when`, `until` and the actions of a rule."""
+    element = element_of(spec)
     if spec.scope.pairs is not None:
-        return pairs_environment()
-    return client_environment(tuple(signal.name for signal in spec.signals if not is_taken(signal.name)))
+        return pairs_environment(element)
+    if spec.scope.fleet is not None:
+        return fleet_environment(element)
+    return client_environment(signal_names(spec), element)

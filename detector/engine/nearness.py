@@ -1,0 +1,143 @@
+"""Which pairs of clients are within reach of each other: of all of them the nearest, up to a number.
+
+A few clients are compared each with each. For more, a tree answers how many pairs there are before any is made: a
+thousand clients at one spot are half a million pairs, and making them only to leave most of them out would stall
+everything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from detector.engine.positions import Point
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+Pair = tuple[str, str]
+
+Distance = Callable[[str, str], float]
+"""Between two clients, in metres, as expressions see it."""
+
+_FEW = 1024
+"""Up to so many pairs to compare, doing so is faster than building trees."""
+
+_ROUNDING = 1 + 1e-9
+"""The trees are asked for a little more than wanted, lest they round a pair away that is just within reach."""
+
+_ROOM = 4
+"""Up to so many times the wanted number of pairs is made, to be sorted exactly."""
+
+_HALVINGS = 40
+
+
+class Near(NamedTuple):
+    """What was found."""
+
+    pairs: list[Pair]
+    left_out: int
+    """How many pairs within reach were left out: the number asked for was too small. With many clients it may count
+    a pair that is beyond reach by a billionth."""
+
+
+class Search(NamedTuple):
+    """Whom to search, and how."""
+
+    points: Mapping[str, Point]
+    """Where clients are; straight distances are never longer than what `distance` says."""
+    distance: Distance
+    first: Collection[str] | None
+    """Who can be the first of a pair; None: the first is the one with the smaller name."""
+    second: Collection[str] | None
+    """Who can be the second, where `first` is given."""
+
+
+def near_pairs(search: Search, within: float, maximum: int) -> Near:
+    """The pairs that are at most `within` metres apart; if more than `maximum`, the nearest, then by names."""
+    first = sorted(search.points if search.first is None else search.points.keys() & search.first)
+    second = sorted(search.points if search.second is None else search.points.keys() & search.second)
+    if len(first) * len(second) <= _FEW:
+        return _nearest(search, ((a, b) for a in first for b in second), within, maximum)
+    return _by_trees(search, first, second, within, maximum)
+
+
+def _fits(search: Search, a: str, b: str) -> bool:
+    return a < b if search.first is None else a != b
+
+
+def _nearest(search: Search, pairs: Iterator[Pair], within: float, maximum: int) -> Near:
+    """Those of the pairs that are within reach, exactly."""
+    measured = [(search.distance(a, b), a, b) for a, b in pairs if _fits(search, a, b)]
+    reached = [each for each in measured if each[0] <= within]
+    if len(reached) <= maximum:
+        return Near([(a, b) for _, a, b in reached], 0)
+    reached.sort()
+    return Near([(a, b) for _, a, b in reached[:maximum]], len(reached) - maximum)
+
+
+def _by_trees(search: Search, first: list[str], second: list[str], within: float, maximum: int) -> Near:
+    # Not at the top: it takes half a second to import, which a detector of few clients does not owe.
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
+    one = cKDTree(np.array([search.points[name] for name in first]))
+    other = one if first == second else cKDTree(np.array([search.points[name] for name in second]))
+    reach = within * _ROUNDING
+    # Each client is near itself; without roles, each pair is found from both sides.
+    themselves = len(set(first) & set(second))
+    sides = 2 if search.first is None else 1
+
+    def count(radius: float) -> int:
+        return (int(one.count_neighbors(other, radius)) - themselves) // sides
+
+    found = count(reach)
+    if found <= maximum * _ROOM:
+        return _nearest(search, _all(one, other, first, second, reach), within, maximum)
+    low, high = 0.0, reach
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        number = count(middle)
+        if number < maximum:
+            low = middle
+        else:
+            high = middle
+            if number <= maximum * _ROOM:
+                break
+    if count(high) <= maximum * _ROOM:
+        pairs = _nearest(search, _all(one, other, first, second, high), within, maximum).pairs
+    else:
+        # Very many are equally far from each other: those that are nearer, and then by names until it is enough.
+        nearer = _nearest(search, _all(one, other, first, second, low), within, maximum).pairs if low else []
+        pairs = _filled(search, nearer, _between(one, other, first, second, high), within, maximum)
+    return Near(pairs, found - len(pairs))
+
+
+def _all(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radius: float) -> Iterator[Pair]:
+    """The pairs of both, found at once."""
+    if one is other:
+        for i, j in one.query_pairs(radius, output_type="ndarray").tolist():
+            yield first[i], first[j]
+            yield first[j], first[i]
+        return
+    for name, found in zip(first, one.query_ball_tree(other, radius), strict=True):
+        for near in found:
+            yield name, second[near]
+
+
+def _between(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radius: float) -> Iterator[Pair]:
+    """The pairs of both, by names; made one client at a time."""
+    for index, name in enumerate(first):
+        for near in sorted(other.query_ball_point(one.data[index], radius)):
+            yield name, second[near]
+
+
+def _filled(search: Search, nearer: list[Pair], more: Iterator[Pair], within: float, maximum: int) -> list[Pair]:
+    pairs = dict.fromkeys(nearer)
+    for a, b in more:
+        if len(pairs) >= maximum:
+            break
+        if _fits(search, a, b) and search.distance(a, b) <= within:
+            pairs[a, b] = None
+    return list(pairs)

@@ -1,0 +1,108 @@
+"""Where clients are: by the newest sample of a stream, in metres of one frame or on the Earth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from detector.engine.buffer import Buffer
+from detector.engine.clients import is_fresh
+from detector.engine.counters import RuleCounters
+from detector.engine.messages import Messages
+from detector.engine.sample import Sample
+from wayside import geodesy
+from wayside.expressions import UNKNOWN, Expression, Unknown, Value
+from wayside.rules import CompiledPosition
+
+Place = tuple[float, ...]
+"""Metres (x, y, z); or degrees (latitude, longitude)."""
+
+Point = tuple[float, float, float]
+"""Metres, straight: what a search works on."""
+
+_FARTHEST = 1e12
+"""No frame reaches this far, in metres; from 1e154 on the squares of distances are no numbers any more."""
+
+_LIMITS: Mapping[str, float] = {"latitude": 90.0, "longitude": 360.0}
+"""Degrees; some write longitudes from 0 to 360."""
+
+
+class Positions:
+    """Looks up positions in the buffer."""
+
+    def __init__(
+        self, buffer: Buffer, messages: Messages, stale_after: Mapping[str, int | None], floor: int | None
+    ) -> None:
+        """`floor`: no look goes back to this time or beyond, in nanoseconds."""
+        self._buffer = buffer
+        self._messages = messages
+        self._stale_after = stale_after
+        self._floor = floor
+
+    def gap(self, time: int) -> None:
+        """What lies before `time` does not say where a client was."""
+        self._floor = time
+
+    def now(self, position: CompiledPosition, client: str, now: int, counters: RuleCounters) -> Place | None:
+        """Where the client is, by the newest sample; None where that is not known or makes no sense."""
+        lane = self._buffer.lane(client, position.stream)
+        sample = None if lane is None else lane.newest
+        if sample is None or not is_fresh(client, position.stream, self._limit(position), self._buffer, now):
+            counters.unknowns += 1
+            return None
+        return self._place(position, client, sample, counters)
+
+    def then(self, position: CompiledPosition, client: str, then: int, counters: RuleCounters) -> Place | None:
+        """Where the client was at a past time, by the newest sample up to then; None like `now`."""
+        lane, limit = self._buffer.lane(client, position.stream), self._limit(position)
+        sample = None if lane is None else next(lane.newest_first(self._floor, then), None)
+        if sample is None or (limit is not None and then - sample.time > limit):
+            counters.unknowns += 1
+            return None
+        return self._place(position, client, sample, counters)
+
+    def _limit(self, position: CompiledPosition) -> int | None:
+        return self._stale_after[position.stream]
+
+    def _place(self, position: CompiledPosition, client: str, sample: Sample, counters: RuleCounters) -> Place | None:
+        place = []
+        for axis, expression in position.axes.items():
+            value = self._evaluate(expression, position.stream, sample, counters)
+            if not isinstance(value, int | float):
+                counters.misplace(f"{axis} of {client} is absent, NaN, no number, or cannot be read")
+                return None
+            if not abs(value) <= _LIMITS.get(axis, _FARTHEST):
+                counters.unknowns += 1
+                unit = "degrees" if position.geographic else "m"
+                counters.misplace(f"{axis} of {client} is {value:g} {unit}, where nobody is")
+                return None
+            place.append(float(value))
+        return tuple(place)
+
+    def _evaluate(self, expression: Expression, stream: str, sample: Sample, counters: RuleCounters) -> Value | Unknown:
+        values = self._messages.values(stream, sample, expression.names)
+        if values is None:
+            counters.unknowns += 1
+            return UNKNOWN
+        return expression.evaluate_or_unknown(values, counters.note)
+
+
+def described(position: CompiledPosition, place: Place) -> dict[str, float]:
+    """What expressions see of a place: x, y and z in metres, or latitude and longitude in degrees."""
+    found = dict(zip(position.axes, place, strict=True))
+    return found if position.geographic else {**found, "z": found.get("z", 0.0)}
+
+
+def distance(position: CompiledPosition, one: Place, other: Place) -> float:
+    """Metres, straight in a flat frame, along the surface on the Earth."""
+    if position.geographic:
+        return geodesy.distance(*one, *other)
+    return math.dist(one, other)
+
+
+def point(position: CompiledPosition, place: Place) -> Point:
+    """The place as a search takes it: no two points are farther apart than `distance` says, however they lie."""
+    if position.geographic:
+        return geodesy.cartesian(*place)
+    x, y, *rest = place
+    return (x, y, rest[0] if rest else 0.0)

@@ -1,0 +1,52 @@
+"""The values that go into an event: what a rule saw of its subject."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from detector.engine.scopes import Candidate
+from wayside.rules import CompiledRule, FleetSubject, PairSubject
+
+_MEMBERS = 100
+"""So many members of the fleet go into an event; `count` says how many there are."""
+
+
+def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
+    """Signals, positions, distance and closing speed, where known; of a fleet its first members and their number."""
+    variables = candidate.variables
+    match rule.subject:
+        case PairSubject():
+            values: dict[str, Any] = {
+                name: variables[name] for name in ("distance", "closingSpeed") if name in variables
+            }
+            for role in ("a", "b"):
+                values[role] = _member(rule, variables[role])
+            return values
+        case FleetSubject():
+            members = variables["members"]
+            return {"count": float(len(members)), "members": [_member(rule, view) for view in members[:_MEMBERS]]}
+        case _:
+            return _signals_of(rule, variables)
+
+
+def _member(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
+    values = {"client": view["client"], **_signals_of(rule, view)}
+    if "position" in view:
+        values["position"] = view["position"]
+    return values
+
+
+def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
+    return {signal.name: _without_bytes(view[signal.name]) for signal in rule.signals if signal.name in view}
+
+
+def _without_bytes(value: Any) -> Any:
+    """Neither an event nor a task can carry bytes, which CEL yields where it is asked to: null stands for them."""
+    if isinstance(value, bytes):
+        return None
+    if isinstance(value, list):
+        return [_without_bytes(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _without_bytes(child) for key, child in value.items()}
+    return value

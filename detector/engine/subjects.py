@@ -1,0 +1,44 @@
+"""Subjects: whom an episode is about."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from wayside.names import parse_subject, subject_text
+from wayside.rules import ClientSubject, CompiledRule, FleetSubject, PairSubject
+
+
+class Subject(NamedTuple):
+    """Clients, and the element of `each` where the rule has one."""
+
+    clients: tuple[str, ...]
+    """One client, the two of a pair (a, then b), or none where it is the fleet."""
+    element: str | None = None
+
+    @property
+    def text(self) -> str:
+        """As in events' keys: `car1`, `car1+car2~north`, `~fleet`."""
+        return subject_text(self.clients, self.element)
+
+
+def subject_of(clients: tuple[str, ...], text: str) -> Subject | None:
+    """The subject of a task or a stored episode; None where its text is none."""
+    try:
+        _, element = parse_subject(text)
+    except ValueError:
+        return None
+    return Subject(clients, element)
+
+
+def fits(rule: CompiledRule, subject: Subject) -> bool:
+    """Whether the rule can have an episode about the subject."""
+    clients, element = subject
+    if element not in {each.name for each in rule.elements}:
+        return False
+    match rule.subject:
+        case ClientSubject():
+            return len(clients) == 1
+        case PairSubject() as pairs:
+            return len(set(clients)) == 2 == len(clients) and (pairs.ordered or clients[0] < clients[1])
+        case FleetSubject():
+            return not clients

@@ -1,0 +1,102 @@
+"""Which pairs are within reach: the same by comparing all and by trees, nearest first where there are too many."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import permutations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from detector.engine.nearness import Near, Search, near_pairs
+from detector.engine.positions import Point, distance, point
+from wayside.rules import CompiledPosition
+
+FLAT = CompiledPosition("pose", {})
+EARTH = CompiledPosition("pose", {"latitude": None, "longitude": None})  # type: ignore[dict-item]
+
+coordinates = st.floats(-1e4, 1e4) | st.integers(-300, 300).map(float) | st.sampled_from([1e12, -1e12])
+points = st.tuples(coordinates, coordinates, st.sampled_from([0.0, 1.0]))
+degrees = st.tuples(
+    st.floats(-90, 90) | st.sampled_from([90.0, -90.0, 89.9999, 0.0, 48.0]),
+    st.floats(-180, 180) | st.sampled_from([180.0, -180.0, 179.9999, -179.9999, 360.0, 0.0]),
+)
+roles = st.none() | st.tuples(st.integers(0, 7), st.integers(0, 7))
+
+
+def search(position: CompiledPosition, places: Mapping[str, Point], role: tuple[int, int] | None = None) -> Search:
+    """`role`: of the clients, who can be a and who b, as a mask over the numbers in their names."""
+    first, second = (
+        (None, None)
+        if role is None
+        else tuple([name for name in places if mask >> int(name[3:]) % 3 & 1] for mask in role)
+    )
+    return Search(
+        {name: point(position, place) for name, place in places.items()},
+        lambda a, b: distance(position, places[a], places[b]),
+        first,
+        second,
+    )
+
+
+def obvious(asked: Search, within: float, maximum: int) -> Near:
+    first = asked.points.keys() if asked.first is None else asked.first
+    second = asked.points.keys() if asked.second is None else asked.second
+    near = sorted(
+        (asked.distance(a, b), a, b)
+        for a, b in permutations(asked.points, 2)
+        if a in first and b in second and (asked.first is not None or a < b) and asked.distance(a, b) <= within
+    )
+    return Near([(a, b) for _, a, b in near[:maximum]], max(0, len(near) - maximum))
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.lists(points, max_size=70), st.sampled_from([0.5, 100.0, 250.0, 1e6]), roles)
+def test_the_pairs_within_reach_are_those_that_comparing_all_finds(
+    placed: list[Point], within: float, role: tuple[int, int] | None
+) -> None:
+    asked = search(FLAT, {f"car{index}": place for index, place in enumerate(placed)}, role)
+    found, expected = near_pairs(asked, within, 10_000), obvious(asked, within, 10_000)
+    assert sorted(found.pairs) == sorted(expected.pairs)
+    assert found.left_out == 0
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.lists(degrees, max_size=50), st.sampled_from([1.0, 30.0, 5_000.0, 1e6]), roles)
+def test_on_the_earth_neither_the_poles_nor_the_antimeridian_part_a_pair(
+    placed: list[Point], within: float, role: tuple[int, int] | None
+) -> None:
+    asked = search(EARTH, {f"car{index}": place for index, place in enumerate(placed)}, role)
+    assert sorted(near_pairs(asked, within, 10_000).pairs) == sorted(obvious(asked, within, 10_000).pairs)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 3).map(float) | st.floats(0, 100), st.just(0.0), st.just(0.0)), max_size=60),
+    st.integers(1, 300),
+    roles,
+)
+def test_of_too_many_pairs_the_nearest_are_looked_at_and_then_those_first_by_name(
+    placed: list[Point], maximum: int, role: tuple[int, int] | None
+) -> None:
+    asked = search(FLAT, {f"car{index:02}": place for index, place in enumerate(placed)}, role)
+    found, expected = near_pairs(asked, 50.0, maximum), obvious(asked, 50.0, maximum)
+    assert sorted(found.pairs) == sorted(expected.pairs)
+    assert found.left_out == expected.left_out
+
+
+def test_thousands_at_one_spot_do_not_make_millions_of_pairs() -> None:
+    places = {f"car{index:04}": (5.0, 5.0, 0.0) for index in range(3_000)}
+    measured = 0
+
+    def counted(a: str, b: str) -> float:
+        nonlocal measured
+        measured += 1
+        return math.dist(places[a], places[b])
+
+    found = near_pairs(Search(places, counted, None, None), 50.0, 1_000)
+    assert len(found.pairs) == 1_000
+    assert found.left_out == 3_000 * 2_999 // 2 - 1_000
+    assert found.pairs[0] == ("car0000", "car0001")
+    assert measured < 10_000

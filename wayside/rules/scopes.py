@@ -1,0 +1,138 @@
+"""Compiles whom a rule is about: its scope, and the elements of `each`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+from wayside.api import EventRule
+from wayside.api.detector import Stream
+from wayside.api.documents import FieldPath
+from wayside.api.eventrule import EventRuleSpec
+from wayside.api.scopes import Each, PairsScope
+from wayside.expressions import Environment, Expression, Kind
+from wayside.rules.compiled import (
+    ClientSubject,
+    CompiledElement,
+    CompiledPosition,
+    CompiledSubject,
+    FleetSubject,
+    PairSubject,
+)
+from wayside.rules.fields import Fields
+from wayside.rules.variables import (
+    MEMBER_OF_CLIENT,
+    RESERVED,
+    client_environment,
+    element_of,
+    is_taken,
+    pairs_environment,
+    signal_names,
+)
+
+CLOSING_NS = 1_000_000_000
+"""Over so long the closing speed is measured, in nanoseconds."""
+
+
+class Expressions(Protocol):
+    """Compiles a rule's expressions, and collects what is wrong with them."""
+
+    rule: EventRule
+
+    def condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
+        """A boolean expression; None where there is none, or it is wrong."""
+
+    def sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind) -> Expression | None:
+        """An expression over one sample; None where there is none, or it is wrong."""
+
+    def stream(self, path: FieldPath, name: str) -> Stream | None:
+        """The Detector's stream of that name; None where it has none."""
+
+    def problem(self, path: FieldPath, message: str) -> None:
+        """Say what is wrong with a field."""
+
+    def kept_ns(self, stream: Stream) -> int:
+        """How long the Detector keeps the stream's samples, in nanoseconds."""
+
+
+def compile_subject(compiler: Expressions) -> CompiledSubject | None:
+    """The scope; None where problems forbid it. Whether `closingSpeed` is asked for is not known here yet."""
+    spec = compiler.rule.spec
+    element = element_of(spec)
+    if spec.scope.pairs is not None:
+        return _pairs(compiler, spec.scope.pairs, element)
+    if spec.scope.fleet is not None:
+        members = compiler.condition(
+            ("spec", "scope", "fleet", "members"),
+            spec.scope.fleet.members,
+            client_environment(signal_names(spec), element),
+        )
+        return None if members is None else FleetSubject(members)
+    assert spec.scope.client is not None  # noqa: S101  the model holds exactly one
+    return ClientSubject(
+        compiler.condition(
+            ("spec", "scope", "client", "where"), spec.scope.client.where, client_environment((), element)
+        )
+    )
+
+
+def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> PairSubject | None:
+    at: FieldPath = ("spec", "scope", "pairs")
+    position = pairs.position
+    stream = compiler.stream((*at, "position", "stream"), position.stream)
+    axes: dict[str, Expression] = {}
+    complete = True
+    for axis in ("x", "y", "z", "latitude", "longitude"):
+        source = getattr(position, axis)
+        if source is not None:
+            expression = compiler.sample((*at, "position", axis), source, stream, Kind.DOUBLE)
+            if expression is None:
+                complete = False
+            else:
+                axes[axis] = expression
+    where = compiler.condition((*at, "where"), pairs.where, pairs_environment(element))
+    role = client_environment((), element)
+    a = None if pairs.a is None else compiler.condition((*at, "a", "where"), pairs.a.where, role)
+    b = None if pairs.b is None else compiler.condition((*at, "b", "where"), pairs.b.where, role)
+    if not complete:
+        return None
+    return PairSubject(CompiledPosition(position.stream, axes), pairs.within, where, a, b, pairs.max_pairs)
+
+
+def compile_elements(compiler: Expressions, each: Each | None) -> tuple[CompiledElement, ...]:
+    """The elements that the rule is evaluated for, in order of their names; one without a name where it has no each."""
+    if each is None:
+        return (CompiledElement(),)
+    spec, name, at = compiler.rule.spec, each.as_, ("spec", "each", "as")
+    if name in RESERVED:
+        compiler.problem(at, f"{name} is a name that scopes and samples give themselves: choose another")
+    elif is_taken(name):
+        compiler.problem(at, f"{name} is a word of CEL itself: choose another name")
+    elif any(signal.name == name for signal in spec.signals):
+        compiler.problem(at, f"{name} is a signal's name as well: choose another")
+    return tuple(
+        CompiledElement(element.name, {name: element.to_json()}) for element in sorted(each.of, key=lambda e: e.name)
+    )
+
+
+def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:
+    """The maps among the variables whose fields are known, and these: CEL itself does not know what is in them."""
+    if spec.scope.pairs is not None:
+        member: dict[str, Any] = dict.fromkeys((*MEMBER_OF_CLIENT, *(signal.name for signal in spec.signals)))
+        geographic = spec.scope.pairs.position.latitude is not None
+        member["position"] = dict.fromkeys(("latitude", "longitude") if geographic else ("x", "y", "z"))
+        yield "a", member
+        yield "b", member
+    if spec.each is not None:
+        # A field that only some elements have is unknown for the others.
+        yield spec.each.as_, dict.fromkeys(name for element in spec.each.of for name in element.to_json())
+
+
+def closing_speed_problem(stream: Stream | None, kept: int) -> str | None:
+    """Why the closing speed cannot be had of this stream, if so."""
+    if stream is None or kept > CLOSING_NS:
+        return None
+    return (
+        f"closingSpeed looks 1 s back, and stream {stream.name} is kept for {kept / 1e9:g} s only: "
+        "raise the stream's buffer.duration to 2s or more"
+    )
