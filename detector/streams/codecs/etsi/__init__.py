@@ -1,0 +1,85 @@
+"""ETSI ITS messages in UPER: CAM, DENM, CPM, MAPEM, SPATEM and VAM, as they come over the air or bare.
+
+A message on its way: `packets` takes off GeoNetworking, security and BTP; `messages` knows its kind and definition;
+`reading`, made from the definition's `asn1` types, reads its `bits` into maps, with `quantities` in SI units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from detector.engine.sample import DecodeError
+from detector.streams.codecs.etsi.asn1 import DefinitionError
+from detector.streams.codecs.etsi.bits import Bits
+from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, Kind, packaged_readers
+from detector.streams.codecs.etsi.packets import message_in
+from detector.streams.codecs.etsi.reading import Read
+
+__all__ = ["DefinitionError", "EtsiDecoder"]
+
+_HEADER = 6
+"""Bytes of ItsPduHeader: protocol version, message number, station. All releases agree on these."""
+
+
+class EtsiDecoder:
+    """Reads ITS messages of one kind, or of any."""
+
+    def __init__(self, type_name: str | None = None) -> None:
+        """`type_name` is etsi/cam or the like; None for messages of all kinds.
+
+        Raises DefinitionError for a kind that is not known or for which there is no definition.
+        """
+        kinds = KINDS if type_name is None else (_kind(type_name),)
+        self._only = None if type_name is None else kinds[0]
+        self._readers: dict[int, Mapping[int, Read]] = {kind.number: packaged_readers(kind) for kind in kinds}
+        if self._only is not None and not self._readers[self._only.number]:
+            raise DefinitionError(f"no package has the ASN.1 definition of {type_name}")
+
+    def decode(self, payload: bytes) -> Any:
+        """The message as a map: header, and what its ASN.1 type has beside it. Raises DecodeError."""
+        return self._read(payload)[1]
+
+    def stamp(self, payload: bytes) -> int | None:
+        """None: most messages tell their time only together with the receive time."""
+        return None
+
+    def stamp_near(self, payload: bytes, received: int) -> int | None:
+        """The sender's time in nanoseconds since the epoch, where the message carries one. Raises DecodeError.
+
+        Of times that the message leaves open (generationDeltaTime recurs every 65.536 s), the one nearest to the
+        receive time.
+        """
+        kind, message = self._read(payload)
+        return kind.stamp(message, received)
+
+    def _read(self, payload: bytes) -> tuple[Kind, dict[str, Any]]:
+        data = message_in(payload)
+        if len(data) <= _HEADER:
+            raise DecodeError(f"{len(data)} bytes: an ITS message has more than {_HEADER}")
+        version, number = data[0], data[1]
+        kind = BY_NUMBER.get(number)
+        if kind is None or number not in self._readers:
+            wanted = "" if self._only is None else f", the stream is of {PREFIX}{self._only.name}"
+            raise DecodeError(f"message {number} ({'unknown' if kind is None else PREFIX + kind.name}){wanted}")
+        read = self._readers[number].get(version)
+        if read is None:
+            raise DecodeError(f"{PREFIX}{kind.name} of protocol version {version}, for which there is no definition")
+        try:
+            message = read(Bits(data))
+        except DecodeError as error:
+            raise DecodeError(f"no {PREFIX}{kind.name} ({len(payload)} bytes): {error}") from None
+        message["header"] = {
+            "protocolVersion": float(version),
+            "messageId": float(number),
+            "stationId": float(int.from_bytes(data[2:_HEADER], "big")),
+        }
+        return kind, message
+
+
+def _kind(type_name: str) -> Kind:
+    kind = BY_NAME.get(type_name.removeprefix(PREFIX))
+    if kind is None or not type_name.startswith(PREFIX):
+        known = ", ".join(PREFIX + name for name in BY_NAME)
+        raise DefinitionError(f"unknown message type {type_name!r}: {known} are known")
+    return kind

@@ -1,0 +1,84 @@
+"""The bits of a message in unaligned PER (ITU-T X.691): numbers of so many bits, and the lengths that come in several
+forms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from detector.engine.sample import DecodeError
+
+_FRAGMENT = 16384
+"""A length beyond is sent in pieces of one to four times this many."""
+
+_ELEMENTS_PER_OCTET = 64
+"""Some elements take no bits at all. A list of them could be as long as its sender claims: this is enough for any."""
+
+
+class Bits:
+    """Reads bits from the first on. Raises DecodeError past the end, and nothing else."""
+
+    __slots__ = ("_data", "_elements", "_end", "position")
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._end = len(data) * 8
+        self.position = 0
+        self._elements = _ELEMENTS_PER_OCTET * (len(data) + 1)
+
+    def take(self, count: int) -> int:
+        """The next `count` bits as a number that is not negative."""
+        start = self.position
+        stop = start + count
+        if stop > self._end:
+            raise DecodeError(f"it ends after {self._end // 8} bytes, in the middle of a value")
+        self.position = stop
+        last = (stop + 7) >> 3
+        return (int.from_bytes(self._data[start >> 3 : last], "big") >> (last * 8 - stop)) & ((1 << count) - 1)
+
+    def octets(self, count: int) -> bytes:
+        """The next `count` octets."""
+        return self.take(8 * count).to_bytes(count, "big")
+
+    def elements(self, count: int) -> int:
+        """The same number, once it is certain that a message of this length can hold so many elements."""
+        self._elements -= count
+        if self._elements < 0:
+            raise DecodeError("it claims more elements than it can hold")
+        return count
+
+    def lengths(self) -> Iterator[int]:
+        """An unbounded length, piece by piece; read what a piece announces before asking for the next (11.9)."""
+        while True:
+            if not self.take(1):
+                yield self.take(7)
+                return
+            if not self.take(1):
+                yield self.take(14)
+                return
+            pieces = self.take(6)
+            if not 1 <= pieces <= 4:
+                raise DecodeError(f"a length in {pieces} pieces: there can be 1 to 4")
+            yield pieces * _FRAGMENT
+
+    def blob(self) -> bytes:
+        """Octets with an unbounded length before them, as open types are sent."""
+        return b"".join([self.octets(length) for length in self.lengths()])
+
+    def unsigned(self) -> int:
+        """A number without an upper bound, from zero on (11.7)."""
+        return int.from_bytes(self.blob(), "big")
+
+    def signed(self) -> int:
+        """A number without bounds (11.8)."""
+        return int.from_bytes(self.blob(), "big", signed=True)
+
+    def small(self) -> int:
+        """A number that is normally small (11.6)."""
+        return self.unsigned() if self.take(1) else self.take(6)
+
+    def small_length(self) -> int:
+        """A length from one on that is normally small (11.9.3.4)."""
+        if not self.take(1):
+            return self.take(6) + 1
+        return sum(self.lengths())

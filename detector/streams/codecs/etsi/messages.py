@@ -1,0 +1,99 @@
+"""The ITS messages that are known: their numbers, their definitions, and where each carries its time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from detector.streams.codecs.etsi import times
+from detector.streams.codecs.etsi.asn1 import DefinitionError
+from detector.streams.codecs.etsi.packaged import packaged_type
+from detector.streams.codecs.etsi.reading import Read, Readers
+
+Stamp = Callable[[Mapping[str, Any], int], int | None]
+"""From a message and its receive time to the sender's time; nanoseconds since the epoch. None where it has none."""
+
+PREFIX = "etsi/"
+"""How a stream's type names a message: etsi/cam."""
+
+
+def _milliseconds(seconds: float) -> int:
+    return round(seconds * 1000) * 10**6
+
+
+def _generation(part: str) -> Stamp:
+    return lambda message, received: times.nearest(round(message[part]["generationDeltaTime"] * 1000), received)
+
+
+def _denm(message: Mapping[str, Any], received: int) -> int | None:
+    return _milliseconds(message["denm"]["management"]["referenceTime"])
+
+
+def _cpm(message: Mapping[str, Any], received: int) -> int | None:
+    reference = message.get("payload", {}).get("managementContainer", {}).get("referenceTime")
+    return None if reference is None else _milliseconds(reference)
+
+
+def _spatem(message: Mapping[str, Any], received: int) -> int | None:
+    first = message["spat"]["intersections"][0]
+    minute, rest = first.get("moy"), first.get("timeStamp")
+    if minute is None or rest is None:
+        return None
+    return times.in_year(round(minute / 60), round(rest * 1000), received)
+
+
+def _none(message: Mapping[str, Any], received: int) -> int | None:
+    return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kind:
+    """One kind of message."""
+
+    name: str
+    number: int
+    """messageId in the header (TS 102 894-2)."""
+    types: tuple[str, ...]
+    """Its type in the ASN.1 modules, by any of the names that it has had."""
+    packaged: Mapping[int, tuple[str, str]]
+    """The package and module of pycrate that define it, by protocol version."""
+    stamp: Stamp
+
+
+_RELEASE_1 = "ITS_r1318"
+_INFRASTRUCTURE = "ITS_IS"
+
+KINDS = tuple(
+    Kind(name, number, types, {version: (package, module) for version, package in packages.items()}, stamp)
+    for name, number, types, module, packages, stamp in (
+        ("denm", 1, ("DENM",), "DENM_PDU_Descriptions", {1: _RELEASE_1, 2: "ITS_DENM_3"}, _denm),
+        ("cam", 2, ("CAM",), "CAM_PDU_Descriptions", {1: _RELEASE_1, 2: "ITS_CAM_2"}, _generation("cam")),
+        ("spatem", 4, ("SPATEM",), "SPATEM_PDU_Descriptions", {1: _RELEASE_1, 2: _INFRASTRUCTURE}, _spatem),
+        ("mapem", 5, ("MAPEM",), "MAPEM_PDU_Descriptions", {1: _RELEASE_1, 2: _INFRASTRUCTURE}, _none),
+        ("cpm", 14, ("CollectivePerceptionMessage", "CPM"), "", {}, _cpm),
+        ("vam", 16, ("VAM",), "VAM_PDU_Descriptions", {1: "ITS_VAM_3", 2: "ITS_VAM_3"}, _generation("vam")),
+    )
+)
+
+BY_NAME = {kind.name: kind for kind in KINDS}
+BY_NUMBER = {kind.number: kind for kind in KINDS}
+
+
+@cache
+def packaged_readers(kind: Kind) -> Mapping[int, Read]:
+    """What reads the kind's messages by the definitions that come with the extra, by protocol version.
+
+    Raises DefinitionError where the extra is not installed.
+    """
+    made: dict[tuple[str, str], Read] = {}
+    readers: dict[int, Read] = {}
+    for version, (package, module) in kind.packaged.items():
+        if (package, module) not in made:
+            made[package, module] = Readers().reader(packaged_type(package, module, kind.types[0]))
+        readers[version] = made[package, module]
+    return readers
+
+
+__all__ = ["BY_NAME", "BY_NUMBER", "KINDS", "PREFIX", "DefinitionError", "Kind", "Stamp", "packaged_readers"]
