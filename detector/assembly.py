@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from detector.engine.engine import Engine, KeyReader
 from detector.engine.sample import Decoder
-from detector.streams.codecs import UnknownTypeError, codec_for
+from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
 from detector.streams.codecs.fields import message_fields
 from wayside.api import Detector, EventRule
 from wayside.keys import KeyPattern
@@ -63,6 +63,9 @@ def inlets(detector: Detector) -> Inlets:
             decoders[stream.name] = codec_for(stream)
         except UnknownTypeError as error:
             problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
+        except DefinitionError as error:
+            field = "encoding" if stream.type is None else "type"
+            problems.append(RuleProblem(("spec", "streams", index, field), str(error)))
         else:
             known = message_fields(stream)
         if known is not None:

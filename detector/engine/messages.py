@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from detector.engine.counters import Counters
-from detector.engine.sample import DecodeError, Decoder, Sample
+from detector.engine.sample import DecodeError, Decoder, NearDecoder, Sample
 from wayside.expressions import UNKNOWN, EvaluationError
 from wayside.rules import CompiledStream
 
@@ -34,6 +34,7 @@ class Messages:
         counters: Counters,
     ) -> None:
         self._decoders = decoders
+        self._near = {stream: each for stream, each in decoders.items() if isinstance(each, NearDecoder)}
         self._streams = streams
         self._read_key = read_key
         self._counters = counters
@@ -69,7 +70,7 @@ class Messages:
             values["key"] = {} if whose is None else whose[1]
         if "sample" in names:
             try:
-                stamp = self._stamp(stream, sample.payload)
+                stamp = self._stamp(stream, sample.payload, sample.received)
             except (DecodeError, EvaluationError, ValueError):
                 stamp = None
             values["sample"] = {
@@ -85,17 +86,18 @@ class Messages:
         None where it cannot be read; that is counted.
         """
         try:
-            stamp = self._stamp(stream, payload)
+            stamp = self._stamp(stream, payload, received)
         except (DecodeError, EvaluationError, ValueError) as error:
             self._unreadable(stream, key, error)
             return None
         return received if stamp is None else stamp
 
-    def _stamp(self, stream: str, payload: bytes) -> int | None:
+    def _stamp(self, stream: str, payload: bytes, received: int) -> int | None:
         """The sender's time in nanoseconds, where the message carries one."""
         decoder, expression = self._decoders[stream], self._streams[stream].stamp
         if expression is None:
-            return decoder.stamp(payload)
+            near = self._near.get(stream)
+            return decoder.stamp(payload) if near is None else near.stamp_near(payload, received)
         return _nanoseconds(expression.evaluate({"msg": decoder.decode(payload)}))
 
     def _unreadable(self, stream: str, key: str, error: Exception) -> None:

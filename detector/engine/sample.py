@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 SAMPLE_OVERHEAD = 160
 """What a sample costs in memory beside its payload, in bytes: its tuple, its numbers and its place in a queue."""
@@ -60,3 +60,11 @@ class Decoder(Protocol):
 
     def stamp(self, payload: bytes) -> int | None:
         """The sender's time in nanoseconds since the epoch, or None where the message carries none."""
+
+
+@runtime_checkable
+class NearDecoder(Decoder, Protocol):
+    """Reads messages that carry only a remainder of their time, such as milliseconds that recur every minute."""
+
+    def stamp_near(self, payload: bytes, received: int) -> int | None:
+        """The sender's time nearest to the receive time; nanoseconds since the epoch. Asked instead of `stamp`."""

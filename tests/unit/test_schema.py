@@ -102,7 +102,20 @@ def test_the_schema_is_structural(kind: str) -> None:
 
 def test_names_of_fields_are_camel_case_and_enums_pascal_case() -> None:
     # Encodings, Zenoh's modes and JSON's types are written as they are elsewhere.
-    lower = {"cdr", "json", "client", "peer", "router", "string", "number", "integer", "boolean", "array", "object"}
+    lower = {
+        "cdr",
+        "json",
+        "uper",
+        "client",
+        "peer",
+        "router",
+        "string",
+        "number",
+        "integer",
+        "boolean",
+        "array",
+        "object",
+    }
     for kind in KINDS:
         for path, node in nodes(schema_of(kind)["properties"]["spec"], "spec"):
             name = path.rsplit(".", 1)[-1].removesuffix("[]")

@@ -38,6 +38,7 @@ class Encoding(StrEnum):
 
     CDR = "cdr"
     JSON = "json"
+    UPER = "uper"
 
 
 class StreamBuffer(Model):
@@ -60,8 +61,12 @@ class Stream(Model):
 
     model_config = validations(
         (
-            "(self.encoding == 'cdr') == has(self.type)",
-            "type is for cdr streams, and they need it, e.g. geometry_msgs/msg/PoseStamped",
+            "self.encoding == 'uper' || (self.encoding == 'cdr') == has(self.type)",
+            "type is for cdr streams, and they need it, e.g. geometry_msgs/msg/PoseStamped; and for uper streams",
+        ),
+        (
+            "!has(self.type) || (self.encoding == 'uper') == self.type.startsWith('etsi/')",
+            "the type of a cdr stream is a ROS 2 message, that of a uper stream an ETSI ITS message, e.g. etsi/cam",
         ),
         (
             "self.key.contains('${client:') != has(self.client)",
@@ -86,17 +91,18 @@ class Stream(Model):
     client: ClientName | None = Field(
         default=None, description="The client that the data belongs to, where the key captures none."
     )
-    encoding: Encoding = Field(description="cdr (ROS 2 messages) or json.")
+    encoding: Encoding = Field(description="cdr (ROS 2 messages), json, or uper (ETSI ITS messages).")
     type: str | None = Field(
         default=None,
         max_length=255,
-        pattern=r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$",
-        description="The ROS 2 message type of a cdr stream, e.g. geometry_msgs/msg/PoseStamped.",
+        pattern=r"^([A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*|etsi/[a-z]+)$",
+        description="The ROS 2 message type of a cdr stream, e.g. geometry_msgs/msg/PoseStamped; or which ETSI ITS "
+        "messages a uper stream has, e.g. etsi/cam (default: of all kinds).",
     )
     stamp: Expression | None = Field(
         default=None,
         description="CEL over msg: the sender's time in seconds. Default: header.stamp where the type has one, "
-        "else the receive time.",
+        "the time of generation in an ETSI ITS message, else the receive time.",
     )
     stale_after: Duration | str | None = Field(
         default=None,
@@ -127,6 +133,9 @@ class Stream(Model):
             raise ValueError("a cdr stream needs its message type: give type, e.g. geometry_msgs/msg/PoseStamped")
         if self.encoding is Encoding.JSON and self.type is not None:
             raise ValueError("a json stream has no type: remove it")
+        if self.type is not None and (self.encoding is Encoding.UPER) != self.type.startswith("etsi/"):
+            example = "etsi/cam" if self.encoding is Encoding.UPER else "geometry_msgs/msg/PoseStamped"
+            raise ValueError(f"{self.type} is no type of {self.encoding} streams: give one such as {example}")
         captures = "${client:" in self.key
         if captures and self.client is not None:
             raise ValueError("key captures the client and client names one: remove one of them")

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from detector.engine.sample import Decoder
 from detector.streams.codecs.cdr import CdrDecoder
+from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder
 from detector.streams.codecs.json_ import JsonDecoder
 from detector.streams.codecs.ros import UnknownTypeError
 from wayside.api.detector import Encoding, Stream
 
 
 def codec_for(stream: Stream) -> Decoder:
-    """What reads the stream's payloads. Raises UnknownTypeError, which names the stream's field and what is close."""
+    """What reads the stream's payloads. Raises UnknownTypeError, which names the stream's field and what is close.
+
+    Raises DefinitionError where the definitions of ETSI ITS messages are not there.
+    """
+    if stream.encoding is Encoding.UPER:
+        return EtsiDecoder(stream.type)
     if stream.encoding is Encoding.JSON:
         return JsonDecoder()
     try:
@@ -19,4 +25,4 @@ def codec_for(stream: Stream) -> Decoder:
         raise UnknownTypeError(stream.type or "", f"streams[{stream.name}].type") from error
 
 
-__all__ = ["CdrDecoder", "JsonDecoder", "UnknownTypeError", "codec_for"]
+__all__ = ["CdrDecoder", "DefinitionError", "EtsiDecoder", "JsonDecoder", "UnknownTypeError", "codec_for"]

@@ -80,9 +80,7 @@ class _Walk:
             case "CHOICE":
                 return asn1.Choice(
                     tuple((name, self.type(found._cont[name])) for name in found._root),
-                    None
-                    if found._ext is None
-                    else tuple((name, self.type(found._cont[name])) for name in found._ext),
+                    None if found._ext is None else tuple((name, self.type(found._cont[name])) for name in found._ext),
                 )
             case "OPEN_TYPE":
                 return self._open(found)

@@ -105,7 +105,9 @@ def _from_secured(data: bytes) -> bytes:
         if len(data) < 4:
             raise DecodeError("a secured packet that ends in its headers")
         if data[0] != _SECURITY:
-            raise DecodeError(f"a secured packet of version {data[0]}: only {_SECURITY} (TS 103 097 from v1.3 on) is read")
+            raise DecodeError(
+                f"a secured packet of version {data[0]}: only {_SECURITY} (TS 103 097 from v1.3 on) is read"
+            )
         tag = data[1]
         if tag == _UNSECURED:
             return _octets(data, 2)

@@ -79,7 +79,9 @@ UNITS: Mapping[str, Unit] = {
     # DSRC, in MAPEM and SPATEM
     **_units("deg", "0.0125", "Angle", null=28800),
     **_units("deg", "1.5", "MergeDivergeNodeAngle", null=-180),
-    **_units("deg", "1e-7", "OffsetLL-B12", "OffsetLL-B14", "OffsetLL-B16", "OffsetLL-B18", "OffsetLL-B22", "OffsetLL-B24"),
+    **_units(
+        "deg", "1e-7", "OffsetLL-B12", "OffsetLL-B14", "OffsetLL-B16", "OffsetLL-B18", "OffsetLL-B22", "OffsetLL-B24"
+    ),
     **_units("m", "0.1", "Elevation", null=-4096),
     **_units("m", "0.01", "Offset-B10", "Offset-B11", "Offset-B12", "Offset-B13", "Offset-B14", "Offset-B16"),
     **_units("m", "0.01", "DrivenLineOffsetSm", "DrivenLineOffsetLg"),
