@@ -9,7 +9,7 @@ from detector.assembly import DetectorError, Inlets, inlets
 from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
-from wayside.rules import RuleError, compile_rule
+from wayside.rules import RuleError, compile_rule, unknown_rules
 
 _CHECKED = (Detector, EventRule)
 
@@ -17,12 +17,12 @@ _CHECKED = (Detector, EventRule)
 def check_documents(documents: Sequence[Document]) -> list[Problem]:
     """Every problem of the Detectors, and of the rules against each Detector that selects them."""
     problems: list[Problem] = []
-    detectors: list[tuple[Detector, Inlets]] = []
+    detectors: list[tuple[Document, Detector, Inlets]] = []
     for document in documents:
         if isinstance(document.object, Detector):
             try:
                 problems += [document.problem(each.path, each.message) for each in plugin_problems(document.object)]
-                detectors.append((document.object, inlets(document.object)))
+                detectors.append((document, document.object, inlets(document.object)))
             except DetectorError as error:
                 problems += [document.problem(each.path, each.message) for each in error.problems]
     any_detector = any(isinstance(document.object, Detector) for document in documents)
@@ -33,21 +33,25 @@ def check_documents(documents: Sequence[Document]) -> list[Problem]:
         )
     for document in rules:
         problems += _rule_problems(document, detectors)
+    names = [document.object.name for document in rules]
+    for of_detector, detector, _ in detectors if rules else ():
+        problems += [of_detector.problem(path, text) for path, text in unknown_rules(detector, names)]
     return list(dict.fromkeys(problems))
 
 
-def _rule_problems(document: Document, detectors: Sequence[tuple[Detector, Inlets]]) -> Iterator[Problem]:
+def _rule_problems(document: Document, detectors: Sequence[tuple[Document, Detector, Inlets]]) -> Iterator[Problem]:
     rule = document.object
     assert isinstance(rule, EventRule)  # noqa: S101  the caller picked it
-    selecting = [each for each in detectors if each[0].spec.rules.matches(rule.metadata.labels)]
+    selecting = [each for each in detectors if each[1].spec.rules.matches(rule.metadata.labels)]
     if detectors and not selecting:
-        names = ", ".join(detector.name for detector, _ in detectors)
+        names = ", ".join(detector.name for _, detector, _ in detectors)
         yield document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
-    for detector, entries in selecting:
+    for of_detector, detector, entries in selecting:
         try:
             compile_rule(rule, detector, entries.fields)
         except RuleError as error:
-            yield from (document.problem(each.path, each.message) for each in error.problems)
+            for each in error.problems:
+                yield (document if each.detector is None else of_detector).problem(each.path, each.message)
 
 
 def summary(documents: Sequence[Document]) -> str:

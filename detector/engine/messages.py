@@ -57,9 +57,11 @@ class Messages:
             self._decoded[at] = message
         return message
 
-    def values(self, stream: str, sample: Sample, names: frozenset[str]) -> dict[str, Any] | None:
+    def values(
+        self, stream: str, sample: Sample, names: frozenset[str], parameters: Mapping[str, Any]
+    ) -> dict[str, Any] | None:
         """What an expression over one sample sees; None where the sample cannot be read."""
-        values: dict[str, Any] = {}
+        values: dict[str, Any] = {"parameters": parameters}
         if "msg" in names:
             message = self.message(stream, sample)
             if message is UNKNOWN:

@@ -67,7 +67,7 @@ class Positions:
     def _place(self, position: CompiledPosition, client: str, sample: Sample, counters: RuleCounters) -> Place | None:
         place = []
         for axis, expression in position.axes.items():
-            value = self._evaluate(expression, position.stream, sample, counters)
+            value = self._evaluate(expression, position, client, sample, counters)
             if not isinstance(value, int | float):
                 counters.misplace(f"{axis} of {client} is absent, NaN, no number, or cannot be read")
                 return None
@@ -79,8 +79,11 @@ class Positions:
             place.append(float(value))
         return tuple(place)
 
-    def _evaluate(self, expression: Expression, stream: str, sample: Sample, counters: RuleCounters) -> Value | Unknown:
-        values = self._messages.values(stream, sample, expression.names)
+    def _evaluate(
+        self, expression: Expression, position: CompiledPosition, client: str, sample: Sample, counters: RuleCounters
+    ) -> Value | Unknown:
+        parameters = position.parameters.of(client)
+        values = self._messages.values(position.stream, sample, expression.names, parameters)
         if values is None:
             counters.unknowns += 1
             return UNKNOWN

@@ -67,6 +67,7 @@ class Views:
                 "client": client,
                 "labels": self._clients.labels(client),
                 "streams": fresh_streams(client, self._stale_after, self._buffer, self._now),
+                "parameters": self._rule.parameters.of(client),
             }
             for signal in self._rule.signals:
                 value = self._signals.value(self._rule.name, signal, client, self._now, self._counters)
@@ -114,7 +115,10 @@ def candidates(rule: CompiledRule, views: Views, clients: Clients, pending: Iter
                 seen = ((client, _with(views.of(client), element)) for client in clients)
                 members = [views.of(client) for client, view in seen if views.truth(fleet.members, view) is True]
                 yield Candidate(
-                    Subject((), element.name), {"members": members, **element.variables}, in_scope=True, near=True
+                    Subject((), element.name),
+                    {"members": members, "parameters": rule.parameters.own, **element.variables},
+                    in_scope=True,
+                    near=True,
                 )
 
 
@@ -145,6 +149,7 @@ def _pairs(
             variables: dict[str, Any] = {
                 "a": _member(views, subject, a, places),
                 "b": _member(views, subject, b, places),
+                "parameters": rule.parameters.own,
                 **element.variables,
             }
             placed = a in places and b in places

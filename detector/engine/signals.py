@@ -122,12 +122,14 @@ class Signals:
         self, signal: CompiledSignal, lane: Lane, sample: Sample, counters: RuleCounters
     ) -> Value | Unknown | None:
         """The sample's value; None where `where` is not true for it."""
-        if signal.where is not None and self._evaluate(signal.where, lane, sample, counters) is not True:
+        if signal.where is not None and self._evaluate(signal.where, signal, lane, sample, counters) is not True:
             return None
-        return True if signal.value is None else self._evaluate(signal.value, lane, sample, counters)
+        return True if signal.value is None else self._evaluate(signal.value, signal, lane, sample, counters)
 
-    def _evaluate(self, expression: Expression, lane: Lane, sample: Sample, counters: RuleCounters) -> Value | Unknown:
-        values = self._messages.values(lane.stream, sample, expression.names)
+    def _evaluate(
+        self, expression: Expression, signal: CompiledSignal, lane: Lane, sample: Sample, counters: RuleCounters
+    ) -> Value | Unknown:
+        values = self._messages.values(lane.stream, sample, expression.names, signal.parameters.of(lane.client))
         if values is None:
             counters.unknowns += 1
             return UNKNOWN

@@ -20,6 +20,7 @@ from wayside.api.base import (
     conditions_field,
     validations,
 )
+from wayside.api.constants import Constants
 from wayside.api.source import ZENOH, DataSource
 from wayside.api.zenoh import Zenoh
 
@@ -30,6 +31,12 @@ class Client(Model):
     name: ClientName = Field(description="The client's name, as it appears in the streams' keys.")
     labels: dict[Annotated[str, Field(max_length=63)], Annotated[str, Field(max_length=256)]] = Field(
         default_factory=dict, max_length=32, description="Facts for rules to use, e.g. labels.role."
+    )
+    parameters: dict[ObjectName, Constants] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="Values for this client of the parameters that rules have, by rule and name. In a pairs scope they "
+        "are those of a or b.",
     )
 
 

@@ -22,6 +22,7 @@ from wayside.api.base import (
     validations,
 )
 from wayside.api.classification import Classification
+from wayside.api.constants import Constants
 from wayside.api.scopes import ClientScope, Each, Scope
 
 
@@ -155,6 +156,11 @@ class EventRuleSpec(Model):
     scope: Scope = Field(default=Scope(client=ClientScope()), description="Whom the rule is about.")
     each: Each | None = Field(default=None, description="Evaluate the rule once for each of these elements.")
     evaluation: Evaluation = Field(default=Evaluation(), description="When the rule is evaluated.")
+    parameters: Constants = Field(
+        default_factory=dict,
+        description="Constants that the expressions share, as parameters.<name>: numbers, texts, booleans, and lists "
+        "and maps of them, such as polygons. A Detector can set others for single clients.",
+    )
     signals: list[Signal] = Field(
         default_factory=list,
         max_length=64,
@@ -231,4 +237,4 @@ class EventRule(Kind):
     def semantics(self) -> dict[str, Any]:
         """The fields that decide which episodes there are; another value of any of them ends open episodes."""
         spec = self.spec.to_json()
-        return {field: spec.get(field) for field in ("scope", "each", "signals", "when", "until", "for")}
+        return {field: spec.get(field) for field in ("scope", "each", "parameters", "signals", "when", "until", "for")}

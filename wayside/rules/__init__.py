@@ -13,6 +13,7 @@ from wayside.rules.compiled import (
 )
 from wayside.rules.compiling import RuleError, RuleProblem, compile_rule, compile_stream, stream_problems
 from wayside.rules.fields import Fields
+from wayside.rules.parameters import unknown_rules
 from wayside.rules.sources import source_problems
 
 __all__ = [
@@ -32,4 +33,5 @@ __all__ = [
     "compile_stream",
     "source_problems",
     "stream_problems",
+    "unknown_rules",
 ]

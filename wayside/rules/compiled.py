@@ -8,6 +8,7 @@ from typing import Any
 
 from wayside.api.eventrule import Aggregate
 from wayside.expressions import CompiledTemplate, Expression
+from wayside.rules.parameters import NO_PARAMETERS, Parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +21,8 @@ class CompiledSignal:
     value: Expression | None
     where: Expression | None
     over_ns: int | None
+    parameters: Parameters = NO_PARAMETERS
+    """What value and where see as `parameters`, by client."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,7 @@ class CompiledPosition:
     stream: str
     axes: Mapping[str, Expression]
     """x and y, perhaps z, in metres; or latitude and longitude, in degrees (WGS 84)."""
+    parameters: Parameters = NO_PARAMETERS
 
     @property
     def geographic(self) -> bool:
@@ -114,6 +118,7 @@ class CompiledRule:
     digest: str
     """Of the fields that decide which episodes there are: open episodes end when it changes."""
     elements: tuple[CompiledElement, ...] = (CompiledElement(),)
+    parameters: Parameters = NO_PARAMETERS
 
 
 @dataclass(frozen=True, slots=True)

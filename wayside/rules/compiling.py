@@ -34,6 +34,7 @@ from wayside.rules.compiled import (
     PairSubject,
 )
 from wayside.rules.fields import Fields, unknown_fields
+from wayside.rules.parameters import override_problems, parameters_of
 from wayside.rules.scopes import closing_speed_problem, compile_elements, compile_subject, known_members
 from wayside.rules.variables import (
     RESERVED,
@@ -51,9 +52,12 @@ class RuleProblem:
 
     path: FieldPath
     message: str
+    detector: str | None = None
+    """The Detector whose field it is; None: the rule's."""
 
     def __str__(self) -> str:
-        return f"{field_text(self.path)}: {self.message}"
+        whose = "" if self.detector is None else f"Detector {self.detector}: "
+        return f"{whose}{field_text(self.path)}: {self.message}"
 
 
 class RuleError(Exception):
@@ -119,7 +123,10 @@ class _RuleCompiler:
         self.spec = rule.spec
         self.detector = detector
         self.fields = fields
-        self.problems: list[RuleProblem] = []
+        self.parameters = parameters_of(rule, detector)
+        self.problems = [
+            RuleProblem(path, message, detector.name) for path, message in override_problems(rule, detector)
+        ]
 
     def compile(self) -> CompiledRule | None:
         """The compiled rule, or None where problems forbid it."""
@@ -152,8 +159,9 @@ class _RuleCompiler:
             dry_run=spec.dry_run,
             deploys=tuple(deploy for deploy in deploys if deploy is not None),
             classification=None if spec.classification is None else spec.classification.to_json(),
-            digest=_digest(self.rule),
+            digest=_digest(self.rule, self.detector),
             elements=elements,
+            parameters=self.parameters,
         )
 
     def _signal(self, index: int, signal: Signal) -> CompiledSignal | None:
@@ -174,7 +182,7 @@ class _RuleCompiler:
                     f"{signal.over} is longer than the {kept / 1e9:g} s that Detector {self.detector.name} keeps of "
                     f"stream {stream.name}: shorten it, or raise the stream's buffer.duration",
                 )
-        return CompiledSignal(signal.name, signal.stream, signal.aggregate, value, where, over)
+        return CompiledSignal(signal.name, signal.stream, signal.aggregate, value, where, over, self.parameters)
 
     def _deploy(self, index: int, action: str, environment: Environment) -> CompiledDeploy | None:
         deploy = self.spec.actions[index].deploy
@@ -213,8 +221,9 @@ class _RuleCompiler:
         if expression is None:
             return None
         known: Fields = dict.fromkeys(SAMPLE_MEMBERS)
-        for text in unknown_fields(expression.paths, "sample", known):
-            self.problem(path, text)
+        for variable, members in (("sample", known), ("parameters", dict.fromkeys(self.spec.parameters))):
+            for text in unknown_fields(expression.paths, variable, members):
+                self.problem(path, text)
         if stream is not None and stream.name in self.fields:
             for text in unknown_fields(expression.paths, "msg", self.fields[stream.name]):
                 self.problem(path, f"{text} (stream {stream.name}, type {stream.type})")
@@ -264,8 +273,10 @@ def _parameter_of(located: InterpolationError | Embedded) -> str:
     return re.split(r"[.\[]", located.path, maxsplit=1)[0]
 
 
-def _digest(rule: EventRule) -> str:
-    return hashlib.sha256(_canonical(rule.semantics()).encode()).hexdigest()[:16]
+def _digest(rule: EventRule, detector: Detector) -> str:
+    """Of what decides which episodes there are, the Detector's values for the parameters among it."""
+    clients = {client.name: values for client in detector.spec.clients if (values := client.parameters.get(rule.name))}
+    return hashlib.sha256(_canonical([rule.semantics(), clients]).encode()).hexdigest()[:16]
 
 
 def _canonical(value: object) -> str:

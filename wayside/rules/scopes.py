@@ -20,6 +20,7 @@ from wayside.rules.compiled import (
     PairSubject,
 )
 from wayside.rules.fields import Fields
+from wayside.rules.parameters import Parameters
 from wayside.rules.variables import (
     MEMBER_OF_CLIENT,
     RESERVED,
@@ -38,6 +39,7 @@ class Expressions(Protocol):
     """Compiles a rule's expressions, and collects what is wrong with them."""
 
     rule: EventRule
+    parameters: Parameters
 
     def condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
         """A boolean expression; None where there is none, or it is wrong."""
@@ -96,7 +98,9 @@ def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> Pai
     b = None if pairs.b is None else compiler.condition((*at, "b", "where"), pairs.b.where, role)
     if not complete:
         return None
-    return PairSubject(CompiledPosition(position.stream, axes), pairs.within, where, a, b, pairs.max_pairs)
+    return PairSubject(
+        CompiledPosition(position.stream, axes, compiler.parameters), pairs.within, where, a, b, pairs.max_pairs
+    )
 
 
 def compile_elements(compiler: Expressions, each: Each | None) -> tuple[CompiledElement, ...]:
@@ -117,9 +121,11 @@ def compile_elements(compiler: Expressions, each: Each | None) -> tuple[Compiled
 
 def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:
     """The maps among the variables whose fields are known, and these: CEL itself does not know what is in them."""
+    yield "parameters", dict.fromkeys(spec.parameters)
     if spec.scope.pairs is not None:
         member: dict[str, Any] = dict.fromkeys((*MEMBER_OF_CLIENT, *(signal.name for signal in spec.signals)))
         geographic = spec.scope.pairs.position.latitude is not None
+        member["parameters"] = dict.fromkeys(spec.parameters)
         member["position"] = dict.fromkeys(("latitude", "longitude") if geographic else ("x", "y", "z"))
         yield "a", member
         yield "b", member

@@ -8,11 +8,12 @@ from wayside.api.eventrule import EventRuleSpec
 from wayside.expressions import Environment, ExpressionError, Kind
 
 RESERVED = frozenset(
-    {"client", "labels", "streams", "position", "a", "b", "distance", "closingSpeed", "members", "msg", "key", "sample"}
+    {"client", "labels", "streams", "parameters", "position", "a", "b", "distance", "closingSpeed", "members"}
+    | {"msg", "key", "sample"}
 )
 """Names that the scopes and samples give; neither a signal nor the element of `each` may take them."""
 
-MEMBER_OF_CLIENT = ("client", "labels", "streams")
+MEMBER_OF_CLIENT = ("client", "labels", "streams", "parameters")
 
 SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 
@@ -22,9 +23,9 @@ def sample_environment() -> Environment:
     """For `value`, `where` and positions: one sample.
 
     msg is the decoded message, key the captured chunks, sample has stamp and received (seconds since the epoch),
-    latency (seconds) and size (bytes).
+    latency (seconds) and size (bytes); parameters are those of the sample's client.
     """
-    return Environment({"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP})
+    return Environment({"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP})
 
 
 @cache
@@ -46,22 +47,21 @@ def is_taken(name: str) -> bool:
 @lru_cache(maxsize=256)
 def client_environment(signals: tuple[str, ...] = (), element: str | None = None) -> Environment:
     """For one client: client, labels, streams (those that are not stale), the signals and the element of `each`."""
-    fixed = {"client": Kind.STRING, "labels": Kind.MAP, "streams": Kind.LIST}
+    fixed = {"client": Kind.STRING, "labels": Kind.MAP, "streams": Kind.LIST, "parameters": Kind.MAP}
     return Environment({**fixed, **dict.fromkeys(signals, Kind.DYN), **_element(element)})
 
 
 @lru_cache(maxsize=256)
 def pairs_environment(element: str | None = None) -> Environment:
     """For a pair: a and b (maps of what a client scope has, and position), distance in metres, closingSpeed in m/s."""
-    return Environment(
-        {"a": Kind.MAP, "b": Kind.MAP, "distance": Kind.DOUBLE, "closingSpeed": Kind.DOUBLE, **_element(element)}
-    )
+    numbers = {"distance": Kind.DOUBLE, "closingSpeed": Kind.DOUBLE}
+    return Environment({"a": Kind.MAP, "b": Kind.MAP, "parameters": Kind.MAP, **numbers, **_element(element)})
 
 
 @lru_cache(maxsize=256)
 def fleet_environment(element: str | None = None) -> Environment:
     """For the fleet: members (a list of maps of what a client scope has)."""
-    return Environment({"members": Kind.LIST, **_element(element)})
+    return Environment({"members": Kind.LIST, "parameters": Kind.MAP, **_element(element)})
 
 
 def _element(name: str | None) -> dict[str, Kind]:

@@ -1,0 +1,101 @@
+"""The parameters of a rule: its own constants, and what the Detector sets for single clients instead."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from wayside.api import Detector, EventRule
+from wayside.api.documents import FieldPath
+from wayside.expressions import normalise
+
+Values = Mapping[str, Any]
+"""Parameters by name, as expressions take them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """What expressions see as `parameters`."""
+
+    own: Values = field(default_factory=dict)
+    """As the rule has them."""
+    overridden: Mapping[str, Values] = field(default_factory=dict)
+    """By client, for those for which the Detector sets some of them: all of them, for that client."""
+
+    def of(self, client: str) -> Values:
+        """Those for one client."""
+        return self.overridden.get(client, self.own)
+
+
+NO_PARAMETERS = Parameters()
+
+
+def parameters_of(rule: EventRule, detector: Detector) -> Parameters:
+    """The rule's parameters at that Detector; overrides that are wrong are left out (see `override_problems`)."""
+    own = _values(rule.spec.parameters)
+    wrong = {path for path, _ in override_problems(rule, detector)}
+    overridden = {
+        client.name: {
+            **own,
+            **_values({name: value for name, value in values.items() if _path(index, rule.name, name) not in wrong}),
+        }
+        for index, client in enumerate(detector.spec.clients)
+        if (values := client.parameters.get(rule.name))
+    }
+    return Parameters(own, overridden)
+
+
+def override_problems(rule: EventRule, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
+    """What is wrong with the Detector's values for the rule's parameters: the field of the Detector, and why."""
+    own = rule.spec.parameters
+    for index, client in enumerate(detector.spec.clients):
+        for name, value in client.parameters.get(rule.name, {}).items():
+            path = _path(index, rule.name, name)
+            if name in own:
+                yield from ((path, text) for text in _misfits(name, own[name], value, rule.name))
+            else:
+                yield path, f"EventRule {rule.name} has no parameter {name}; {_known(name, own)}"
+
+
+def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[FieldPath, str]]:
+    """The Detector's values for rules that are not there: the field of the Detector, and what to do."""
+    names = list(rules)
+    for index, client in enumerate(detector.spec.clients):
+        for rule in client.parameters:
+            if rule not in names:
+                close = difflib.get_close_matches(rule, names, n=1)
+                hint = f"did you mean {close[0]}?" if close else "give its file as well, or remove the parameters"
+                yield ("spec", "clients", index, "parameters", rule), f"there is no EventRule {rule} here; {hint}"
+
+
+def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
+    """Where the other value is of another kind than the rule's own; of lists, what their items are counts."""
+    wanted, given = _kind(own), _kind(other)
+    if wanted != given:
+        yield f"{name} of EventRule {rule} is a {wanted}, this is a {given}: {other!r:.60}"
+    elif isinstance(own, list) and isinstance(other, list) and own:
+        for index, item in enumerate(other):
+            yield from _misfits(f"{name}[{index}]", own[min(index, len(own) - 1)], item, rule)
+    elif isinstance(own, dict) and isinstance(other, dict):
+        for key in own.keys() & other.keys():
+            yield from _misfits(f"{name}.{key}", own[key], other[key], rule)
+
+
+def _kind(value: object) -> str:
+    kinds = {bool: "boolean", int: "number", float: "number", str: "text", list: "list", dict: "map"}
+    return kinds.get(type(value), type(value).__name__)
+
+
+def _known(name: str, own: Values) -> str:
+    close = difflib.get_close_matches(name, own, n=1)
+    return f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(own)) or 'none'}"
+
+
+def _values(constants: Mapping[str, Any]) -> Values:
+    return {name: normalise(value) for name, value in constants.items()}
+
+
+def _path(client: int, rule: str, name: str) -> FieldPath:
+    return ("spec", "clients", client, "parameters", rule, name)
