@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from detector.engine.engine import Engine, KeyReader
+from detector.engine.liveliness import LIVELINESS
 from detector.engine.sample import Decoder
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
 from detector.streams.codecs.fields import message_fields
@@ -76,9 +77,12 @@ def inlets(detector: Detector) -> Inlets:
         raise DetectorError(problems)
     patterns = {stream.name: KeyPattern.parse(stream.key) for stream in detector.spec.streams}
     clients = {stream.name: stream.client for stream in detector.spec.streams}
+    if detector.spec.zenoh.liveliness is not None:
+        patterns[LIVELINESS], clients[LIVELINESS] = KeyPattern.parse(detector.spec.zenoh.liveliness), None
 
     def read_key(stream: str, key: str) -> tuple[str, Mapping[str, str]] | None:
-        captures = patterns[stream].match(key)
+        pattern = patterns.get(stream)
+        captures = None if pattern is None else pattern.match(key)
         if captures is None:
             return None
         client = clients[stream] or captures["client"]

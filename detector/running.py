@@ -6,14 +6,16 @@ import asyncio
 import gc
 import logging
 import time
-from collections.abc import AsyncIterator, Iterable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 
 from detector.actions.deploy import DemandReconciler
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.demands import Demand
 from detector.engine.intake import Intake
+from detector.engine.liveliness import LIVELINESS
 from detector.evaluator import Evaluator
 from detector.event_log import EventLog
 from detector.outlet import LiveOutlet
@@ -112,7 +114,11 @@ class Running:
     def _network(self, detector: Detector) -> Network:
         spec = detector.spec
         streams = [stream for stream in spec.streams if stream.source == ZENOH]
-        return Network(spec.zenoh, streams, self._intake.putter, on_failure=self._fail)
+        return Network(spec.zenoh, streams, self._putter, on_failure=self._fail)
+
+    def _putter(self, stream: str) -> Callable[[str, bytes], None]:
+        """What takes a stream's messages; what happens to tokens is never dropped lightly."""
+        return self._intake.patient_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
 
     def _good(self, wanted: Detector) -> Detector:
         """The changed Detector; the last one where it cannot run."""
@@ -149,7 +155,7 @@ def tune_garbage_collection() -> None:
 
 def _unused(path: Path) -> Path:
     """The path, or where there is a file already, one beside it: a restart must not destroy what was recorded."""
-    candidates = (path, *(path.with_name(f"{path.stem}.{number}{path.suffix}") for number in range(2, 1_000_000)))
+    candidates = chain([path], (path.with_name(f"{path.stem}.{number}{path.suffix}") for number in count(2)))
     free = next(candidate for candidate in candidates if not candidate.exists())
     if free != path:
         _log.warning("%s exists already: recording into %s", path, free)

@@ -1,4 +1,7 @@
-"""Who is there: a client is known from its first sample until nothing was received from it for `clientTimeout`."""
+"""Who is there: a client is known from its first sample until nothing was received from it for `clientTimeout`.
+
+One with a liveliness token is known as long as it has one, and lost at the first tick after its last one was dropped.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from detector.engine.buffer import NEVER, Buffer
+from detector.engine.liveliness import Tokens
 
 
 @dataclass(slots=True)
@@ -24,6 +28,7 @@ class Clients:
         self._labels = labels
         self._timeout = timeout
         self._present: dict[str, Presence] = {}
+        self.tokens = Tokens()
 
     def configure(self, labels: Mapping[str, Mapping[str, str]], timeout: int) -> None:
         """The Detector changed: other labels, another timeout."""
@@ -42,8 +47,14 @@ class Clients:
             presence.last = time
 
     def lose(self, now: int) -> list[str]:
-        """Forget the clients that have timed out; returns them."""
-        lost = [name for name, presence in self._present.items() if now - presence.last > self._timeout]
+        """Forget the clients that have timed out without a token, or dropped their last one; returns them."""
+        tokens = self.tokens
+        lost = [
+            name
+            for name, presence in self._present.items()
+            if (now - presence.last > self._timeout and not tokens.hold(name)) or tokens.dropped(name)
+        ]
+        tokens.forget_dropped()
         for name in lost:
             del self._present[name]
         return lost

@@ -76,6 +76,9 @@ class Engine:
         self._configure(detector, decoders, read_key)
         kept = {stream.name for stream in detector.spec.streams if _reads_like(stream, before.stream(stream.name))}
         self.buffer.keep(kept)
+        if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
+            for client in self.clients.tokens.forget():
+                self.clients.still_heard(client, self._timeline.now)
         for lane in self.buffer:
             self._lane_makers[lane.stream].limit(lane)
         if isinstance(self._timeline, DataTimeline):

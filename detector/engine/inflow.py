@@ -13,6 +13,7 @@ from detector.engine.buffer import Buffer, Lane
 from detector.engine.clients import Clients
 from detector.engine.counters import Counters
 from detector.engine.lanes import LaneMaker
+from detector.engine.liveliness import LIVELINESS, Token
 from detector.engine.messages import KeyReader
 from detector.engine.sample import SAMPLE_OVERHEAD, Arrival, Stamped
 from wayside.api import Detector
@@ -56,7 +57,10 @@ class Inflow:
             return
         for time, (_, stream, key, payload) in zip(times, arrivals, strict=True):
             lane = self._lane(stream, key, time)
-            if lane is not None:
+            if lane is None:
+                if stream == LIVELINESS:
+                    self._token(key, payload, time)
+            else:
                 self._number += 1
                 self._buffer.grew(lane.insert(Stamped(time, self._number, payload, time, key)))
 
@@ -71,6 +75,8 @@ class Inflow:
             except KeyError:
                 found = self._lane(stream, key, time)
                 if found is None:
+                    if stream == LIVELINESS:
+                        self._token(key, payload, time)
                     continue
                 lane = found
             if time >= lane.latest and not lane.capped:
@@ -113,8 +119,34 @@ class Inflow:
             del self._lost[client]
             self._buffer.forget(client)
 
+    def _token(self, key: str, payload: bytes, time: int) -> None:
+        """Something happened to a client's liveliness token."""
+        try:
+            token = Token(payload)
+        except ValueError:
+            self._counters.unnamed[LIVELINESS] += 1
+            return
+        tokens = self._clients.tokens
+        if token is not Token.DECLARED:
+            client = tokens.withdraw(key, lost=token is Token.DROPPED)
+            if client is not None:
+                self._clients.still_heard(client, time)  # from here on the timeout counts
+            return
+        whose = self._read_key(LIVELINESS, key)
+        if whose is None:
+            self._counters.unnamed[LIVELINESS] += 1
+        elif (whose[0] not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS) or not tokens.declare(
+            key, whose[0]
+        ):
+            self._counters.crowded[LIVELINESS] += 1
+        else:
+            self._lost.pop(whose[0], None)
+            self._clients.heard(whose[0], time)
+
     def _route(self, stream: str, key: str, time: int) -> Lane | None:
         """The lane for a key that has none at hand: a new key, or one of a client that was lost."""
+        if stream == LIVELINESS:
+            return None
         client = self._read(stream, key)
         if client is None:
             return None

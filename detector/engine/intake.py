@@ -15,6 +15,9 @@ from itertools import islice
 
 from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
 
+_PAUSE = 0.01
+"""Seconds between two looks whether there is room."""
+
 _RECEIVED = operator.itemgetter(0)
 
 
@@ -55,6 +58,20 @@ class Intake:
             extend([new(Arrival, (t, stream, key, payload)) for t, (key, payload) in enumerate(messages, time)])
 
         return put
+
+    def patient_putter(self, stream: str, patience: float = 1.0) -> Callable[[Sequence[tuple[str, bytes]]], None]:
+        """The same for what is rare and should not be dropped: it waits for room, at most `patience` seconds."""
+        put = self.putter(stream)
+        pause = threading.Event()
+
+        def patient(messages: Sequence[tuple[str, bytes]]) -> None:
+            waited = 0.0
+            while self._room <= 0 and waited < patience:
+                pause.wait(_PAUSE)
+                waited += _PAUSE
+            put(messages)
+
+        return patient
 
     def drain(self, until: int) -> list[Arrival]:
         """What was queued, in order. Everything that is drained later is received after `until`."""

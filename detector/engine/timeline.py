@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
+from detector.engine.liveliness import LIVELINESS
 from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
 
 _RECEIVED = itemgetter(0)
@@ -193,6 +194,9 @@ class DataTimeline:
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
         """All that the arrivals make happen; `until`, a time of the wall, says nothing here."""
         for arrival in arrivals:
+            if arrival.stream == LIVELINESS:
+                yield from self._token(arrival)
+                continue
             client = self._client_of(arrival)
             stamp = None if client is None else self._stamp_of(arrival)
             if client is None or stamp is None:
@@ -235,6 +239,14 @@ class DataTimeline:
     def rest(self) -> Iterator[Step]:
         """All that waits, at once: no tick of this axis comes any more."""
         yield from self._release(None)
+
+    def _token(self, arrival: Arrival) -> Iterator[Step]:
+        """What happens to a token carries no stamp: it comes after all samples with the newest stamp so far."""
+        newest = self.now if self._newest is None else self._newest
+        if newest <= self.now or self._waiting_bytes >= self._maximum_bytes:
+            yield Insert((arrival,), (self.now,))
+        else:
+            self._wait(arrival, newest)
 
     def _hold(self, arrival: Arrival, stamp: int) -> Iterator[Step]:
         """A sample of a latched stream."""

@@ -18,6 +18,8 @@ from typing import NoReturn
 
 import zenoh
 
+from detector.engine.liveliness import LIVELINESS
+from detector.streams.liveliness import TokenWatch
 from detector.streams.session import Connections, NetworkError, await_session, open_session
 from wayside.api.detector import Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -62,6 +64,9 @@ class Network:
             (stream.name, zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression), putter(stream.name))
             for stream in streams
         ]
+        self._liveliness = config.liveliness
+        self._put_token = putter(LIVELINESS)
+        self._tokens: TokenWatch | None = None
         self._capacity = capacity
         self._events: deque[tuple[str, bytes]] = deque()
         self._changed = threading.Condition()
@@ -109,6 +114,8 @@ class Network:
             session.close()  # type: ignore[no-untyped-call]  # frees the threads: of a put that waits, and of receiving
         for receiver in self._receivers:
             receiver.join(timeout)
+        if self._tokens is not None:
+            self._tokens.close(timeout)
         if (left := len(self._events)) > 0:
             self.dropped_events += left
             log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
@@ -120,6 +127,8 @@ class Network:
             thread = threading.Thread(target=self._receive, args=(subscriber, put), name=f"stream {name}", daemon=True)
             thread.start()
             self._receivers.append(thread)
+        if self._liveliness is not None:
+            self._tokens = TokenWatch(session, self._connections, self._liveliness, self._put_token)
         self._session = session
 
     def _receive(self, subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]], put: Put) -> None:

@@ -15,6 +15,8 @@ Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/
 
 _ENCRYPTED = ("tls/", "quic/")
 
+_NO_CLIENT = "liveliness captures no client: write ${client:*} where its name stands"
+
 _NO_CERTIFICATE = (
     "an endpoint to listen on with TLS needs a certificate: give tls.certificate and tls.key, or tlsSecret"
 )
@@ -31,7 +33,9 @@ class ZenohMode(StrEnum):
 class Zenoh(Access):
     """The detector's Zenoh session."""
 
-    model_config = validations(*ACCESS_VALIDATIONS)
+    model_config = validations(
+        *ACCESS_VALIDATIONS, ("!has(self.liveliness) || self.liveliness.contains('${client:')", _NO_CLIENT)
+    )
 
     mode: ZenohMode = Field(
         default=ZenohMode.PEER, description="client (of a router), peer, or router (others may connect through it)."
@@ -56,6 +60,20 @@ class Zenoh(Access):
         description="Whether publishers on the same machine may hand samples over in shared memory; "
         "the pods must then share /dev/shm.",
     )
+
+    liveliness: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=512,
+        description="The key of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a token is "
+        "there, however long it sends nothing; once its last token is gone it is lost at once.",
+    )
+
+    @model_validator(mode="after")
+    def _names_clients(self) -> Zenoh:
+        if self.liveliness is not None and "${client:" not in self.liveliness:
+            raise ValueError(_NO_CLIENT)
+        return self
 
     @model_validator(mode="after")
     def _has_certificate(self) -> Zenoh:

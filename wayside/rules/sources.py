@@ -7,11 +7,12 @@ from collections.abc import Iterator
 
 from wayside.api import Detector
 from wayside.api.source import ZENOH
+from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.compiling import RuleProblem
 
 
 def source_problems(detector: Detector) -> Iterator[RuleProblem]:
-    """Sources that are named wrongly, streams of sources that are not there, and sources without streams."""
+    """Sources that are named wrongly or not at all, sources without streams, and what only Zenoh can do."""
     names = [source.name for source in detector.spec.sources]
     for index, source in enumerate(detector.spec.sources):
         if source.name == ZENOH:
@@ -32,3 +33,8 @@ def source_problems(detector: Detector) -> Iterator[RuleProblem]:
         yield RuleProblem(
             ("spec", "streams", index, "source"), f"Detector {detector.name} has no source {stream.source}; {hint}"
         )
+    if detector.spec.zenoh.liveliness is not None:
+        try:
+            KeyPattern.parse(detector.spec.zenoh.liveliness)
+        except KeyPatternError as error:
+            yield RuleProblem(("spec", "zenoh", "liveliness"), str(error))
