@@ -116,7 +116,7 @@ class Running:
         streams = [stream for stream in spec.streams if stream.source == ZENOH]
         return Network(spec.zenoh, streams, self._putter, on_failure=self._fail)
 
-    def _putter(self, stream: str) -> Callable[[str, bytes], None]:
+    def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
         """What takes a stream's messages; what happens to tokens is never dropped lightly."""
         return self._intake.patient_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
 

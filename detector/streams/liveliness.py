@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import zenoh
 
@@ -29,7 +29,11 @@ class TokenWatch:
     """Tells of tokens while its session is open; at its end, that nothing is known of them any more."""
 
     def __init__(
-        self, session: zenoh.Session, connections: Connections, key: str, put: Callable[[str, bytes], None]
+        self,
+        session: zenoh.Session,
+        connections: Connections,
+        key: str,
+        put: Callable[[Sequence[tuple[str, bytes]]], None],
     ) -> None:
         """`key` is a pattern in key-format notation. Raises KeyPatternError."""
         self._put = put
@@ -54,8 +58,7 @@ class TokenWatch:
             while True:
                 self._tell([tokens.recv()], tokens)
         except zenoh.ZError:  # the session is closed
-            for key in self._held:
-                self._put(key, Token.UNSURE.value)
+            self._put([(key, Token.UNSURE.value) for key in self._held])
 
     def _tell(self, reports: list[zenoh.Sample], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """What a report and those that follow it at once come to, a token at a time."""
@@ -66,8 +69,8 @@ class TokenWatch:
         for key, kind in newest.items():
             if kind == zenoh.SampleKind.PUT:
                 self._held[key] = None
-                self._put(key, Token.DECLARED.value)
+                self._put([(key, Token.DECLARED.value)])
             elif key in self._held:
                 del self._held[key]
                 unsure = self._stop.is_set() or self._connections.router_left_within(2 * _SETTLE)
-                self._put(key, (Token.UNSURE if unsure else Token.DROPPED).value)
+                self._put([(key, (Token.UNSURE if unsure else Token.DROPPED).value)])
