@@ -1,4 +1,4 @@
-"""The command `detector`: run, replay, check."""
+"""The command `detector`: run, replay, check, and the commands that ask one that runs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from detector import inquiry
 from detector.actions.file_store import write_tasks_yaml
 from detector.assembly import DetectorError
 from detector.checking import check_documents, summary
@@ -24,6 +25,7 @@ from detector.replay.routing import Router
 from detector.rules.files import load_rules
 from detector.service import Files, Named, Options
 from detector.service import run as run_service
+from detector.streams.asking import NoAnswerError
 from detector.streams.zenoh import NetworkError
 from wayside import commandline
 from wayside.api.documents import DocumentError, load_documents
@@ -36,7 +38,7 @@ app = typer.Typer(
     add_completion=False,
 )
 
-_EXPECTED = (DocumentError, DetectorError, RecordingError, NetworkError, NoClusterError, OSError)
+_EXPECTED = (DocumentError, DetectorError, RecordingError, NetworkError, NoAnswerError, NoClusterError, OSError)
 """Errors of the input: said in one line, without a trace."""
 
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
@@ -75,6 +77,10 @@ def run(
     record_intake: Annotated[
         Path | None, typer.Option(help="Write all that the engine consumes into this file, for an exact replay.")
     ] = None,
+    metrics_port: Annotated[
+        int | None,
+        typer.Option(help="Serve /metrics, /healthz and /readyz on this port; 0: on a free one.", min=0, max=65535),
+    ] = None,
 ) -> None:
     """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
     if (name is None) == (detector is None):
@@ -82,12 +88,12 @@ def run(
     if name is not None:
         if rules:
             refuse("--rules goes with --detector; with --name the rules are read from the API server")
-        options = Options(Named(name, namespace, output), record_intake)
+        options = Options(Named(name, namespace, output), record_intake, metrics_port)
     else:
         assert detector is not None  # noqa: S101  one of both is given
         if namespace is not None:
             refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
-        options = Options(Files(detector, tuple(rules or ()), output or Path("out")), record_intake)
+        options = Options(Files(detector, tuple(rules or ()), output or Path("out")), record_intake, metrics_port)
     asyncio.run(run_service(options))
 
 
@@ -139,6 +145,9 @@ def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folder
     if problems:
         raise typer.Exit(1)
     typer.echo(f"{summary(documents)}: nothing wrong", err=True)
+
+
+app.command()(inquiry.status)
 
 
 def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] | None, progress: Progress) -> Outcome:

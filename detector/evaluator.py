@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from concurrent.futures import Future
+from typing import Any, Protocol, TypeVar
 
 from detector.assembly import RuleBook, inlets
 from detector.engine.demands import Demand, to_task
@@ -19,9 +21,12 @@ from detector.engine.intake import Intake
 from detector.engine.sample import Arrival
 from detector.losses import Losses
 from detector.rules.selection import RuleSet
+from detector.status.keeping import StatusKeeper
 from wayside.api.detector import Stream
 
 _log = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
 
 _DRAIN_EVERY = 0.05
 """Seconds between two looks at the intake, so that its queue stays short however rare the ticks are."""
@@ -77,10 +82,13 @@ class Evaluator:
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
         self._stopping = False
+        self._ended = False
+        self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
-        self.gaps = 0
         self.losses = Losses(engine, intake)
+        self.status = StatusKeeper(engine, self.losses, now)
+        engine.stopwatch = time.perf_counter_ns
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
     def start(self, rule_set: RuleSet, restored: Sequence[Demand]) -> None:
@@ -103,6 +111,17 @@ class Evaluator:
         self._hand_over(events)
         self._thread.start()
 
+    def call(self, work: Callable[[], Result]) -> Future[Result]:
+        """Have something done on the evaluation's thread, between two looks; thread-safe. Gives what it returns."""
+        future: Future[Result] = Future()
+        with self._wake:
+            if self._ended:
+                future.cancel()
+            else:
+                self._calls.append((future, work))
+            self._wake.notify()
+        return future
+
     def configure(self, rule_set: RuleSet) -> None:
         """Go on with other rules, or another Detector that can run, from the next look on; thread-safe."""
         with self._wake:
@@ -121,15 +140,24 @@ class Evaluator:
             stopping = False
             while not stopping:
                 with self._wake:
-                    if self._wanted is None and not self._stopping:
+                    if self._wanted is None and not self._stopping and not self._calls:
                         self._wake.wait(self.pause())
                     wanted, self._wanted = self._wanted, None
+                    calls, self._calls = self._calls, []
                     stopping = self._stopping
                 self._look(wanted)
+                for future, work in calls:
+                    _answer(future, work)
+                self.status.looked()
                 self.losses.say()
             self._record(self._engine.now, {"kind": "end"})
         except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
             self._on_failure(error)
+        finally:
+            with self._wake:
+                self._ended = True
+                for future, _ in self._calls:
+                    future.cancel()
 
     def pause(self) -> float:
         """Seconds until there is something to do. With clock Data only the samples say when a tick is due."""
@@ -156,11 +184,12 @@ class Evaluator:
     def _take(self, arrivals: list[Arrival], now: int) -> list[Event]:
         if self._recorder is not None and arrivals:
             self._recorder.arrivals(arrivals)
+        self.status.arrived(arrivals)
         return self._engine.advance(arrivals, now)
 
     def _gap(self, now: int, why: str) -> list[Event]:
         _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)
-        self.gaps += 1
+        self.status.gaps += 1
         self._record(now, {"kind": "gap", "until": self._engine.now})
         return self._engine.gap(now)
 
@@ -187,6 +216,7 @@ class Evaluator:
         compiled, refused = self._rule_book.compile(rule_set.rules, rule_set.detector, entries.fields)
         for refusal in refused:
             _log.error("%s", refusal)
+        self.status.refused(refused)
         return self._engine.set_rules(compiled)
 
     def _hand_over(self, events: Sequence[Event]) -> None:
@@ -208,3 +238,12 @@ class Evaluator:
     def _record(self, time: int, document: Mapping[str, Any]) -> None:
         if self._recorder is not None:
             self._recorder.control(time, document)
+
+
+def _answer(future: Future[Any], work: Callable[[], Any]) -> None:
+    """Do what somebody asked for; an error is theirs, and not the evaluation's end."""
+    if future.set_running_or_notify_cancel():
+        try:
+            future.set_result(work())
+        except Exception as error:  # noqa: BLE001  whoever asked hears of it
+            future.set_exception(error)

@@ -22,7 +22,12 @@ Result = TypeVar("Result")
 
 
 async def run_in_cluster(
-    name: str, namespace: str | None, output: Path | None, record: Path | None, stopping: asyncio.Event
+    name: str,
+    namespace: str | None,
+    output: Path | None,
+    record: Path | None,
+    stopping: asyncio.Event,
+    metrics_port: int | None,
 ) -> None:
     """Run the Detector of that name until it is to stop.
 
@@ -37,7 +42,7 @@ async def run_in_cluster(
         async with asyncio.TaskGroup() as group:
             group.create_task(lease.run())
             try:
-                await _run_while_held(name, output, record, stopping, rules, lease, store, reconciler)
+                await _run_while_held(name, output, record, stopping, rules, lease, store, reconciler, metrics_port)
             finally:
                 lease.stop()
 
@@ -51,6 +56,7 @@ async def _run_while_held(
     lease: HolderLease,
     store: TaskStore,
     reconciler: DemandReconciler,
+    metrics_port: int | None,
 ) -> None:
     changes = rules.follow()
     first = await _unless(stopping, anext(changes))
@@ -62,7 +68,7 @@ async def _run_while_held(
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            with Running(first, name, reconciler, output, record, restored) as running:
+            with Running(first, name, reconciler, output, record, restored, metrics_port) as running:
                 following = group.create_task(running.follow(changes))
                 await running.until(stopping)
                 following.cancel()

@@ -9,7 +9,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 from detector.engine.engine import Engine
 from detector.engine.intake import Intake
@@ -30,6 +30,12 @@ class Loss:
     count: int
     last: str = ""
     """The reason of the last one, where there is one."""
+    _: KW_ONLY
+    cause: str
+    """In one word, for metrics: letters and underscores."""
+    stream: str = ""
+    """The stream, or the source of streams."""
+    rule: str = ""
 
 
 class Losses:
@@ -82,29 +88,34 @@ class Losses:
         """Every kind of loss, also those that did not happen."""
         counters, timeline = self._engine.counters, self._engine.timeline
         for tally in self._tallies:
-            yield from (Loss(entry.text, entry.count, entry.last) for entry in tally.entries())
+            for entry in tally.entries():
+                yield Loss(entry.text, entry.count, entry.last, cause=entry.cause.name.lower(), stream=entry.name)
         if self._intake is not None:
             full = "samples dropped, the intake being full: more come in than are evaluated"
-            yield Loss(full, self._intake.dropped)
-        yield Loss("samples pushed out of the buffer before their time: it is too small", self._engine.buffer.evicted)
+            yield Loss(full, self._intake.dropped, cause="intake_full")
+        pushed_out = "samples pushed out of the buffer before their time: it is too small"
+        yield Loss(pushed_out, self._engine.buffer.evicted, cause="evicted")
         if isinstance(timeline, DataTimeline):
-            yield Loss("samples dropped, their stamps being ahead of the rest", timeline.dropped_ahead, timeline.last)
-            yield Loss("samples dropped, their stamps being too old", timeline.dropped_late, timeline.last)
-            yield Loss("samples dropped, too many waiting for their time", timeline.dropped_full)
-        for stream, count in counters.undecodable.items():
-            yield Loss(
-                f"times a sample of stream {stream} could not be read", count, counters.last_undecodable.get(stream, "")
-            )
-        for stream, count in counters.unnamed.items():
-            yield Loss(f"samples of stream {stream} dropped, their keys naming no client", count)
-        for stream, count in counters.crowded.items():
-            yield Loss(f"samples of stream {stream} dropped, too many clients being known", count)
+            ahead, late = timeline.dropped_ahead, timeline.dropped_late
+            yield Loss("samples dropped, their stamps being ahead of the rest", ahead, timeline.last, cause="ahead")
+            yield Loss("samples dropped, their stamps being too old", late, timeline.last, cause="late")
+            yield Loss("samples dropped, too many waiting for their time", timeline.dropped_full, cause="waiting_full")
+        for name, count in counters.undecodable.items():
+            last = counters.last_undecodable.get(name, "")
+            unread = f"times a sample of stream {name} could not be read"
+            yield Loss(unread, count, last, cause="undecodable", stream=name)
+        for name, count in counters.unnamed.items():
+            unnamed = f"samples of stream {name} dropped, their keys naming no client"
+            yield Loss(unnamed, count, cause="unnamed", stream=name)
+        for name, count in counters.crowded.items():
+            crowded = f"samples of stream {name} dropped, too many clients being known"
+            yield Loss(crowded, count, cause="crowded", stream=name)
         for name, rule in counters.rules.items():
-            yield Loss(f"evaluation errors in EventRule {name}", rule.errors, rule.last_error)
-            yield Loss(f"times a sample had no position for EventRule {name}", rule.misplaced, rule.last_misplaced)
-            yield Loss(
-                f"looks at pairs left out for EventRule {name}, more than maxPairs being near", rule.crowded_pairs
-            )
+            yield Loss(f"evaluation errors in EventRule {name}", rule.errors, rule.last_error, cause="error", rule=name)
+            misplaced = f"times a sample had no position for EventRule {name}"
+            yield Loss(misplaced, rule.misplaced, rule.last_misplaced, cause="misplaced", rule=name)
+            crowded = f"looks at pairs left out for EventRule {name}, more than maxPairs being near"
+            yield Loss(crowded, rule.crowded_pairs, cause="crowded_pairs", rule=name)
 
 
 def _line(loss: Loss, count: int) -> str:

@@ -22,6 +22,11 @@ class LiveOutlet:
         self._log = log
         self._reconciler = reconciler
 
+    @property
+    def unwritten(self) -> int:
+        """Events that are missing in `events.jsonl`."""
+        return 0 if self._log is None else self._log.dropped
+
     def events(self, events: Sequence[Event]) -> None:
         """Publish and log what started and ended."""
         for event in events:

@@ -12,6 +12,7 @@ from itertools import chain, count
 from pathlib import Path
 
 from detector.actions.deploy import DemandReconciler
+from detector.answers import Answers
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.demands import Demand
 from detector.engine.intake import Intake
@@ -23,6 +24,8 @@ from detector.replay.intake_writer import IntakeWriter
 from detector.rules.selection import RuleSet
 from detector.sources.registry import plugin_problems
 from detector.sources.supervision import Sources
+from detector.status.server import StatusServer
+from detector.streams.answering import Answering
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
 from wayside.api import Detector
@@ -43,8 +46,9 @@ class Running:
         output: Path | None,
         record: Path | None,
         restored: Sequence[Demand],
+        metrics_port: int | None = None,
     ) -> None:
-        """Raises DetectorError where the Detector cannot run, OSError where a file cannot be written."""
+        """Raises DetectorError where the Detector cannot run, OSError where a file or the port cannot be had."""
         self._loop = asyncio.get_running_loop()
         self._failed: asyncio.Future[None] = self._loop.create_future()
         self._rule_set = rule_set
@@ -66,6 +70,8 @@ class Running:
             recorder=self._writer,
             on_failure=self._fail,
         )
+        self.answers = Answers(self._evaluator, lambda: self._outlet)
+        self._server = None if metrics_port is None else _server(metrics_port, self.answers)
 
         self._evaluator.losses.watch(self._tally)
         self._sources = Sources(self._intake.putter, self._tally)
@@ -74,6 +80,9 @@ class Running:
         self._evaluator.start(self._rule_set, self._restored)
         self._outlet.network.start()
         self._sources.follow(self._rule_set.detector)
+        if self._server is not None:
+            self._server.start()
+            _log.info("/metrics, /healthz and /readyz are served on port %d", self._server.port)
         _log.info(
             "Detector %s runs with %d rules and %d restored demands",
             self._rule_set.detector.name,
@@ -84,6 +93,8 @@ class Running:
 
     def __exit__(self, *_: object) -> None:
         self._sources.close()
+        if self._server is not None:
+            self._server.close()
         self._evaluator.stop()
         self._outlet.network.close()
         if self._log is not None:
@@ -114,7 +125,14 @@ class Running:
     def _network(self, detector: Detector) -> Network:
         spec = detector.spec
         streams = [stream for stream in spec.streams if stream.source == ZENOH]
-        return Network(spec.zenoh, streams, self._putter, on_failure=self._fail)
+        holder = self._engine.identity.holder
+        return Network(
+            spec.zenoh,
+            streams,
+            self._putter,
+            on_failure=self._fail,
+            answering=lambda session: Answering(session, holder, self.answers.answer),
+        )
 
     def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
         """What takes a stream's messages; what happens to tokens is never dropped lightly."""
@@ -140,6 +158,16 @@ class Running:
         self._evaluator.losses.sum_up()
         if self._outlet.network.dropped_events:
             _log.warning("in all, %d events not published", self._outlet.network.dropped_events)
+
+
+def _server(port: int, answers: Answers) -> StatusServer:
+    # Not at the top: only a detector that is scraped owes the time to import it.
+    from detector.status.metrics import Metrics  # noqa: PLC0415
+
+    metrics = Metrics(answers.status)
+    return StatusServer(
+        port, {"/metrics": lambda: (True, metrics.text()), "/healthz": answers.healthy, "/readyz": answers.ready}
+    )
 
 
 def tune_garbage_collection() -> None:

@@ -17,6 +17,7 @@ from detector.actions.deploy import DemandReconciler
 from detector.actions.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.stores import restore
 from detector.rules.files import load_rules
+from detector.rules.following import follow_files
 from detector.running import Running, tune_garbage_collection
 
 _log = logging.getLogger(__name__)
@@ -46,6 +47,8 @@ class Options:
 
     source: Files | Named
     record_intake: Path | None = None
+    metrics_port: int | None = None
+    """Where /metrics, /healthz and /readyz are served; None: nowhere."""
 
 
 async def run(options: Options) -> None:
@@ -61,15 +64,17 @@ async def run(options: Options) -> None:
         loop.add_signal_handler(number, stopping.set)
     match options.source:
         case Files() as files:
-            await _run_from_files(files, options.record_intake, stopping)
+            await _run_from_files(files, options, stopping)
         case Named() as named:
             # Not at the top: the Kubernetes client takes half a second to import, which nobody without a cluster owes.
             from detector.in_cluster import run_in_cluster  # noqa: PLC0415
 
-            await run_in_cluster(named.name, named.namespace, named.output, options.record_intake, stopping)
+            await run_in_cluster(
+                named.name, named.namespace, named.output, options.record_intake, stopping, options.metrics_port
+            )
 
 
-async def _run_from_files(files: Files, record: Path | None, stopping: asyncio.Event) -> None:
+async def _run_from_files(files: Files, options: Options, stopping: asyncio.Event) -> None:
     loaded = load_rules(files.detector, files.rules)
     for warning in loaded.warnings:
         _log.warning("%s", warning)
@@ -81,8 +86,11 @@ async def _run_from_files(files: Files, record: Path | None, stopping: asyncio.E
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            with Running(loaded.rule_set, holder, reconciler, files.output, record, restored) as running:
+            record, port = options.record_intake, options.metrics_port
+            with Running(loaded.rule_set, holder, reconciler, files.output, record, restored, port) as running:
+                following = group.create_task(running.follow(follow_files(files.detector, files.rules)))
                 await running.until(stopping)
+                following.cancel()
         finally:
             reconciler.stop()
     write_tasks_yaml(files.output / "tasks.yaml", (await store.all()).values())

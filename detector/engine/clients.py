@@ -69,6 +69,10 @@ class Clients:
         """Since when the client is known, in nanoseconds since the epoch."""
         return self._present[client].since
 
+    def last(self, client: str) -> int:
+        """When something was last received from the client, in nanoseconds since the epoch."""
+        return self._present[client].last
+
     def labels(self, client: str) -> Mapping[str, str]:
         """The labels that the Detector gives the client."""
         return self._labels.get(client, {})

@@ -28,6 +28,12 @@ class RuleCounters:
     misplaced: int = 0
     """Looks at a client whose newest sample says no place: absent, no number, infinite."""
     last_misplaced: str = ""
+    ticks: int = 0
+    """Times at which the rule was evaluated, for all its subjects."""
+    last_tick: int = 0
+    """The newest of these times, in nanoseconds on the engine's time axis."""
+    time_ns: int = 0
+    """Spent on evaluating it, by the engine's stopwatch."""
 
     crowded_pairs: int = 0
     """Pairs within reach that were not looked at, there being more than `maxPairs`; each at each evaluation."""
@@ -41,6 +47,12 @@ class RuleCounters:
             self.unknowns += 1
             if message in self.absences or len(self.absences) < _MAXIMUM_REASONS:
                 self.absences[message] += 1
+
+    def timed(self, tick: int, spent: int) -> None:
+        """The rule was evaluated at the tick; nanoseconds, both."""
+        self.ticks += 1
+        self.last_tick = tick
+        self.time_ns += spent
 
     def misplace(self, message: str) -> None:
         """Count a sample that should say where its client is, and does not."""

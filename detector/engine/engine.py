@@ -6,7 +6,7 @@ It reads no clock and does no I/O. Live operation, the replay of a recording and
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from detector.engine.buffer import Buffer
 from detector.engine.clients import Clients
@@ -20,7 +20,7 @@ from detector.engine.lanes import lane_makers
 from detector.engine.messages import KeyReader, Messages
 from detector.engine.positions import Positions
 from detector.engine.queries import BufferQueries
-from detector.engine.sample import Arrival, Decoder
+from detector.engine.sample import Arrival, Decoder, Sample
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
 from detector.engine.subjects import subject_of
@@ -31,6 +31,8 @@ from wayside.api.detector import Clock, Stream
 from wayside.rules import CompiledRule, compile_stream
 
 __all__ = ["Engine", "KeyReader"]
+
+_SAMPLE = frozenset({"sample"})
 
 
 class Engine:
@@ -57,6 +59,8 @@ class Engine:
         self._ticks = Ticks()
         self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
         self.clients = Clients({}, detector.spec.client_timeout.ns)
+        self.stopwatch: Callable[[], int] = int
+        """Gives nanoseconds of any clock; the shell sets one that runs. What it says is counted and decides nothing."""
         self._floor: int | None = None
         """Windows do not reach back further than the last gap; nanoseconds."""
         self._inflow = Inflow(self.buffer, self.clients, self.counters)
@@ -84,6 +88,8 @@ class Engine:
         if isinstance(self._timeline, DataTimeline):
             self._timeline.max_behind = _longest(detector)
             self._timeline.latched = _latched(detector)
+            self._timeline.alone_after = detector.spec.client_timeout.ns
+            self._timeline.maximum_bytes = detector.spec.buffer.bytes.bytes
         times = (detector.spec.clock, detector.spec.lateness, detector.spec.max_ahead)
         if times != (before.clock, before.lateness, before.max_ahead):
             self._run(self._timeline.rest())
@@ -182,6 +188,12 @@ class Engine:
         """The time axis; with clock Data it counts what it dropped."""
         return self._timeline
 
+    def latency(self, sample: Sample, stream: str) -> float | None:
+        """Seconds from the sample's stamp to its receipt; None where it carries no stamp. Counts nothing."""
+        values = self._messages.values(stream, sample, _SAMPLE)
+        latency = None if values is None else values["sample"].get("latency")
+        return latency if isinstance(latency, float) else None
+
     @property
     def rules(self) -> Mapping[str, RuleRun]:
         """The rules that are evaluated, by name."""
@@ -226,7 +238,9 @@ class Engine:
                     self._stale_after,
                     run.counters,
                 )
+                begin = self.stopwatch()
                 events += run.tick(time, views, self.clients)
+                run.counters.timed(time, self.stopwatch() - begin)
         self._messages.forget()
         self._transforms.forget()
         return events

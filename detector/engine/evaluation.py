@@ -72,6 +72,16 @@ class RuleRun:
         self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}
         yield from sorted(events, key=lambda event: event.subject)
 
+    @property
+    def open_episodes(self) -> int:
+        """How many episodes are open."""
+        return len(self._open)
+
+    @property
+    def pending(self) -> int:
+        """Subjects whose condition holds, but not yet as long as `for`."""
+        return sum(state.onset is not None for state in self._states.values())
+
     def gap(self, time: int) -> None:
         """Time went on (or back) without ticks: open episodes hold, what was pending is forgotten."""
         for state in self._states.values():

@@ -165,8 +165,8 @@ class DataTimeline:
         self._ticks = ticks
         self._lateness = lateness
         self._max_ahead = max_ahead
-        self._alone_after = alone_after
-        self._maximum_bytes = maximum_bytes
+        self.alone_after = alone_after
+        self.maximum_bytes = maximum_bytes
         self._stamp_of = stamp_of
         self._client_of = client_of
         self._newest: int | None = None
@@ -266,7 +266,7 @@ class DataTimeline:
         return Gap(self.now, backwards)
 
     def _wait(self, arrival: Arrival, stamp: int) -> None:
-        if self._waiting_bytes >= self._maximum_bytes:
+        if self._waiting_bytes >= self.maximum_bytes:
             self.dropped_full += 1
             return
         self._number += 1
@@ -300,7 +300,7 @@ class DataTimeline:
         if row is not None and -self._max_ahead <= stamp - row.last <= self._reach(arrival, row.received):
             row.several = row.several or client != row.client
             row.last, row.received = stamp, arrival.received
-            if row.several or not self._several_clients or abs(stamp - row.first) >= self._alone_after:
+            if row.several or not self._several_clients or abs(stamp - row.first) >= self.alone_after:
                 self._row = None
                 return True
         else:

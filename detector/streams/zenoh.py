@@ -19,6 +19,7 @@ from typing import NoReturn
 import zenoh
 
 from detector.engine.liveliness import LIVELINESS
+from detector.streams.answering import Answering
 from detector.streams.liveliness import TokenWatch
 from detector.streams.session import Connections, NetworkError, await_session, open_session
 from wayside.api.detector import Stream
@@ -53,8 +54,11 @@ class Network:
         *,
         capacity: int = 4096,
         on_failure: Callable[[BaseException], None] = lambda error: None,
+        answering: Callable[[zenoh.Session], Answering] | None = None,
     ) -> None:
         """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
+
+        `answering` answers queries once there is a session.
 
         `on_failure` is told if a thread dies of an error. Raises KeyPatternError.
         """
@@ -74,6 +78,8 @@ class Network:
         self._session: zenoh.Session | None = None
         self._connections: Connections | None = None
         self._receivers: list[threading.Thread] = []
+        self._make_answering = answering
+        self._answering: Answering | None = None
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
         self.dropped_events = 0
         """Events that found the queue full, or that Zenoh refused."""
@@ -92,6 +98,11 @@ class Network:
                 return
             self._events.append((key, payload))
             self._changed.notify()
+
+    @property
+    def joined(self) -> bool:
+        """Whether there is a session: samples come in as soon as somebody is connected."""
+        return self._session is not None
 
     @property
     def connected(self) -> bool:
@@ -116,6 +127,8 @@ class Network:
             receiver.join(timeout)
         if self._tokens is not None:
             self._tokens.close(timeout)
+        if self._answering is not None:
+            self._answering.join(timeout)
         if (left := len(self._events)) > 0:
             self.dropped_events += left
             log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
@@ -130,6 +143,8 @@ class Network:
         if self._liveliness is not None:
             self._tokens = TokenWatch(session, self._connections, self._liveliness, self._put_token)
         self._session = session
+        if self._make_answering is not None:
+            self._answering = self._make_answering(session)
 
     def _receive(self, subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]], put: Put) -> None:
         """Hands over what comes on a stream, until the session is closed."""

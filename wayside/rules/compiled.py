@@ -120,6 +120,12 @@ class CompiledRule:
     elements: tuple[CompiledElement, ...] = (CompiledElement(),)
     parameters: Parameters = NO_PARAMETERS
 
+    @property
+    def streams(self) -> frozenset[str]:
+        """The streams that it looks at."""
+        position = {self.subject.position.stream} if isinstance(self.subject, PairSubject) else set()
+        return frozenset({*position, *(signal.stream for signal in self.signals)})
+
 
 @dataclass(frozen=True, slots=True)
 class CompiledStream:

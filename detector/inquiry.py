@@ -1,0 +1,76 @@
+"""The commands that ask a running detector: `detector status`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from detector.rules.files import load_rules
+from detector.status.model import read_status
+from detector.status.table import status_view
+from detector.streams.asking import Asked, ask
+from wayside.api.zenoh import Zenoh, ZenohMode
+from wayside.commandline import refuse
+
+DetectorFile = Annotated[
+    Path | None, typer.Option("--detector", help="The running detector's YAML file: says its name and network.")
+]
+Name = Annotated[str | None, typer.Option(help="The holder to ask; default: the file's Detector, else every one.")]
+Connect = Annotated[
+    list[str] | None, typer.Option(help="Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: those of the file.")
+]
+Timeout = Annotated[float, typer.Option(help="Seconds to wait for answers.", min=0.1)]
+
+_WIDTH = 160
+"""Columns of a table that goes into a pipe or a file."""
+
+
+def status(
+    detector: DetectorFile = None,
+    name: Name = None,
+    connect: Connect = None,
+    rule: Annotated[str | None, typer.Option(help="Tell only about this rule.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each detector.")] = False,
+    timeout: Timeout = 3.0,
+) -> None:
+    """Say what running detectors take in, evaluate and lose."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_WIDTH)
+    for answer in inquire("status", {} if rule is None else {"rule": rule}, detector, name, connect, timeout):
+        if as_json:
+            typer.echo(json.dumps(json.loads(answer.payload)))
+        else:
+            console.print(status_view(read_status(answer.payload)), highlight=False, markup=False)
+
+
+def inquire(
+    what: str,
+    given: dict[str, str],
+    detector: Path | None,
+    name: str | None,
+    connect: list[str] | None,
+    timeout: float,
+) -> list[Asked]:
+    """Ask the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
+    config, holder = Zenoh(mode=ZenohMode.PEER), "*"
+    if detector is not None:
+        given_detector = load_rules(detector, ()).rule_set.detector
+        holder, config = given_detector.name, _reaching(given_detector.spec.zenoh)
+    if connect:
+        config = config.model_copy(update={"connect": connect, "scouting": False, "mode": ZenohMode.CLIENT})
+    if not config.connect and not config.scouting:
+        refuse("give --connect ENDPOINT, or --detector FILE whose spec.zenoh says where the detector is")
+    return ask(config, name or holder, what, given, timeout)
+
+
+def _reaching(zenoh: Zenoh) -> Zenoh:
+    """The detector's own way into the network; one that others connect to is reached where it listens."""
+    if zenoh.listen:
+        here = [endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for endpoint in zenoh.listen]
+        return zenoh.model_copy(update={"connect": here, "listen": [], "mode": ZenohMode.CLIENT})
+    return zenoh

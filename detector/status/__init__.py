@@ -1,0 +1,1 @@
+"""What a running detector says of itself: its status, the same as metrics, and the requests that it answers."""

@@ -1,0 +1,232 @@
+"""Keeps the status of a running detector: taken by the evaluation thread, at most once a second, read by any other.
+
+So whoever asks neither waits for the evaluation nor holds it up, and the engine's counters are only ever read by the
+thread that writes them. What costs something per sample is looked at in samples: latencies are those of the newest
+message of at most a few clients, once a second.
+"""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib.metadata import version
+from itertools import islice
+
+from detector.assembly import Refusal
+from detector.engine.buffer import NEVER, Lane
+from detector.engine.engine import Engine
+from detector.engine.evaluation import RuleRun
+from detector.engine.sample import Arrival
+from detector.losses import Losses
+from detector.status.model import ClientStatus, Drops, Histogram, RuleState, RuleStatus, Status, StreamStatus
+
+BOUNDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""Of the latencies' histograms, in seconds."""
+
+_EVERY = 1_000_000_000
+"""Nanoseconds between two statuses, and between two looks at a latency."""
+
+_LOOKED_AT = 16
+"""Of so many clients the newest sample's latency is looked at, for each stream or rule."""
+
+_RATES_OVER = 10
+"""Rates are over so many statuses."""
+
+_CLIENTS = 200
+
+
+class _Latencies:
+    """A histogram in the making."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * (len(BOUNDS) + 1)
+        self._sum = 0.0
+
+    def add(self, seconds: float) -> None:
+        self._counts[bisect_left(BOUNDS, seconds)] += 1
+        self._sum += seconds
+
+    def histogram(self) -> Histogram:
+        return Histogram(BOUNDS, tuple(self._counts), self._sum)
+
+
+class StatusKeeper:
+    """The newest status, and what is needed to take the next one. All but `latest` is for the evaluation thread."""
+
+    def __init__(self, engine: Engine, losses: Losses, now: Callable[[], int]) -> None:
+        """`now` gives nanoseconds since the epoch."""
+        self._engine = engine
+        self._losses = losses
+        self._now = now
+        self._started = now()
+        self._beat = time.monotonic()
+        self._taken = 0
+        self._refusals: dict[str, Refusal] = {}
+        self._last: dict[str, Arrival] = {}
+        """With clock Data, the last arrival of each stream: the buffer knows only stamps."""
+        self._looked: dict[str, int] = {}
+        """When a rule's latency was last looked at."""
+        self._counts: deque[tuple[int, dict[str, int]]] = deque(maxlen=_RATES_OVER + 1)
+        self._stream_latencies: dict[str, _Latencies] = {}
+        self._rule_latencies: dict[str, _Latencies] = {}
+        self._version = version("wayside")
+        self.gaps = 0
+        self.latest: Status = self._take(self._started)
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the evaluation last did what was due; for any thread."""
+        return time.monotonic() - self._beat
+
+    def arrived(self, arrivals: Sequence[Arrival]) -> None:
+        """The engine takes these in now."""
+        if not self._engine.on_wall_clock:
+            self._last.update((arrival.stream, arrival) for arrival in arrivals)
+
+    def refused(self, refusals: Iterable[Refusal]) -> None:
+        """These rules, of those that are wanted now, are not evaluated as they are written."""
+        self._refusals = {refusal.rule.name: refusal for refusal in refusals}
+        self._taken = 0
+
+    def looked(self) -> None:
+        """The evaluation has done what was due."""
+        self._beat = time.monotonic()
+        now = self._now()
+        if self._engine.on_wall_clock:
+            for name, run in self._engine.rules.items():
+                if run.counters.last_tick + _EVERY > now >= self._looked.get(name, 0) + _EVERY:
+                    self._looked[name] = now
+                    self._look_at_rule(run, now)
+        if not self._taken <= now < self._taken + _EVERY:
+            self.latest = self._take(now)
+
+    def _take(self, now: int) -> Status:
+        self._taken = now
+        engine = self._engine
+        spec, buffer, counters = engine.detector.spec, engine.buffer, engine.counters
+        lanes: dict[str, list[Lane]] = {stream.name: [] for stream in spec.streams}
+        for lane in buffer:
+            lanes[lane.stream].append(lane)
+        for name, of_stream in lanes.items():
+            self._look_at_stream(name, of_stream)
+        self._counts.append((now, {name: counters.samples[name] for name in lanes}))
+        self._forget(lanes)
+        metadata = engine.detector.metadata
+        return Status(
+            detector=engine.identity.detector,
+            holder=engine.identity.holder,
+            namespace=engine.identity.namespace,
+            version=self._version,
+            generation=getattr(metadata, "generation", None) or 0,
+            clock=spec.clock.value,
+            started=self._started / 1e9,
+            taken=now / 1e9,
+            now=engine.now / 1e9,
+            gaps=self.gaps,
+            buffered_bytes=buffer.bytes,
+            maximum_bytes=buffer.maximum_bytes,
+            client_count=len(engine.clients),
+            clients=[*self._clients()],
+            streams=[self._stream(name, of_stream) for name, of_stream in lanes.items()],
+            rules=[*self._rules()],
+            drops=[
+                Drops(loss.cause, loss.what, loss.count, loss.stream, loss.rule, loss.last)
+                for loss in self._losses.all()
+            ],
+        )
+
+    def _stream(self, name: str, lanes: Sequence[Lane]) -> StreamStatus:
+        (first, before), (last, counts) = self._counts[0], self._counts[-1]
+        newest = max((lane.latest for lane in lanes), default=NEVER)
+        latencies = self._stream_latencies.setdefault(name, _Latencies())
+        return StreamStatus(
+            name=name,
+            samples=counts[name],
+            rate=(counts[name] - before.get(name, 0)) * 1e9 / (last - first) if last > first else 0.0,
+            clients=sum(bool(lane.samples) for lane in lanes),
+            age=None if newest == NEVER else max(0.0, (self._axis() - newest) / 1e9),
+            buffered_samples=sum(len(lane.samples) for lane in lanes),
+            buffered_bytes=sum(lane.bytes for lane in lanes),
+            latency=latencies.histogram(),
+        )
+
+    def _axis(self) -> int:
+        """The time that ages are told by: with clock Wall now, also where ticks are rare."""
+        return self._now() if self._engine.on_wall_clock else self._engine.now
+
+    def _clients(self) -> Iterator[ClientStatus]:
+        now, clients = self._axis(), self._engine.clients
+        for name in islice(clients, _CLIENTS):
+            yield ClientStatus(name, max(0.0, (now - clients.last(name)) / 1e9))
+
+    def _rules(self) -> Iterator[RuleStatus]:
+        runs = self._engine.rules
+        for name in sorted({*runs, *self._refusals}):
+            run, refusal = runs.get(name), self._refusals.get(name)
+            if refusal is not None:
+                state, message = RuleState.REFUSED, str(refusal)
+            else:
+                state, message = _state(runs[name])
+            if run is None:
+                yield RuleStatus(name, state, message)
+                continue
+            counters, latencies = run.counters, self._rule_latencies.get(name)
+            yield RuleStatus(
+                name,
+                state,
+                message,
+                evaluations=counters.evaluations,
+                ticks=counters.ticks,
+                time=counters.time_ns / 1e9,
+                unknowns=counters.unknowns,
+                absences=dict(counters.absences),
+                errors=counters.errors,
+                last_error=counters.last_error,
+                started=counters.started,
+                ended=counters.ended,
+                open=run.open_episodes,
+                pending=run.pending,
+                latency=None if latencies is None else latencies.histogram(),
+            )
+
+    def _look_at_stream(self, name: str, lanes: Sequence[Lane]) -> None:
+        """Note the latencies from stamp to receipt of what came since the last look."""
+        latencies = self._stream_latencies.setdefault(name, _Latencies())
+        if not self._engine.on_wall_clock:
+            arrival = self._last.pop(name, None)
+            samples: Iterable[Arrival] = () if arrival is None else (arrival,)
+        else:
+            since = self._counts[-1][0] if self._counts else NEVER
+            newest = (lane.newest for lane in lanes if lane.latest > since)
+            samples = islice((sample for sample in newest if isinstance(sample, Arrival)), _LOOKED_AT)
+        for sample in samples:
+            latency = self._engine.latency(sample, name)
+            if latency is not None:
+                latencies.add(latency)
+
+    def _look_at_rule(self, run: RuleRun, now: int) -> None:
+        """Note how long ago the data was received of which the rule has just been evaluated."""
+        latencies = self._rule_latencies.setdefault(run.rule.name, _Latencies())
+        streams, tick = run.rule.streams, run.counters.last_tick
+        lanes = (lane for lane in self._engine.buffer if lane.stream in streams)
+        for lane in islice(lanes, _LOOKED_AT):
+            sample = next(lane.newest_first(None, tick), None)
+            if sample is not None:
+                latencies.add((now - sample.received) / 1e9)
+
+    def _forget(self, streams: Iterable[str]) -> None:
+        """What is kept of streams and rules that are gone."""
+        for of_streams in (self._stream_latencies, self._last):
+            for name in of_streams.keys() - {*streams}:
+                of_streams.pop(name)
+        for of_rules in (self._rule_latencies, self._looked):
+            for name in of_rules.keys() - self._engine.rules.keys():
+                of_rules.pop(name)
+
+
+def _state(run: RuleRun) -> tuple[RuleState, str]:
+    if not run.rule.enabled:
+        return RuleState.DISABLED, "enabled is false"
+    return RuleState.ACCEPTED, "dryRun: events are published, no action runs" if run.rule.dry_run else ""

@@ -1,0 +1,104 @@
+"""A status as tables for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+from detector.status.model import Histogram, RuleStatus, Status
+
+_CLIENTS = 20
+
+
+def status_view(status: Status) -> RenderableType:
+    """Everything that a status says, in a few tables."""
+    return Group(*_parts(status))
+
+
+def _parts(status: Status) -> Iterator[RenderableType]:
+    generation = f", generation {status.generation}" if status.generation else ""
+    yield (
+        f"detector {status.holder} (wayside {status.version}{generation}), clock {status.clock}, "
+        f"up {status.taken - status.started:.0f} s, {'connected' if status.connected else 'not connected'}"
+    )
+    yield (
+        f"buffer {_size(status.buffered_bytes)} of {_size(status.maximum_bytes)}, {status.client_count} clients, "
+        f"{status.gaps} gaps; evaluated up to {_ago(status.taken - status.now)}"
+    )
+    streams = _table("stream", "samples", "per s", "clients", "newest", "buffered", "size", "latency")
+    for stream in status.streams:
+        streams.add_row(
+            stream.name,
+            str(stream.samples),
+            f"{stream.rate:.1f}",
+            str(stream.clients),
+            "none" if stream.age is None else _ago(stream.age),
+            str(stream.buffered_samples),
+            _size(stream.buffered_bytes),
+            _median(stream.latency),
+        )
+    yield streams
+    rules = _table("rule", "state", "evaluations", "time", "latency", "unknowns", "errors", "open", "started", "ended")
+    for rule in status.rules:
+        rules.add_row(
+            rule.name,
+            rule.state.value,
+            str(rule.evaluations),
+            f"{rule.time:.3f} s",
+            _median(rule.latency),
+            str(rule.unknowns),
+            str(rule.errors),
+            str(rule.open),
+            str(rule.started),
+            str(rule.ended),
+        )
+    yield rules
+    for rule in status.rules:
+        yield from _remarks(rule)
+    if any(drops.count for drops in status.drops):
+        lost = _table("lost", "count", "the last")
+        for drops in status.drops:
+            if drops.count:
+                lost.add_row(drops.what, str(drops.count), drops.last)
+        yield lost
+    if status.clients:
+        shown = ", ".join(f"{client.name} ({_ago(client.age)})" for client in status.clients[:_CLIENTS])
+        more = status.client_count - _CLIENTS
+        yield f"clients: {shown}" + (f" and {more} more" if more > 0 else "")
+
+
+def _remarks(rule: RuleStatus) -> Iterator[str]:
+    if rule.message:
+        yield f"{rule.name}: {rule.message}"
+    if rule.last_error:
+        yield f"{rule.name}: the last error: {rule.last_error}"
+    for what, count in sorted(rule.absences.items(), key=lambda item: -item[1])[:3]:
+        yield f"{rule.name}: {count} times {what}"
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        table.add_column(column, no_wrap=column != "the last", overflow="fold")
+    return table
+
+
+def _median(histogram: Histogram | None) -> str:
+    bound = None if histogram is None else histogram.quantile(0.5)
+    if bound is None:
+        return "-"
+    return f"> {histogram.bounds[-1]:g} s" if math.isinf(bound) and histogram else f"≤ {bound * 1000:g} ms"
+
+
+def _ago(seconds: float) -> str:
+    return f"{seconds:.1f} s ago" if seconds < 120 else f"{seconds / 60:.0f} min ago"
+
+
+def _size(count: int) -> str:
+    for unit, step in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
+        if count >= step:
+            return f"{count / step:.1f} {unit}"
+    return f"{count} B"

@@ -1,0 +1,72 @@
+"""Answers Zenoh queries about a detector: one queryable for its keys, on a thread of its own.
+
+    wayside/detectors/<holder>/<what>?name=value;…
+
+An answer is JSON. What cannot be answered is an error reply whose text says why.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+
+import zenoh
+
+_log = logging.getLogger(__name__)
+
+Answer = Callable[[str, Mapping[str, str]], bytes]
+"""Takes what is asked for and its parameters, gives JSON. Raises ValueError where it cannot."""
+
+JSON = "application/json"
+
+_CHANNEL = 64
+"""So many queries wait; Zenoh holds further ones back, and those who ask give up in their own time."""
+
+
+def status_key(holder: str, what: str) -> str:
+    """The key on which a detector answers; `*` for any."""
+    return f"wayside/detectors/{holder}/{what}"
+
+
+class Answering:
+    """Answers the queries of one session until that is closed."""
+
+    def __init__(self, session: zenoh.Session, holder: str, answer: Answer) -> None:
+        """Raises zenoh.ZError where the queryable cannot be declared."""
+        self._holder = holder
+        self._answer = answer
+        self._queryable = session.declare_queryable(
+            status_key(holder, "*"), zenoh.handlers.FifoChannel(_CHANNEL), complete=True
+        )
+        self._thread = threading.Thread(target=self._run, name="answering", daemon=True)
+        self._thread.start()
+
+    def join(self, timeout: float) -> None:
+        """The session is closed: wait for the thread, at most so many seconds."""
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        while True:
+            try:
+                query = self._queryable.handler.recv()
+            except zenoh.ZError:
+                return
+            try:
+                self._reply(query)
+            except Exception as error:  # noqa: BLE001  one bad question must not silence the detector
+                _log.warning("a query of %s was not answered: %s", query.key_expr, error)
+            finally:
+                query.drop()  # type: ignore[no-untyped-call]  # ends the query, whatever was replied
+
+    def _reply(self, query: zenoh.Query) -> None:
+        given = (part.partition("=") for part in str(query.parameters).split(";") if part)
+        parameters = {name: value for name, _, value in given}
+        asked = str(query.key_expr).rsplit("/", 1)[-1]
+        what = "status" if asked.startswith("*") else asked
+        try:
+            payload = self._answer(what, parameters)
+        except ValueError as error:
+            query.reply_err(str(error), encoding="text/plain")
+            return
+        query.reply(status_key(self._holder, what), payload, encoding=JSON)

@@ -1,0 +1,175 @@
+"""A running detector says what it takes in, evaluates and loses; the numbers are those of what was sent."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from detector.assembly import Refusal
+from detector.engine.intake import Intake
+from detector.evaluator import Evaluator
+from detector.inquiry import inquire
+from detector.losses import Losses
+from detector.status.keeping import StatusKeeper
+from detector.status.model import RuleState, Status, read_status, to_json
+from detector.status.table import status_view
+from detector.streams.answering import Answering
+from detector.streams.asking import NoAnswerError, ask
+from detector.streams.zenoh import Network
+from tests.unit.driving import Drive, a_detector, a_rule, a_stream, arrival, at
+from wayside.api.zenoh import Zenoh, ZenohMode
+from wayside.rules import RuleProblem
+
+SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
+FAST = a_rule("fast", signals=[SPEED], when="v > 10")
+
+
+class Kept:
+    """An engine, its status, and the wall clock."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive = drive
+        self.time = 0.0
+        self.keeper = StatusKeeper(drive.engine, Losses(drive.engine), lambda: at(self.time))
+
+    def take(self, *arrivals: object, until: float) -> Status:
+        self.keeper.arrived(arrivals)  # type: ignore[arg-type]
+        self.drive.take(*arrivals, until=until)  # type: ignore[arg-type]
+        self.time = until
+        self.keeper.looked()
+        return self.keeper.latest
+
+
+def test_streams_are_told_with_rate_age_buffer_and_latency() -> None:
+    stamped = a_stream("speed", stamp="msg.t")
+    kept = Kept(Drive(a_detector(a_stream("pose"), stamped), FAST))
+    for second in range(10):
+        sent = arrival(second + 0.5, "car", {"v": 1, "t": at(second + 0.5) / 1e9 - 0.03})
+        status = kept.take(sent, until=second + 1)
+    pose, speed = status.streams
+    assert (pose.name, pose.samples, pose.rate, pose.age, pose.clients) == ("pose", 0, 0.0, None, 0)
+    assert (speed.samples, speed.rate, speed.age, speed.clients) == (10, 1.0, 0.5, 1)
+    lane = kept.drive.engine.buffer.lane("car", "speed")
+    assert lane is not None
+    assert (speed.buffered_samples, speed.buffered_bytes) == (len(lane.samples), lane.bytes)
+    assert status.buffered_bytes == lane.bytes
+    assert speed.latency.count == 10
+    assert speed.latency.quantile(0.5) == 0.05
+    assert [(client.name, client.age) for client in status.clients] == [("car", 0.5)]
+
+
+def test_rules_are_told_with_what_was_unknown_failed_and_is_open() -> None:
+    kept = Kept(Drive(a_detector(), FAST))
+    status = kept.take(arrival(0.5, "car", {"v": 20}), arrival(0.6, "bus", {}), until=1)
+    (rule,) = status.rules
+    assert (rule.state, rule.evaluations, rule.ticks, rule.started, rule.open) == (RuleState.ACCEPTED, 2, 1, 1, 1)
+    assert rule.unknowns > 0
+    assert rule.latency is not None
+    assert rule.latency.count == 2  # of two clients, half a second old
+    assert rule.latency.sum == pytest.approx(0.5 + 0.4)
+
+
+def test_with_clock_data_latencies_are_from_the_stamp_to_the_receipt() -> None:
+    kept = Kept(Drive(a_detector(a_stream("speed", stamp="msg.t"), clock="Data"), FAST))
+    kept.take(arrival(100.0, "car", {"v": 1, "t": 1_767_225_600.0}), until=100)
+    status = kept.take(arrival(101.25, "car", {"v": 1, "t": 1_767_225_601.0}), until=102)
+    assert status.streams[0].latency.sum == pytest.approx(100 + 100.25)
+
+
+def test_a_rule_that_is_refused_or_disabled_says_so() -> None:
+    kept = Kept(Drive(a_detector(), a_rule("off", when="true", enabled=False)))
+    kept.keeper.refused([Refusal(a_rule("bad", when="1"), (RuleProblem(("spec", "when"), "no boolean"),), kept=False)])
+    status = kept.take(until=1)
+    assert [(rule.name, rule.state) for rule in status.rules] == [
+        ("bad", RuleState.REFUSED),
+        ("off", RuleState.DISABLED),
+    ]
+    assert status.rules[0].message == "EventRule bad is refused: spec.when: no boolean"
+
+
+def test_drops_are_told_by_cause() -> None:
+    kept = Kept(Drive(a_detector(), a_rule("r", signals=[SPEED], when="v > 1")))
+    status = kept.take(arrival(0.5, "car", b"{"), arrival(0.6, "c%", {}), until=1)
+    drops = {(drop.cause, drop.stream): drop.count for drop in status.drops if drop.count}
+    assert drops == {("undecodable", "speed"): 1, ("unnamed", "speed"): 1}
+
+
+def test_a_status_is_taken_at_most_once_a_second_and_survives_its_journey() -> None:
+    kept = Kept(Drive(a_detector(), FAST))
+    first = kept.take(arrival(0.5, "car", {"v": 20}), until=1)
+    assert kept.take(until=1.9) is first
+    second = kept.take(until=2)
+    assert second.taken == first.taken + 1
+    assert read_status(to_json(second)) == second
+    assert status_view(second) is not None
+
+
+class _Nowhere:
+    def events(self, events: object) -> None: ...
+
+    def demands(self, demands: object, ended: object) -> None: ...
+
+
+def test_what_is_asked_of_the_evaluation_is_done_on_its_thread_and_errors_are_the_askers() -> None:
+    failures: list[BaseException] = []
+    drive = Drive(a_detector())
+    evaluator = Evaluator(
+        drive.engine, Intake(lambda: at(0)), _Nowhere(), now=lambda: at(0), on_failure=failures.append
+    )
+    early = evaluator.call(lambda: drive.engine.now)
+    evaluator._thread.start()
+    assert early.result(5) == drive.engine.now
+    with pytest.raises(ZeroDivisionError):
+        evaluator.call(lambda: 1 // 0).result(5)
+    assert evaluator.call(lambda: "goes on").result(5) == "goes on"
+    evaluator.stop()
+    assert evaluator.call(lambda: "too late").cancelled()
+    assert failures == []
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def an_answer(what: str, given: object) -> bytes:
+    if what == "status":
+        return f'{{"given": "{given}"}}'.encode()
+    raise ValueError(f"does not answer {what!r}")
+
+
+@pytest.fixture
+def answering(endpoint: str) -> Iterator[None]:
+    network = Network(
+        Zenoh(listen=[endpoint]), [], lambda stream: print, answering=lambda session: Answering(session, "d", an_answer)
+    )
+    network.start()
+    yield
+    network.close()
+
+
+@pytest.mark.usefixtures("answering")
+def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoint: str) -> None:
+    config = Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])
+    for holder in ("d", "*"):
+        (answer,) = ask(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 5)
+        assert answer.key == "wayside/detectors/d/status"
+        assert b"'rule': 'r', 'subject': 'a+b~c'" in answer.payload
+    with pytest.raises(NoAnswerError, match="does not answer 'nonsense'"):
+        ask(config, "d", "nonsense", {}, 5)
+    with pytest.raises(NoAnswerError, match=r"no detector other answers at tcp/.* within 0.5 s: is it running"):
+        ask(config, "other", "status", {}, 0.5)
+
+
+@pytest.mark.usefixtures("answering")
+def test_the_detectors_file_tells_where_it_listens(endpoint: str, tmp_path: Path) -> None:
+    file = tmp_path / "detector.yaml"
+    file.write_text(a_detector(zenoh={"listen": [endpoint]}).model_dump_json(by_alias=True, exclude_none=True))
+    (answer,) = inquire("status", {}, file, None, None, 5)
+    assert answer.key == "wayside/detectors/d/status"
