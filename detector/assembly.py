@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from detector.engine.engine import Engine, KeyReader
 from detector.engine.liveliness import LIVELINESS
 from detector.engine.sample import Decoder
+from detector.models.binding import bind_models
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
 from detector.streams.codecs.fields import message_fields
 from wayside.api import Detector, EventRule
@@ -109,7 +110,7 @@ class RuleBook:
         good: dict[str, EventRule] = {}
         for rule in rules:
             try:
-                compiled.append(compile_rule(rule, detector, fields))
+                compiled.append(bind_models(compile_rule(rule, detector, fields)))
                 good[rule.name] = rule
             except RuleError as error:
                 before = self._good.get(rule.name)
@@ -125,7 +126,7 @@ class RuleBook:
 def _compiled(rule: EventRule, detector: Detector, fields: Mapping[str, Fields]) -> CompiledRule | None:
     """The rule, or None where the Detector no longer allows it."""
     try:
-        return compile_rule(rule, detector, fields)
+        return bind_models(compile_rule(rule, detector, fields))
     except RuleError:
         return None
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, Inlets, inlets
+from detector.models.binding import bind_models
 from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
@@ -48,7 +49,7 @@ def _rule_problems(document: Document, detectors: Sequence[tuple[Document, Detec
         yield document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
     for of_detector, detector, entries in selecting:
         try:
-            compile_rule(rule, detector, entries.fields)
+            bind_models(compile_rule(rule, detector, entries.fields))
         except RuleError as error:
             for each in error.problems:
                 yield (document if each.detector is None else of_detector).problem(each.path, each.message)

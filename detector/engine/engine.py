@@ -190,7 +190,7 @@ class Engine:
 
     def latency(self, sample: Sample, stream: str) -> float | None:
         """Seconds from the sample's stamp to its receipt; None where it carries no stamp. Counts nothing."""
-        values = self._messages.values(stream, sample, _SAMPLE)
+        values = self._messages.values(stream, sample, _SAMPLE, {})
         latency = None if values is None else values["sample"].get("latency")
         return latency if isinstance(latency, float) else None
 

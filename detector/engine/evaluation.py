@@ -209,6 +209,7 @@ class RuleRun:
             reason=reason,
             values=values,
             classification=self.rule.classification,
+            models={model.name: model.runner.sha256 for model in self.rule.models if model.runner is not None},
             element=episode.subject.element,
         )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from detector.engine.demands import plain
@@ -31,6 +31,8 @@ class Event:
     reason: Reason | None
     values: Mapping[str, JsonValue]
     classification: Mapping[str, JsonValue] | None
+    models: Mapping[str, str] = field(default_factory=dict)
+    """The sha256 of the models that the rule's signals are computed by, by signal."""
     element: str | None = None
     """The element of `each` that the rule was evaluated for."""
 
@@ -59,6 +61,8 @@ class Event:
             data["endTime"] = format_time(self.end_time)
             data["reason"] = self.reason.value
         data["values"] = plain(self.values)
+        if self.models:
+            data["models"] = dict(self.models)
         if self.classification is not None:
             data["classification"] = dict(self.classification)
         return {

@@ -10,6 +10,7 @@ from detector.engine.buffer import Buffer
 from detector.engine.clients import Clients, fresh_streams
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes import Truth, both
+from detector.engine.models import add_models
 from detector.engine.nearness import Search, near_pairs
 from detector.engine.positions import Place, Positions, described, distance, point
 from detector.engine.signals import Signals
@@ -61,19 +62,28 @@ class Views:
 
     def of(self, client: str) -> dict[str, Any]:
         """client, labels, streams and the known signals."""
-        view = self._views.get(client)
-        if view is None:
-            view = {
-                "client": client,
-                "labels": self._clients.labels(client),
-                "streams": fresh_streams(client, self._stale_after, self._buffer, self._now),
-                "parameters": self._rule.parameters.of(client),
-            }
-            for signal in self._rule.signals:
-                value = self._signals.value(self._rule.name, signal, client, self._now, self._counters)
-                if value is not UNKNOWN:
-                    view[signal.name] = value
-            self._views[client] = view
+        if client not in self._views:
+            self.prepare((client,))
+        return self._views[client]
+
+    def prepare(self, clients: Iterable[str]) -> None:
+        """Look at these clients together: models are run once for all of them."""
+        new = {client: self._looked_at(client) for client in clients if client not in self._views}
+        self._views.update(new)
+        if self._rule.models and new:
+            add_models(self._rule, new, self._now, self._signals, self._counters)
+
+    def _looked_at(self, client: str) -> dict[str, Any]:
+        view: dict[str, Any] = {
+            "client": client,
+            "labels": self._clients.labels(client),
+            "streams": fresh_streams(client, self._stale_after, self._buffer, self._now),
+            "parameters": self._rule.parameters.of(client),
+        }
+        for signal in self._rule.signals:
+            value = self._signals.value(self._rule.name, signal, client, self._now, self._counters)
+            if value is not UNKNOWN:
+                view[signal.name] = value
         return view
 
     def place(self, subject: PairSubject, client: str) -> Place | None:
@@ -101,6 +111,8 @@ class Views:
 
 def candidates(rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Subject]) -> Iterator[Candidate]:
     """The subjects to look at: all that may start an episode, and those that have one or are about to."""
+    if not isinstance(rule.subject, PairSubject):
+        views.prepare(clients)
     match rule.subject:
         case ClientSubject() as each:
             for element in rule.elements:
@@ -144,7 +156,9 @@ def _pairs(
         found = near_pairs(Search(points, between, *roles), subject.within, subject.maximum)
         views.left_out(found.left_out)
         near = {Subject(pair, element.name) for pair in found.pairs}
-        for each in sorted(near | {one for one in in_progress if one.element == element.name}):
+        looked_at = sorted(near | {one for one in in_progress if one.element == element.name})
+        views.prepare(dict.fromkeys(client for each in looked_at for client in each.clients))
+        for each in looked_at:
             a, b = each.clients
             variables: dict[str, Any] = {
                 "a": _member(views, subject, a, places),

@@ -63,6 +63,24 @@ class Signals:
         value = _aggregated(signal, window, counters)
         return self._no_value(counters) if value is UNKNOWN else value
 
+    def window(
+        self, rule: str, signal: CompiledSignal, client: str, now: int, counters: RuleCounters, *, at_most: int | None
+    ) -> list[tuple[int, Value | Unknown]]:
+        """Times and values of the signal's samples, newest first; none where the stream is stale."""
+        lane = self._buffer.lane(client, signal.stream)
+        if lane is None or not self._is_fresh(client, signal.stream, now):
+            return []
+        window = self._window(rule, signal, lane, client, now, counters, at_most=at_most)
+        return [(sample.time, value) for sample, value in window]
+
+    def newest_payload(self, stream: str, client: str, now: int) -> bytes | None:
+        """The bytes of the newest sample; None where there is none, or the stream is stale."""
+        lane = self._buffer.lane(client, stream)
+        if lane is None or not self._is_fresh(client, stream, now):
+            return None
+        sample = next(lane.newest_first(None, now), None)
+        return None if sample is None else sample.payload
+
     def _is_fresh(self, client: str, stream: str, now: int) -> bool:
         return is_fresh(client, stream, self._stale_after[stream], self._buffer, now)
 

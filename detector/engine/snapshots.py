@@ -38,7 +38,8 @@ def _member(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
-    return {signal.name: _without_bytes(view[signal.name]) for signal in rule.signals if signal.name in view}
+    names = [*(signal.name for signal in rule.signals), *(model.name for model in rule.models)]
+    return {name: _without_bytes(view[name]) for name in names if name in view}
 
 
 def _without_bytes(value: Any) -> Any:

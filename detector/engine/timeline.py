@@ -243,7 +243,7 @@ class DataTimeline:
     def _token(self, arrival: Arrival) -> Iterator[Step]:
         """What happens to a token carries no stamp: it comes after all samples with the newest stamp so far."""
         newest = self.now if self._newest is None else self._newest
-        if newest <= self.now or self._waiting_bytes >= self._maximum_bytes:
+        if newest <= self.now or self._waiting_bytes >= self.maximum_bytes:
             yield Insert((arrival,), (self.now,))
         else:
             self._wait(arrival, newest)

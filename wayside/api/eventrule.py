@@ -23,6 +23,7 @@ from wayside.api.base import (
 )
 from wayside.api.classification import Classification
 from wayside.api.constants import Constants
+from wayside.api.model import ModelSource
 from wayside.api.scopes import ClientScope, Each, Scope
 
 
@@ -83,13 +84,21 @@ class Signal(Model):
             "all aggregates but Last, First, Previous and Age need a window: give over, e.g. over: 5s",
         ),
         (
-            "(self.aggregate in ['Count', 'Age']) != has(self.value)",
+            "has(self.model) || (self.aggregate in ['Count', 'Age']) != has(self.value)",
             "give value, e.g. value: msg.speed; but none for the aggregates Count and Age, which look at no value",
+        ),
+        ("has(self.stream) != has(self.model)", "give exactly one of stream and model"),
+        (
+            "!has(self.model) || !(has(self.where) || has(self.over) || has(self.value))",
+            "a model's signal has no value, where or over: remove them",
         ),
     )
 
     name: Identifier = Field(description="The variable by which expressions use the signal.")
-    stream: ObjectName = Field(description="The stream of the Detector that it is computed from.")
+    stream: ObjectName | None = Field(default=None, description="The stream of the Detector that it is computed from.")
+    model: ModelSource | None = Field(
+        default=None, description="Instead of a stream, an ONNX model over other signals, an image or a point cloud."
+    )
     value: Expression | None = Field(
         default=None,
         description="CEL over msg (the decoded sample), key (the captured chunks) and sample (stamp, received, "
@@ -112,6 +121,12 @@ class Signal(Model):
 
     @model_validator(mode="after")
     def _complete(self) -> Signal:
+        if (self.stream is None) == (self.model is None):
+            raise ValueError("give exactly one of stream and model")
+        if self.model is not None:
+            if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
+                raise ValueError("a model's signal has no value, where, over or aggregate: remove them")
+            return self
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
         if self.aggregate not in WITHOUT_VALUE and self.value is None:

@@ -119,8 +119,8 @@ class ModelPoints(Model):
     count: int = Field(
         ge=1,
         le=1_000_000,
-        description="Of more points, every so many-th is taken; fewer are filled up with zeros. Points with a NaN are "
-        "left out.",
+        description="Of more points, every so many-th is taken; fewer are filled up with zeros. Points with a NaN in a "
+        "field or in x, y, z are left out.",
     )
     scale: list[float] = Field(
         default_factory=list,
@@ -182,7 +182,7 @@ class ModelSource(Model):
         description="The .onnx file, e.g. on a volume: /models/risk.onnx. Its sha256 is in the events.",
     )
     sha256: str | None = Field(
-        default=None, pattern=r"^[0-9a-f]{64}$", description="Refuse the file if it is another one."
+        default=None, pattern=r"^[0-9a-f]{64}$", max_length=64, description="Refuse the file if it is another one."
     )
     inputs: list[ModelInput] = Field(
         min_length=1,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from wayside.api.eventrule import Aggregate
+from wayside.api.model import ModelImage, ModelPoints, ModelSource
 from wayside.expressions import CompiledTemplate, Expression
 from wayside.rules.parameters import NO_PARAMETERS, Parameters
 
@@ -98,6 +99,39 @@ class CompiledDeploy:
     parameters: CompiledTemplate = field(compare=False)
 
 
+class ModelRunner(Protocol):
+    """A model that is ready to run. Deterministic: the same inputs give the same outputs."""
+
+    @property
+    def sha256(self) -> str:
+        """Of the model's file."""
+
+    def tensor(self, name: str, payload: bytes) -> Any:
+        """What the bytes of a camera's or lidar's message are as that input; raises the engine's DecodeError."""
+
+    def run(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
+        """The signal's value for each row of inputs by name. Raises ValueError where the model fails."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledModel:
+    """A signal that a model computes."""
+
+    name: str
+    index: int
+    """Its place among the rule's signals."""
+    source: ModelSource
+    windows: Mapping[tuple[str, str], CompiledSignal] = field(compare=False)
+    """By the name of the input and of the signal: where its samples are found."""
+    runner: ModelRunner | None = field(default=None, compare=False)
+    """None until the model's file is bound to the rule."""
+
+    @property
+    def sensors(self) -> tuple[ModelImage | ModelPoints, ...]:
+        """The cameras and lidars that it looks at."""
+        return tuple(source for each in self.source.inputs if (source := each.image or each.points) is not None)
+
+
 @dataclass(frozen=True, slots=True)
 class CompiledRule:
     """A rule, ready to be evaluated."""
@@ -119,12 +153,15 @@ class CompiledRule:
     """Of the fields that decide which episodes there are: open episodes end when it changes."""
     elements: tuple[CompiledElement, ...] = (CompiledElement(),)
     parameters: Parameters = NO_PARAMETERS
+    models: tuple[CompiledModel, ...] = ()
+    """The signals that models compute."""
 
     @property
     def streams(self) -> frozenset[str]:
         """The streams that it looks at."""
         position = {self.subject.position.stream} if isinstance(self.subject, PairSubject) else set()
-        return frozenset({*position, *(signal.stream for signal in self.signals)})
+        seen = (source.stream for model in self.models for source in model.sensors)
+        return frozenset({*position, *seen, *(signal.stream for signal in self.signals)})
 
 
 @dataclass(frozen=True, slots=True)

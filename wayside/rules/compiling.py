@@ -34,6 +34,7 @@ from wayside.rules.compiled import (
     PairSubject,
 )
 from wayside.rules.fields import Fields, unknown_fields
+from wayside.rules.models import compile_models
 from wayside.rules.parameters import override_problems, parameters_of
 from wayside.rules.scopes import closing_speed_problem, compile_elements, compile_subject, known_members
 from wayside.rules.variables import (
@@ -133,6 +134,7 @@ class _RuleCompiler:
         subject = compile_subject(self)
         elements = compile_elements(self, self.spec.each)
         signals = [self._signal(index, signal) for index, signal in enumerate(self.spec.signals)]
+        models = compile_models(self, [signal for signal in signals if signal is not None])
         environment = condition_environment(self.spec)
         when = self.condition(("spec", "when"), self.spec.when, environment)
         until = self.condition(("spec", "until"), self.spec.until, environment)
@@ -162,6 +164,7 @@ class _RuleCompiler:
             digest=_digest(self.rule, self.detector),
             elements=elements,
             parameters=self.parameters,
+            models=models,
         )
 
     def _signal(self, index: int, signal: Signal) -> CompiledSignal | None:
@@ -170,6 +173,9 @@ class _RuleCompiler:
             self.problem((*at, "name"), f"{signal.name} is a name that every scope gives itself: choose another")
         elif is_taken(signal.name):
             self.problem((*at, "name"), f"{signal.name} is a word of CEL itself: choose another name")
+        if signal.model is not None:
+            return None
+        assert signal.stream is not None  # noqa: S101  the model holds exactly one source
         stream = self.stream((*at, "stream"), signal.stream)
         value = self.sample((*at, "value"), signal.value, stream, Kind.DYN)
         where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL)

@@ -61,7 +61,7 @@ def gray(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
-    """The points of a sensor_msgs/msg/PointCloud2 as (points, fields), without those that have a NaN.
+    """The points of a sensor_msgs/msg/PointCloud2 as (points, fields), without those that have a NaN there or no place.
 
     Raises:
         DecodeError: no such message, a field that it does not have, or fewer bytes than it says.
@@ -76,7 +76,8 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
     )
     order = ">" if message.is_bigendian else "<"
     columns = []
-    for name in fields:
+    read = dict.fromkeys([*fields, *(name for name in "xyz" if name in described)])
+    for name in read:
         field = described[name]
         if field.datatype not in _POINT_TYPES:
             raise DecodeError(f"field {name} of the points has datatype {field.datatype}: 1 to 8 are known")
@@ -87,11 +88,11 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
     last = (height - 1) * row + (width - 1) * step
     if any(last + offset + kind.itemsize > len(message.data) for kind, offset in columns) or step == 0:
         raise DecodeError(f"{width} x {height} points of {step} bytes in rows of {row}: {len(message.data)} bytes")
-    found = np.empty((height * width, len(fields)))
+    found = np.empty((height * width, len(read)))
     for index, (kind, offset) in enumerate(columns):
         at = np.ndarray((height, width), kind, message.data, offset, (row, step))
         found[:, index] = at.reshape(-1)
-    return found[~np.isnan(found).any(axis=1)]
+    return found[~np.isnan(found).any(axis=1)][:, : len(fields)]
 
 
 def _message(payload: bytes, kind: str) -> Any:

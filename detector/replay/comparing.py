@@ -1,0 +1,144 @@
+"""Two rules compared over the same recording: which episodes both have, which only one, and how far apart they are.
+
+For each subject, two episodes are the same where they overlap in time. Each is matched with at most one: in order of
+their starts, an episode of the first rule takes the one of the second that it shares most time with. An episode that is
+still open ends with the recording.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from detector.engine.events import Event
+from wayside.times import format_time
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Span:
+    """An episode's time for one subject; nanoseconds since the epoch."""
+
+    start: int
+    end: int
+    subject: str
+    open: bool = False
+    """It had not ended when the recording did."""
+
+    def shared(self, other: Span) -> int:
+        """How long both last, in nanoseconds; negative where they are apart."""
+        return min(self.end, other.end) - max(self.start, other.start)
+
+    def to_json(self) -> dict[str, Any]:
+        """Subject, start and end as text."""
+        times = {"startTime": format_time(self.start), "endTime": None if self.open else format_time(self.end)}
+        return {"subject": self.subject, **times}
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What two rules found."""
+
+    first: str
+    second: str
+    both: tuple[tuple[Span, Span], ...]
+    only_first: tuple[Span, ...]
+    only_second: tuple[Span, ...]
+
+    @property
+    def start_differences(self) -> list[float]:
+        """Second minus first, in seconds: positive where the second rule was later."""
+        return [(second.start - first.start) / 1e9 for first, second in self.both]
+
+    @property
+    def end_differences(self) -> list[float]:
+        """The same of the ends, of those that both ended."""
+        return [(second.end - first.end) / 1e9 for first, second in self.both if not (first.open or second.open)]
+
+    @property
+    def agreement(self) -> float | None:
+        """The time in which both had an episode of a subject, over that in which either had; None without any."""
+        shared = sum(first.shared(second) for first, second in self.both)
+        spans = [*self.only_first, *self.only_second, *(span for pair in self.both for span in pair)]
+        either = sum(span.end - span.start for span in spans) - shared
+        return shared / either if either else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, for `comparison.json`."""
+        return {
+            "rules": [self.first, self.second],
+            "both": [
+                {
+                    "subject": first.subject,
+                    "first": first.to_json(),
+                    "second": second.to_json(),
+                    "startDifference": (second.start - first.start) / 1e9,
+                    "endDifference": None if first.open or second.open else (second.end - first.end) / 1e9,
+                }
+                for first, second in self.both
+            ],
+            "onlyFirst": [span.to_json() for span in self.only_first],
+            "onlySecond": [span.to_json() for span in self.only_second],
+            "agreement": self.agreement,
+        }
+
+    def lines(self) -> Iterator[str]:
+        """The same in a few lines for people."""
+        yield (
+            f"{self.first} and {self.second}: {len(self.both)} episodes in both, "
+            f"{len(self.only_first)} only in {self.first}, {len(self.only_second)} only in {self.second}"
+        )
+        for what, differences in (("start", self.start_differences), ("end", self.end_differences)):
+            if differences:
+                yield (
+                    f"{self.second} {what}s {_signed(statistics.median(differences))} s after {self.first} (median; "
+                    f"{_signed(min(differences))} to {_signed(max(differences))} s)"
+                )
+        if self.agreement is not None:
+            yield f"both have an episode in {self.agreement:.1%} of the time in which either has"
+        for rule, spans in ((self.first, self.only_first), (self.second, self.only_second)):
+            for span in spans[:_SHOWN]:
+                yield f"only {rule}: {span.subject} from {format_time(span.start)}"
+
+
+_SHOWN = 10
+
+
+def compare(events: Iterable[Event], first: str, second: str, end: int) -> Comparison:
+    """Compare the episodes of two rules; the recording ends at `end`, in nanoseconds since the epoch."""
+    of_rule: dict[str, list[Span]] = {first: [], second: []}
+    open_spans: dict[str, tuple[str, Event]] = {}
+    for event in events:
+        if event.rule not in of_rule:
+            continue
+        if event.end_time is None:
+            open_spans[event.episode] = (event.rule, event)
+        else:
+            open_spans.pop(event.episode, None)
+            of_rule[event.rule].append(Span(event.start_time, event.end_time, event.subject))
+    for rule, event in open_spans.values():
+        of_rule[rule].append(Span(event.start_time, max(end, event.start_time), event.subject, open=True))
+    return _matched(first, second, sorted(of_rule[first]), sorted(of_rule[second]))
+
+
+def _matched(first: str, second: str, spans: Sequence[Span], others: Sequence[Span]) -> Comparison:
+    left: dict[str, list[Span]] = {}
+    for other in others:
+        left.setdefault(other.subject, []).append(other)
+    both: list[tuple[Span, Span]] = []
+    only: list[Span] = []
+    for span in spans:
+        candidates = [other for other in left.get(span.subject, ()) if span.shared(other) >= 0]
+        if not candidates:
+            only.append(span)
+            continue
+        best = max(candidates, key=span.shared)
+        left[span.subject].remove(best)
+        both.append((span, best))
+    rest = sorted(other for of_subject in left.values() for other in of_subject)
+    return Comparison(first, second, tuple(both), tuple(only), tuple(rest))
+
+
+def _signed(seconds: float) -> str:
+    return f"{seconds:+.3f}"
