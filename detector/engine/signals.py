@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final, cast
 
 from detector.engine.aggregates import Timed, calculated, distinct, is_number
@@ -59,7 +59,7 @@ class Signals:
         always_known = signal.aggregate in _ALWAYS_KNOWN
         if lane is None or not (always_known or self._is_fresh(client, signal.stream, now)):
             return _ALWAYS_KNOWN[signal.aggregate] if always_known else self._no_value(counters)
-        window = self._window(rule, signal, lane, client, now, counters, at_most=_NEWEST.get(signal.aggregate))
+        window = self._window(rule, signal, lane, client, now, counters, at_most=_ENOUGH.get(signal.aggregate))
         value = _aggregated(signal, window, counters)
         return self._no_value(counters) if value is UNKNOWN else value
 
@@ -113,13 +113,17 @@ class Signals:
     ) -> list[tuple[Sample, Value | Unknown]]:
         """The samples in the window with their values, newest first, without those that `where` leaves out.
 
+        For First the oldest comes first.
         `at_most` so many of them are looked for.
         """
         key = (rule, signal.name, client)
         known = self._extracted.get(key, {})
         looked_at: dict[Sample, Value | Unknown | None] = {}
         values: list[tuple[Sample, Value | Unknown]] = []
-        for sample in self._in_window(signal, lane, now):
+        samples: Iterable[Sample] = self._in_window(signal, lane, now)
+        if signal.aggregate is Aggregate.FIRST:
+            samples = reversed(list(samples))  # so that only the oldest is decoded, not all that came since
+        for sample in samples:
             # By the sample itself: its value follows from what it holds, so two that are equal have the same.
             value = known[sample] if sample in known else self._extract(signal, lane, sample, counters)
             looked_at[sample] = value
@@ -154,8 +158,8 @@ class Signals:
         return expression.evaluate_or_unknown(values, counters.note)
 
 
-_NEWEST: Final = {Aggregate.LAST: 1, Aggregate.PREVIOUS: 2}
-"""How many samples from the newest on an aggregate looks at, where not at all."""
+_ENOUGH: Final = {Aggregate.LAST: 1, Aggregate.PREVIOUS: 2, Aggregate.FIRST: 1}
+"""How many samples an aggregate looks at, where not at all."""
 
 _ALWAYS_KNOWN: Final[Mapping[Aggregate, Value]] = {Aggregate.COUNT: 0.0, Aggregate.ANY: False}
 """The aggregates that a client without samples, or with a stale stream, has as well: what they are of nothing."""
@@ -170,7 +174,7 @@ def _aggregated(
         case Aggregate.COUNT:
             return float(len(window))
         case Aggregate.LAST | Aggregate.FIRST:
-            return window[0 if aggregate is Aggregate.LAST else -1][1] if window else UNKNOWN
+            return window[0][1] if window else UNKNOWN
         case Aggregate.PREVIOUS:
             return window[1][1] if len(window) > 1 else UNKNOWN
     known = [(sample.time, value) for sample, value in reversed(window) if not isinstance(value, Unknown)]

@@ -339,3 +339,31 @@ def test_a_signal_of_bytes_travels_as_null() -> None:
     drive = Drive(a_detector(), rule)
     drive.take(arrival(0.5, "car", {"v": "secret"}), until=1)
     assert json.loads(drive.events[0].to_json())["data"]["values"] == {"raw": [None, "x"]}
+
+
+def test_values_of_the_wrong_kind_are_left_out_and_counted_as_errors_with_what_was_wanted() -> None:
+    rule = a_rule(
+        signals=[
+            {"name": "top", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "5s"},
+            {"name": "all", "stream": "speed", "value": "msg.v", "aggregate": "All", "over": "5s"},
+        ],
+        when="top == 3 && all",
+    )
+    drive = Drive(a_detector(), rule)
+    values = [3, "9", True, [1], None]
+    arrivals = [arrival(0.1 * i + 0.1, "car", {"v": value}) for i, value in enumerate(values)]
+    assert drive.take(*arrivals, until=1) == ["r car started 1"]
+    counters = drive.engine.counters.rules["r"]
+    assert counters.errors == 3 + 3  # of Max: a text, a boolean, a list; of All: a number, a text, a list
+    assert counters.last_error == "signal all: All needs booleans, is [1.0]"
+
+
+def test_first_decodes_only_the_sample_that_it_is() -> None:
+    rule = a_rule(
+        signals=[{"name": "first", "stream": "speed", "value": "msg.v", "aggregate": "First", "over": "9s"}],
+        when="first == 1",
+    )
+    drive = Drive(a_detector(), rule)
+    broken = [arrival(0.2 + 0.1 * i, "car", b"{") for i in range(5)]
+    assert drive.take(arrival(0.1, "car", {"v": 1}), *broken, until=1) == ["r car started 1"]
+    assert drive.engine.counters.undecodable["speed"] == 0

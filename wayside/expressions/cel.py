@@ -22,7 +22,7 @@ from cel_expr_python import cel
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
-from wayside.expressions.handles import holding, value_of
+from wayside.expressions.handles import begin, end, value_of
 from wayside.expressions.numbers import MAX_EXACT, doubled
 from wayside.expressions.projection import Leaf, missing_path, normalise, project, tree
 from wayside.expressions.syntax import Node, Path, arguments, nothing_but_arguments, parse, paths
@@ -179,8 +179,11 @@ class Expression:
         return value
 
     def _run(self, values: Mapping[str, object], *, known: bool) -> Value:
-        with holding():
+        before = begin()
+        try:
             return self._run_holding(values, known=known)
+        finally:
+            end(before)
 
     def _run_holding(self, values: Mapping[str, object], *, known: bool) -> Value:
         try:

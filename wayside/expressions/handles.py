@@ -8,8 +8,6 @@ functions of `functions` turn back into the value. Handles are good for the eval
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Final
 
 _FIRST: Final = 2**63 + 2**62
@@ -25,14 +23,18 @@ class _Held(threading.local):
 _held = _Held()
 
 
-@contextmanager
-def holding() -> Iterator[None]:
-    """For the time of one evaluation: `hand` hands out handles, `value_of` takes them."""
+def begin() -> list[object] | None:
+    """An evaluation begins: `hand` hands out handles, `value_of` takes them. Returns what `end` is to be given.
+
+    Two functions and no context manager: this is the path of every evaluation.
+    """
     before, _held.values = _held.values, []
-    try:
-        yield
-    finally:
-        _held.values = before
+    return before
+
+
+def end(before: list[object] | None) -> None:
+    """The evaluation has ended; one that it lay within goes on."""
+    _held.values = before
 
 
 def hand(value: object) -> int | None:
