@@ -17,6 +17,7 @@ from wayside.api import Detector, EventRule
 from wayside.api.base import Kind, Metadata
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
+from wayside.rules import depends
 
 RuleKey = tuple[KindKey, Name]
 """An EventRule or a Detector."""
@@ -74,7 +75,8 @@ class RuleWork:
             if not isinstance(judged, EventRule):
                 return old, unreadable_status(old, "RuleInvalid", entry.problem, generation, now)
             detectors = self.world.models(DETECTOR, Detector, namespace)
-            return old, rule_status(judged, detectors, now, self.world.invalid(DETECTOR, namespace))
+            others = self.world.models(EVENT_RULE, EventRule, namespace) if depends(judged) else []
+            return old, rule_status(judged, detectors, now, self.world.invalid(DETECTOR, namespace), others)
         old, judged = DetectorStatus.model_validate(written), entry.model
         if not isinstance(judged, Detector):
             return old, unreadable_status(old, "DetectorInvalid", entry.problem, generation, now)

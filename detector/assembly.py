@@ -14,7 +14,16 @@ from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
 from detector.streams.codecs.fields import message_fields
 from wayside.api import Detector, EventRule
 from wayside.keys import KeyPattern
-from wayside.rules import CompiledRule, Fields, RuleError, RuleProblem, compile_rule, source_problems, stream_problems
+from wayside.rules import (
+    CompiledRule,
+    Fields,
+    RuleError,
+    RuleProblem,
+    compile_rule,
+    dependency_problems,
+    source_problems,
+    stream_problems,
+)
 
 _CLIENT_NAME = re.compile(r"[A-Za-z0-9._:-]{1,63}")
 
@@ -108,9 +117,10 @@ class RuleBook:
         compiled: list[CompiledRule] = []
         refused: list[Refusal] = []
         good: dict[str, EventRule] = {}
+        wrong = dependency_problems(rules)
         for rule in rules:
             try:
-                compiled.append(bind_models(compile_rule(rule, detector, fields)))
+                compiled.append(bind_models(compile_rule(rule, detector, fields, wrong.get(rule.name, ()))))
                 good[rule.name] = rule
             except RuleError as error:
                 before = self._good.get(rule.name)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from detector.assembly import DetectorError, Inlets, inlets
 from detector.models.binding import bind_models
 from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
-from wayside.rules import RuleError, compile_rule, unknown_rules
+from wayside.rules import RuleError, RuleProblem, compile_rule, dependency_problems, unknown_rules
 
 _CHECKED = (Detector, EventRule)
 
@@ -32,15 +32,29 @@ def check_documents(documents: Sequence[Document]) -> list[Problem]:
         problems.append(
             rules[0].problem((), "a rule is checked against its Detector: give the Detector's file as well")
         )
+    wrong = {
+        detector.name: dependency_problems(
+            [rule for rule in _objects(rules) if detector.spec.rules.matches(rule.metadata.labels)]
+        )
+        for _, detector, _ in detectors
+    }
     for document in rules:
-        problems += _rule_problems(document, detectors)
+        problems += _rule_problems(document, detectors, wrong)
     names = [document.object.name for document in rules]
     for of_detector, detector, _ in detectors if rules else ():
         problems += [of_detector.problem(path, text) for path, text in unknown_rules(detector, names)]
     return list(dict.fromkeys(problems))
 
 
-def _rule_problems(document: Document, detectors: Sequence[tuple[Document, Detector, Inlets]]) -> Iterator[Problem]:
+def _objects(documents: Iterable[Document]) -> Iterator[EventRule]:
+    return (document.object for document in documents if isinstance(document.object, EventRule))
+
+
+def _rule_problems(
+    document: Document,
+    detectors: Sequence[tuple[Document, Detector, Inlets]],
+    wrong: Mapping[str, Mapping[str, Sequence[RuleProblem]]],
+) -> Iterator[Problem]:
     rule = document.object
     assert isinstance(rule, EventRule)  # noqa: S101  the caller picked it
     selecting = [each for each in detectors if each[1].spec.rules.matches(rule.metadata.labels)]
@@ -49,7 +63,7 @@ def _rule_problems(document: Document, detectors: Sequence[tuple[Document, Detec
         yield document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
     for of_detector, detector, entries in selecting:
         try:
-            bind_models(compile_rule(rule, detector, entries.fields))
+            bind_models(compile_rule(rule, detector, entries.fields, wrong[detector.name].get(rule.name, ())))
         except RuleError as error:
             for each in error.problems:
                 yield (document if each.detector is None else of_detector).problem(each.path, each.message)

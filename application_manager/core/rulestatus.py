@@ -14,7 +14,7 @@ from application_manager.core.conditions import Aspect, updated
 from wayside.api import Detector, EventRule
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
-from wayside.rules import RuleError, compile_rule, source_problems, stream_problems
+from wayside.rules import RuleError, compile_rule, dependency_problems, source_problems, stream_problems
 
 Status = TypeVar("Status", EventRuleStatus, DetectorStatus)
 
@@ -22,7 +22,11 @@ _AS_FAR_AS = "as far as can be told without the message types; what they show to
 
 
 def rule_status(
-    rule: EventRule, detectors: Sequence[Detector], now: float, invalid: Sequence[str] = ()
+    rule: EventRule,
+    detectors: Sequence[Detector],
+    now: float,
+    invalid: Sequence[str] = (),
+    others: Sequence[EventRule] = (),
 ) -> EventRuleStatus:
     """The rule's status.
 
@@ -31,6 +35,7 @@ def rule_status(
         detectors: those of its namespace that are valid.
         now: seconds since 1970.
         invalid: the names of its namespace's other detectors.
+        others: the rules of its namespace, which its signals may name.
     """
     selecting = sorted((each for each in detectors if selects(each, rule)), key=lambda each: each.name)
     old = rule.status or EventRuleStatus()
@@ -38,7 +43,9 @@ def rule_status(
     return EventRuleStatus(
         observed_generation=generation,
         detectors=[each.name for each in selecting],
-        conditions=list(updated(old.conditions, (_rule_aspect(rule, selecting, detectors, invalid),), generation, now)),
+        conditions=list(
+            updated(old.conditions, (_rule_aspect(rule, selecting, detectors, invalid, others),), generation, now)
+        ),
     )
 
 
@@ -82,7 +89,11 @@ def selects(detector: Detector, rule: EventRule) -> bool:
 
 
 def _rule_aspect(
-    rule: EventRule, selecting: Sequence[Detector], detectors: Sequence[Detector], invalid: Sequence[str]
+    rule: EventRule,
+    selecting: Sequence[Detector],
+    detectors: Sequence[Detector],
+    invalid: Sequence[str],
+    others: Sequence[EventRule],
 ) -> Aspect:
     if not selecting:
         wanted = [f"{each.name} selects {_labels(each)}" for each in sorted(detectors, key=lambda each: each.name)]
@@ -94,7 +105,8 @@ def _rule_aspect(
     problems: dict[str, list[str]] = {}  # problem → detectors that have it
     for detector in selecting:
         try:
-            compile_rule(rule, detector)
+            beside = [each for each in others if each.name != rule.name and selects(detector, each)]
+            compile_rule(rule, detector, None, dependency_problems([rule, *beside]).get(rule.name, ()))
         except RuleError as error:
             for problem in error.problems:
                 problems.setdefault(str(problem), []).append(detector.name)

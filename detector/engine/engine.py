@@ -23,12 +23,13 @@ from detector.engine.queries import BufferQueries
 from detector.engine.sample import Arrival, Decoder, Sample
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
+from detector.engine.starts import Starts
 from detector.engine.subjects import subject_of
 from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Ticks, Timeline, WallTimeline
 from detector.engine.transforms import Transforms, TransformStream
 from wayside.api import Detector
 from wayside.api.detector import Clock, Stream
-from wayside.rules import CompiledRule, compile_stream
+from wayside.rules import CompiledRule, compile_stream, in_order
 
 __all__ = ["Engine", "KeyReader"]
 
@@ -57,6 +58,7 @@ class Engine:
         self._runs: dict[str, RuleRun] = {}
         self._rules_version = 0
         self._ticks = Ticks()
+        self._starts = Starts()
         self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
         self.clients = Clients({}, detector.spec.client_timeout.ns)
         self.stopwatch: Callable[[], int] = int
@@ -108,7 +110,7 @@ class Engine:
         self._messages = Messages(decoders, compiled, read_key, self.counters)
         self._transforms = Transforms(_transform_streams(detector), self.buffer, self._messages, self.counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
-        self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after, self._floor)
+        self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after, self._starts, self._floor)
         self._positions = Positions(self.buffer, self._messages, self._stale_after, self._floor)
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
@@ -130,6 +132,7 @@ class Engine:
             rule = new.get(name)
             if rule is None or not same_semantics(run, rule):
                 events += run.end_all(now, Reason.RULE_CHANGED)
+                self._starts.forget(name)
             else:
                 run.change_actions(rule)
                 runs[name] = run
@@ -137,7 +140,10 @@ class Engine:
         for name, rule in new.items():
             if name not in runs:
                 runs[name] = RuleRun(rule, self.identity, self.counters.rule(name))
-        self._runs = dict(sorted(runs.items()))
+        self._runs = {rule.name: runs[rule.name] for rule in in_order([run.rule for run in runs.values()])}
+        for name in sorted(self._starts.configure(rules, self.detector.spec.buffer.duration.ns)):
+            for event in runs[name].open_starts() if name in runs else ():
+                self._starts.started(event)
         self._signals.forget(lambda rule, client: rule in kept)
         self._ticks.set_periods([rule.every_ns for rule in rules if rule.enabled])
         self._rules_version += 1
@@ -152,7 +158,8 @@ class Engine:
         for (name, _, _), of_one in sorted(episodes.items()):
             run = self._runs.get(name)
             if run is not None and run.can_restore(of_one[0]):
-                run.restore(of_one)
+                for event in run.restore(of_one):
+                    self._starts.started(event)
                 for client in of_one[0].subjects:
                     self.clients.heard(client, now)
             else:
@@ -219,11 +226,13 @@ class Engine:
 
     def _tick(self, time: int) -> list[Event]:
         self.buffer.expire(time)
+        self._starts.buffer.expire(time)
         for client, latest in self.buffer.latest():
             self.clients.still_heard(client, latest)
         lost = self.clients.lose(time)
         if lost:
             self._inflow.lose(set(lost))
+            self._starts.lose(lost)
             self._signals.forget(lambda rule, client: client in self.clients)
         events: list[Event] = []
         for run in self._runs.values():
@@ -239,8 +248,11 @@ class Engine:
                     run.counters,
                 )
                 begin = self.stopwatch()
-                events += run.tick(time, views, self.clients)
+                happened = [*run.tick(time, views, self.clients)]
                 run.counters.timed(time, self.stopwatch() - begin)
+                for event in happened:
+                    self._starts.note(event)
+                events += happened
         self._messages.forget()
         self._transforms.forget()
         return events
@@ -248,6 +260,7 @@ class Engine:
     def _gap(self, time: int, backwards: bool) -> None:
         if backwards:
             self.buffer.step_back(time)
+            self._starts.buffer.step_back(time)
         self._floor = time
         self._signals.gap(time)
         self._positions.gap(time)

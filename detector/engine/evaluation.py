@@ -99,10 +99,11 @@ class RuleRun:
             and subject not in self._open
         )
 
-    def restore(self, demands: list[Demand]) -> None:
+    def restore(self, demands: list[Demand]) -> Iterator[Event]:
         """Take up an episode that was open before a restart, from the demands of its actions.
 
-        Where an action is not what it was, its demand holds until it is rendered anew, at the next evaluation.
+        Yields the event that told of its start then. Where an action is not what it was, its demand holds until it is
+        rendered anew, at the next evaluation.
         """
         first = demands[0]
         subject = subject_of(first.subjects, first.subject)
@@ -120,6 +121,7 @@ class RuleRun:
             {d.action: d for d in demands if d.action in deploys},
             {d.action for d in demands if d.action in deploys and deploys[d.action] != (d.template, d.priority)},
         )
+        yield self._event(self._open[subject], None, None, first.values)
 
     def change_actions(self, rule: CompiledRule) -> None:
         """Go on with a rule that differs in nothing that decides which episodes there are.
@@ -147,6 +149,11 @@ class RuleRun:
         if not self.rule.dry_run:
             for episode in self._open.values():
                 yield from episode.demands.values()
+
+    def open_starts(self) -> Iterator[Event]:
+        """The events that said that the episodes which are open started, in order of the subjects."""
+        for subject in sorted(self._open, key=lambda each: each.text):
+            yield self._event(self._open[subject], None, None, self._open[subject].values)
 
     def _in_progress(self) -> Iterator[Subject]:
         return (subject for subject, state in self._states.items() if state.is_open or state.onset is not None)

@@ -11,8 +11,9 @@ from detector.engine.clients import Clients, is_fresh
 from detector.engine.counters import RuleCounters
 from detector.engine.messages import Messages
 from detector.engine.sample import Sample
+from detector.engine.starts import Starts
 from wayside.api.eventrule import Aggregate
-from wayside.expressions import UNKNOWN, Expression, Unknown, Value
+from wayside.expressions import UNKNOWN, Expression, Reason, Unknown, Value
 from wayside.rules import CompiledSignal
 
 
@@ -25,13 +26,15 @@ class Signals:
         clients: Clients,
         messages: Messages,
         stale_after: Mapping[str, int | None],
+        starts: Starts,
         floor: int | None = None,
     ) -> None:
-        """`floor`: windows do not reach back to this time or beyond, in nanoseconds."""
+        """`starts` has the samples of signals over rules; windows do not reach back to `floor` (ns) or beyond."""
         self._buffer = buffer
         self._clients = clients
         self._messages = messages
         self._stale_after = stale_after
+        self._starts = starts
         self._extracted: dict[tuple[str, str, str], dict[Sample, Value | Unknown | None]] = {}
         self._picked: dict[tuple[str, str, str], int] = {}
         """When the last sample came that an Age's `where` picks."""
@@ -53,7 +56,15 @@ class Signals:
         self, rule: str, signal: CompiledSignal, client: str, now: int, counters: RuleCounters
     ) -> Value | Unknown:
         """The signal's value at the tick `now`."""
-        lane = self._buffer.lane(client, signal.stream)
+        if signal.rule is None:
+            lane = self._buffer.lane(client, signal.stream)
+        elif not self._starts.is_evaluated(signal.stream):
+            counters.note(Reason.ABSENT, f"signal {signal.name}: rule {signal.rule} is disabled, refused or gone")
+            return UNKNOWN
+        else:
+            lane = self._starts.lane(client, signal.stream)
+        if signal.aggregate is Aggregate.ACTIVE:
+            return self._starts.is_open(client, signal.stream)
         if signal.aggregate is Aggregate.AGE:
             return self._age(rule, signal, lane, client, now, counters)
         always_known = signal.aggregate in _ALWAYS_KNOWN
@@ -82,7 +93,8 @@ class Signals:
         return None if sample is None else sample.payload
 
     def _is_fresh(self, client: str, stream: str, now: int) -> bool:
-        return is_fresh(client, stream, self._stale_after[stream], self._buffer, now)
+        # The starts of a rule's episodes are in no list of streams: they do not go stale.
+        return stream not in self._stale_after or is_fresh(client, stream, self._stale_after[stream], self._buffer, now)
 
     def _no_value(self, counters: RuleCounters) -> Unknown:
         counters.unknowns += 1
@@ -151,7 +163,8 @@ class Signals:
     def _evaluate(
         self, expression: Expression, signal: CompiledSignal, lane: Lane, sample: Sample, counters: RuleCounters
     ) -> Value | Unknown:
-        values = self._messages.values(lane.stream, sample, expression.names, signal.parameters.of(lane.client))
+        source = self._messages if signal.rule is None else self._starts
+        values = source.values(lane.stream, sample, expression.names, signal.parameters.of(lane.client))
         if values is None:
             counters.unknowns += 1
             return UNKNOWN

@@ -45,15 +45,16 @@ class Aggregate(StrEnum):
     ANY = "Any"
     DISTINCT = "Distinct"
     AGE = "Age"
+    ACTIVE = "Active"
 
 
 OF_A_SAMPLE = frozenset({Aggregate.LAST, Aggregate.FIRST, Aggregate.PREVIOUS})
 """The aggregates that are the value of one sample."""
 
-WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE})
+WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE, Aggregate.ACTIVE})
 """The aggregates that look at no value."""
 
-WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE}
+WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE, Aggregate.ACTIVE}
 """The aggregates that need `over`."""
 
 
@@ -76,18 +77,26 @@ class Evaluation(Model):
 
 
 class Signal(Model):
-    """A value computed from the samples of a stream."""
+    """A value computed from the samples of a stream, or from the episodes of another rule."""
 
     model_config = validations(
         (
-            "self.aggregate in ['Last', 'First', 'Previous', 'Age'] || has(self.over)",
-            "all aggregates but Last, First, Previous and Age need a window: give over, e.g. over: 5s",
+            "self.aggregate in ['Last', 'First', 'Previous', 'Age', 'Active'] || has(self.over)",
+            "all aggregates but Last, First, Previous, Age and Active need a window: give over, e.g. over: 5s",
         ),
         (
-            "has(self.model) || (self.aggregate in ['Count', 'Age']) != has(self.value)",
-            "give value, e.g. value: msg.speed; but none for the aggregates Count and Age, which look at no value",
+            "has(self.model) || (self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
+            "give value, e.g. value: msg.speed; but none for the aggregates Count, Age and Active, "
+            "which look at no value",
         ),
-        ("has(self.stream) != has(self.model)", "give exactly one of stream and model"),
+        (
+            "self.aggregate != 'Active' || (has(self.rule) && !has(self.over) && !has(self.where))",
+            "the aggregate Active is for a signal over a rule, and takes neither over nor where",
+        ),
+        (
+            "[has(self.stream), has(self.rule), has(self.model)].filter(given, given).size() == 1",
+            "give exactly one of stream, rule and model",
+        ),
         (
             "!has(self.model) || !(has(self.where) || has(self.over) || has(self.value))",
             "a model's signal has no value, where or over: remove them",
@@ -96,39 +105,47 @@ class Signal(Model):
 
     name: Identifier = Field(description="The variable by which expressions use the signal.")
     stream: ObjectName | None = Field(default=None, description="The stream of the Detector that it is computed from.")
+    rule: ObjectName | None = Field(
+        default=None,
+        description="Instead of a stream, another rule that the Detector selects: the samples are the starts of its "
+        "episodes that the client is a subject of. msg has episode, subject, subjects, onsetTime and startTime "
+        "(seconds since the epoch), and the values of the start.",
+    )
     model: ModelSource | None = Field(
         default=None, description="Instead of a stream, an ONNX model over other signals, an image or a point cloud."
     )
     value: Expression | None = Field(
         default=None,
         description="CEL over msg (the decoded sample), key (the captured chunks) and sample (stamp, received, "
-        "latency, size). Not needed for Count and Age.",
+        "latency, size). Not needed for Count, Age and Active.",
     )
     where: Expression | None = Field(
         default=None, description="CEL over msg, key and sample: only samples for which it is true count."
     )
     over: PositiveDuration | None = Field(
         default=None,
-        description="The window (t - over, t]. Needed by all aggregates but Last, First, Previous and Age.",
+        description="The window (t - over, t]. Needed by all aggregates but Last, First, Previous, Age and Active.",
     )
     aggregate: Aggregate = Field(
         default=Aggregate.LAST,
         description="How the samples become one value. Last, Previous, First: the newest, the one before, the oldest. "
         "Min, Max, Mean, Sum, StdDev (of the population): of numbers. Delta: last - first; Rate: that per second. "
         "All, Any: of booleans. Distinct: the list of different values. Count: how many samples. Age: seconds since "
-        "the last one was received.",
+        "the last one was received. Active, of a rule: whether an episode is open.",
     )
 
     @model_validator(mode="after")
     def _complete(self) -> Signal:
-        if (self.stream is None) == (self.model is None):
-            raise ValueError("give exactly one of stream and model")
+        if sum(source is not None for source in (self.stream, self.rule, self.model)) != 1:
+            raise ValueError("give exactly one of stream, rule and model")
         if self.model is not None:
             if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
                 raise ValueError("a model's signal has no value, where, over or aggregate: remove them")
             return self
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
+        if self.aggregate is Aggregate.ACTIVE and (self.rule is None or self.over or self.where):
+            raise ValueError("aggregate Active is for a signal over a rule, and takes neither over nor where")
         if self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:

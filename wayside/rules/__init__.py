@@ -11,10 +11,13 @@ from wayside.rules.compiled import (
     CompiledStream,
     FleetSubject,
     PairSubject,
+    episode_stream,
 )
-from wayside.rules.compiling import RuleError, RuleProblem, compile_rule, compile_stream, stream_problems
+from wayside.rules.compiling import compile_rule, compile_stream, stream_problems
+from wayside.rules.dependencies import dependency_problems, depends, in_order
 from wayside.rules.fields import Fields
 from wayside.rules.parameters import unknown_rules
+from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.sources import source_problems
 
 __all__ = [
@@ -33,6 +36,10 @@ __all__ = [
     "RuleProblem",
     "compile_rule",
     "compile_stream",
+    "dependency_problems",
+    "depends",
+    "episode_stream",
+    "in_order",
     "source_problems",
     "stream_problems",
     "unknown_rules",

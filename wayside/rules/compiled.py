@@ -18,12 +18,20 @@ class CompiledSignal:
 
     name: str
     stream: str
+    """Of the Detector, or what `episode_stream` gives for `rule`."""
     aggregate: Aggregate
     value: Expression | None
     where: Expression | None
     over_ns: int | None
     parameters: Parameters = NO_PARAMETERS
     """What value and where see as `parameters`, by client."""
+    rule: str | None = None
+    """The rule whose episode starts are the samples; None where they come from a stream."""
+
+
+def episode_stream(rule: str) -> str:
+    """What the episode starts of a rule are called where other samples have a stream; no stream has such a name."""
+    return f"rule/{rule}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,11 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from wayside.api import Detector, EventRule
 from wayside.api.detector import Stream
-from wayside.api.documents import FieldPath, field_text
+from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Signal
 from wayside.expressions import (
     CompiledTemplate,
@@ -32,12 +32,15 @@ from wayside.rules.compiled import (
     CompiledStream,
     CompiledSubject,
     PairSubject,
+    episode_stream,
 )
 from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.models import compile_models
 from wayside.rules.parameters import override_problems, parameters_of
+from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.scopes import closing_speed_problem, compile_elements, compile_subject, known_members
 from wayside.rules.variables import (
+    EPISODE_MEMBERS,
     RESERVED,
     SAMPLE_MEMBERS,
     condition_environment,
@@ -47,38 +50,22 @@ from wayside.rules.variables import (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class RuleProblem:
-    """Why a rule cannot be evaluated: the field, and what to do."""
-
-    path: FieldPath
-    message: str
-    detector: str | None = None
-    """The Detector whose field it is; None: the rule's."""
-
-    def __str__(self) -> str:
-        whose = "" if self.detector is None else f"Detector {self.detector}: "
-        return f"{whose}{field_text(self.path)}: {self.message}"
-
-
-class RuleError(Exception):
-    """A rule that cannot be evaluated; `problems` has all reasons."""
-
-    def __init__(self, problems: Iterable[RuleProblem]) -> None:
-        self.problems = tuple(problems)
-        super().__init__("; ".join(map(str, self.problems)))
-
-
-def compile_rule(rule: EventRule, detector: Detector, fields: Mapping[str, Fields] | None = None) -> CompiledRule:
+def compile_rule(
+    rule: EventRule,
+    detector: Detector,
+    fields: Mapping[str, Fields] | None = None,
+    known: Iterable[RuleProblem] = (),
+) -> CompiledRule:
     """The rule as the engine evaluates it.
 
     `fields` has the message fields of the streams that are known to have no others; what an expression reads beside
-    them is a problem.
+    them is a problem. `known` has problems that were found beside it, among several rules.
 
     Raises:
         RuleError: with every problem of the rule.
     """
     compiler = _RuleCompiler(rule, detector, fields or {})
+    compiler.problems += known
     compiled = compiler.compile()
     if compiler.problems or compiled is None:
         raise RuleError(compiler.problems)
@@ -175,6 +162,8 @@ class _RuleCompiler:
             self.problem((*at, "name"), f"{signal.name} is a word of CEL itself: choose another name")
         if signal.model is not None:
             return None
+        if signal.rule is not None:
+            return self._episode_signal(at, signal, signal.rule)
         assert signal.stream is not None  # noqa: S101  the model holds exactly one source
         stream = self.stream((*at, "stream"), signal.stream)
         value = self.sample((*at, "value"), signal.value, stream, Kind.DYN)
@@ -189,6 +178,20 @@ class _RuleCompiler:
                     f"stream {stream.name}: shorten it, or raise the stream's buffer.duration",
                 )
         return CompiledSignal(signal.name, signal.stream, signal.aggregate, value, where, over, self.parameters)
+
+    def _episode_signal(self, at: FieldPath, signal: Signal, rule: str) -> CompiledSignal:
+        """A signal whose samples are the episode starts of another rule."""
+        value, where = (
+            self.sample((*at, field), source, None, kind)
+            for field, source, kind in (("value", signal.value, Kind.DYN), ("where", signal.where, Kind.BOOL))
+        )
+        for field, expression in (("value", value), ("where", where)):
+            for text in () if expression is None else unknown_fields(expression.paths, "msg", EPISODE_MEMBERS):
+                self.problem((*at, field), f"{text} (msg is an episode's start)")
+        over = None if signal.over is None else signal.over.ns
+        return CompiledSignal(
+            signal.name, episode_stream(rule), signal.aggregate, value, where, over, self.parameters, rule
+        )
 
     def _deploy(self, index: int, action: str, environment: Environment) -> CompiledDeploy | None:
         deploy = self.spec.actions[index].deploy

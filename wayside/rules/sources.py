@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from wayside.api import Detector
 from wayside.api.source import ZENOH
 from wayside.keys import KeyPattern, KeyPatternError
-from wayside.rules.compiling import RuleProblem
+from wayside.rules.problems import RuleProblem
 
 
 def source_problems(detector: Detector) -> Iterator[RuleProblem]:

@@ -6,6 +6,7 @@ from functools import cache, lru_cache
 
 from wayside.api.eventrule import EventRuleSpec
 from wayside.expressions import Environment, ExpressionError, Kind
+from wayside.rules.fields import Fields
 
 RESERVED = frozenset(
     {"client", "labels", "streams", "parameters", "position", "a", "b", "distance", "closingSpeed", "members"}
@@ -14,6 +15,11 @@ RESERVED = frozenset(
 """Names that the scopes and samples give; neither a signal nor the element of `each` may take them."""
 
 MEMBER_OF_CLIENT = ("client", "labels", "streams", "parameters")
+
+EPISODE_MEMBERS: Fields = dict.fromkeys(
+    ("episode", "subject", "subjects", "element", "onsetTime", "startTime", "values")
+)
+"""What msg has in a signal over a rule: an episode's start. Times are seconds since the epoch."""
 
 SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 

@@ -1,0 +1,132 @@
+"""The episodes of rules as other rules see them: each start is a sample, and what is open is known.
+
+A start is kept for each of the episode's clients; that of an episode of the whole fleet, which names none, for
+everybody. Starts live in a buffer of their own, with a cap of its own: they are no data of a client, so they neither
+keep it from timing out nor push its samples out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from detector.engine.buffer import Buffer, Lane
+from detector.engine.demands import plain
+from detector.engine.events import Event
+from detector.engine.sample import Sample, Stamped
+from wayside.rules import CompiledRule, episode_stream
+
+MAXIMUM_BYTES = 64 * 2**20
+"""Of all starts that are kept; beyond, the oldest go and are counted as evicted."""
+
+_EVERYBODY = ""
+"""In place of a client: no client has such a name."""
+
+
+class Starts:
+    """The starts and the open episodes of the rules that signals of other rules name."""
+
+    def __init__(self) -> None:
+        self.buffer = Buffer(MAXIMUM_BYTES)
+        self._durations: dict[str, int] = {}
+        """Of the rules that are named, by what their starts are called: how long starts are kept, in nanoseconds."""
+        self._evaluated: set[str] = set()
+        self._open: dict[str, dict[str, set[str]]] = {}
+        """Episodes that are open, by what starts are called and client."""
+        self._number = 0
+
+    def configure(self, rules: Iterable[CompiledRule], least: int) -> set[str]:
+        """These rules are evaluated from now on; starts are kept as long as any signal looks back, or `least` (ns).
+
+        Returns the rules that are named now and were not before: what is open of them must be told (see `started`).
+        """
+        durations: dict[str, int] = {}
+        names: dict[str, str] = {}
+        for rule in rules:
+            for signal in rule.signals:
+                if signal.rule is not None:
+                    durations[signal.stream] = max(durations.get(signal.stream, least), signal.over_ns or 0)
+                    names[signal.stream] = signal.rule
+        new = {name for stream, name in names.items() if stream not in self._durations}
+        self._durations = durations
+        self._evaluated = {episode_stream(rule.name) for rule in rules if rule.enabled}
+        self.buffer.keep(durations)
+        for lane in self.buffer:
+            lane.duration = durations[lane.stream]
+        self._open = {stream: each for stream, each in self._open.items() if stream in durations}
+        return new
+
+    def forget(self, rule: str) -> None:
+        """The rule means something else now, or is gone: its past starts are not its own."""
+        stream = episode_stream(rule)
+        self.buffer.keep([each for each in self._durations if each != stream])
+        self._open.pop(stream, None)
+
+    def note(self, event: Event) -> None:
+        """An episode started or ended."""
+        if event.started:
+            self.started(event)
+        elif event.end_time is not None:
+            open_episodes = self._open.get(episode_stream(event.rule), {})
+            for client in event.subjects or (_EVERYBODY,):
+                open_episodes.get(client, set()).discard(event.episode)
+                if not open_episodes.get(client):
+                    open_episodes.pop(client, None)
+
+    def started(self, event: Event) -> None:
+        """An episode started, now or, where it was restored, before."""
+        stream = episode_stream(event.rule)
+        if stream not in self._durations:
+            return
+        payload = _payload(event)
+        for client in event.subjects or (_EVERYBODY,):
+            self._open.setdefault(stream, {}).setdefault(client, set()).add(event.episode)
+            lane = self.buffer.lane(client, stream)
+            if lane is None:
+                lane = self.buffer.add(Lane(client, stream, self._durations[stream]))
+            self._number += 1
+            sample = Stamped(event.start_time, self._number, payload, event.start_time, event.key)
+            self.buffer.grew(lane.insert(sample))
+
+    def is_evaluated(self, stream: str) -> bool:
+        """Whether the rule whose starts these are is there and enabled; else nothing can be said of its episodes."""
+        return stream in self._evaluated
+
+    def is_open(self, client: str, stream: str) -> bool:
+        """Whether an episode is open that the client is a subject of."""
+        episodes = self._open.get(stream, {})
+        return bool(episodes.get(client) or episodes.get(_EVERYBODY))
+
+    def lane(self, client: str, stream: str) -> Lane | None:
+        """The starts of the episodes that the client is a subject of."""
+        return self.buffer.lane(client, stream) or self.buffer.lane(_EVERYBODY, stream)
+
+    def lose(self, clients: Iterable[str]) -> None:
+        """These clients are lost; should they return, past starts are not theirs. (What is open ends by an event.)"""
+        for client in clients:
+            self.buffer.forget(client)
+
+    def values(
+        self, stream: str, sample: Sample, names: frozenset[str], parameters: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """What an expression over one start sees."""
+        values: dict[str, Any] = {"key": {}, "parameters": parameters}
+        if "msg" in names:
+            values["msg"] = json.loads(sample.payload, parse_int=float)
+        seconds = sample.received / 10**9
+        values["sample"] = {"received": seconds, "stamp": seconds, "latency": 0.0, "size": float(len(sample.payload))}
+        return values
+
+
+def _payload(event: Event) -> bytes:
+    message: Mapping[str, Any] = {
+        "episode": event.episode,
+        "subject": event.subject,
+        "subjects": list(event.subjects),
+        **({} if event.element is None else {"element": event.element}),
+        "onsetTime": event.onset_time / 10**9,
+        "startTime": event.start_time / 10**9,
+        "values": plain(event.values),
+    }
+    return json.dumps(message, separators=(",", ":"), ensure_ascii=False).encode()

@@ -1,0 +1,82 @@
+"""Rules over rules: which rule a rule's signals name, in which order they are evaluated, and what is wrong with that.
+
+A signal's samples may be the episode starts of another rule. Within a tick a rule is evaluated after those it depends
+on: its depth is 0 where it names none, else one more than the greatest depth of those it names.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from wayside.api import EventRule
+from wayside.rules.compiled import CompiledRule
+from wayside.rules.problems import RuleProblem
+
+
+def in_order(rules: Iterable[CompiledRule]) -> list[CompiledRule]:
+    """The rules as they are evaluated within a tick: by depth, then by name.
+
+    What is named and not there is left out of account, and so is what closes a cycle (only rules that go on as they
+    last were can form one: `dependency_problems` refuses the others).
+    """
+    named = {rule.name: [signal.rule for signal in rule.signals if signal.rule is not None] for rule in rules}
+    depths: dict[str, int] = {}
+
+    def depth(name: str, above: tuple[str, ...]) -> int:
+        if name not in depths:
+            below = [
+                depth(each, (*above, name)) for each in named[name] if each in named and each not in (*above, name)
+            ]
+            depths[name] = 1 + max(below, default=-1)
+        return depths[name]
+
+    return sorted(rules, key=lambda rule: (depth(rule.name, ()), rule.name))
+
+
+def dependency_problems(rules: Sequence[EventRule]) -> dict[str, list[RuleProblem]]:
+    """By the names of the rules: signals that name a rule that is not among them, and cycles."""
+    problems: dict[str, list[RuleProblem]] = {}
+    named = {rule.name: dict(_named(rule)) for rule in rules}
+    for name, signals in named.items():
+        for index, other in signals.items():
+            if other not in named:
+                message = _unknown(other, [each for each in named if each != name])
+            elif cycle := _way(other, name, named):
+                message = (
+                    f"rules cannot depend on each other in a circle: {' → '.join((name, *cycle))}; "
+                    "remove one of these signals"
+                )
+            else:
+                continue
+            problems.setdefault(name, []).append(RuleProblem(("spec", "signals", index, "rule"), message))
+    return problems
+
+
+def depends(rule: EventRule) -> bool:
+    """Whether a signal of the rule names another rule."""
+    return any(True for _ in _named(rule))
+
+
+def _named(rule: EventRule) -> Iterator[tuple[int, str]]:
+    return ((index, signal.rule) for index, signal in enumerate(rule.spec.signals) if signal.rule is not None)
+
+
+def _unknown(name: str, others: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, others, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"there is {', '.join(sorted(others)) or 'no other rule'}"
+    return f"there is no rule {name} that the same Detector selects; {hint}"
+
+
+def _way(start: str, end: str, named: Mapping[str, Mapping[int, str]]) -> tuple[str, ...]:
+    """The shortest way along dependencies from one rule to another, both included; none: empty."""
+    ways: list[tuple[str, ...]] = [(start,)]
+    seen = {start}
+    for way in ways:
+        if way[-1] == end:
+            return way
+        for other in named.get(way[-1], {}).values():
+            if other not in seen:
+                seen.add(other)
+                ways.append((*way, other))
+    return ()

@@ -1,0 +1,30 @@
+"""What is wrong with a rule, and in which field."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from wayside.api.documents import FieldPath, field_text
+
+
+@dataclass(frozen=True, slots=True)
+class RuleProblem:
+    """Why a rule cannot be evaluated: the field, and what to do."""
+
+    path: FieldPath
+    message: str
+    detector: str | None = None
+    """The Detector whose field it is; None: the rule's."""
+
+    def __str__(self) -> str:
+        whose = "" if self.detector is None else f"Detector {self.detector}: "
+        return f"{whose}{field_text(self.path)}: {self.message}"
+
+
+class RuleError(Exception):
+    """A rule that cannot be evaluated; `problems` has all reasons."""
+
+    def __init__(self, problems: Iterable[RuleProblem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("; ".join(map(str, self.problems)))
