@@ -1,0 +1,67 @@
+"""What a window's values come to, as the documentation has it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from fractions import Fraction
+from typing import Any
+
+NOTHING = object()
+"""Unknown."""
+
+
+def aggregated(name: str, window: list[tuple[int, Any]]) -> Any:
+    """Of (time, value) from the oldest on; a value that is unknown is NOTHING."""
+    values = [value for _, value in window]
+    if name == "Count":
+        return float(len(values))
+    if name in ("Last", "First", "Previous"):
+        place = {"Last": -1, "First": 0, "Previous": -2}[name]
+        return values[place] if len(values) >= (2 if name == "Previous" else 1) else NOTHING
+    known = [(time, value) for time, value in window if value is not NOTHING]
+    if name == "Distinct":
+        different: list[Any] = []
+        for _, value in known:
+            if not any(_same(value, each) for each in different):
+                different.append(value)
+        return different or NOTHING
+    if name in ("All", "Any"):
+        truths = [value for _, value in known if isinstance(value, bool)]
+        return any(truths) if name == "Any" else all(truths) if truths else NOTHING
+    numbers = [(time, value) for time, value in known if isinstance(value, int | float) and not isinstance(value, bool)]
+    if not numbers:
+        return NOTHING
+    result = _calculated(name, numbers)
+    return NOTHING if result is NOTHING or math.isnan(result) else result
+
+
+def _calculated(name: str, numbers: list[tuple[int, Any]]) -> Any:
+    plain = [number for _, number in numbers]
+    infinite = any(math.isinf(number) for number in plain)
+    if name in ("Min", "Max"):
+        return (min if name == "Min" else max)(plain)
+    if name in ("Sum", "Mean"):
+        if infinite:
+            return sum(number for number in plain if math.isinf(number))
+        return _double(sum(map(Fraction, plain), Fraction()) / (1 if name == "Sum" else len(plain)))
+    if name == "StdDev":
+        return math.nan if infinite else statistics.pstdev(plain)
+    (first_time, first), (last_time, last) = numbers[0], numbers[-1]
+    if len(numbers) < 2 or (name == "Rate" and first_time == last_time):
+        return NOTHING
+    if math.isinf(first) or math.isinf(last):
+        return float(last) - float(first)
+    change = Fraction(last) - Fraction(first)
+    return _double(change if name == "Delta" else change / Fraction(last_time - first_time, 10**9))
+
+
+def _double(exact: Fraction) -> float:
+    try:
+        return float(exact)
+    except OverflowError:
+        return math.copysign(math.inf, exact)
+
+
+def _same(one: Any, other: Any) -> bool:
+    return isinstance(one, bool) == isinstance(other, bool) and one == other

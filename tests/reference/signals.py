@@ -1,0 +1,125 @@
+"""Signals, computed from all samples of a client."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from tests.reference.aggregates import NOTHING, aggregated
+from tests.reference.world import SECOND, World
+from wayside.expressions import UNKNOWN, Environment, Expression, Kind
+
+
+@cache
+def _compiled(source: str, names: tuple[str, ...]) -> Expression:
+    return Environment(dict.fromkeys(names, Kind.DYN)).compile(source)
+
+
+def truth(source: str | None, variables: dict[str, Any], names: Iterable[str]) -> bool | None:
+    """What a condition says; None is unknown, and one that is absent holds."""
+    if source is None:
+        return True
+    value = _evaluated(source, variables, tuple(names))
+    return value if isinstance(value, bool) else None
+
+
+def _evaluated(source: str, variables: dict[str, Any], names: tuple[str, ...]) -> Any:
+    value = _compiled(source, names).evaluate_or_unknown(variables)
+    return NOTHING if value is UNKNOWN else value
+
+
+@dataclass(frozen=True)
+class Start:
+    """An episode of a rule started. `clients` is None for everybody."""
+
+    rule: str
+    time: int
+    clients: tuple[str, ...] | None
+    message: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Item:
+    """What a signal looks at: a sample, or a start."""
+
+    time: int
+    message: Any
+    sample: dict[str, float]
+
+
+@dataclass
+class Sources:
+    """All that signals are computed from."""
+
+    world: World
+    starts: list[Start]
+    """In order; those of a client that was lost since are not its own any more."""
+    open_of: dict[str, list[tuple[str, ...] | None]]
+    """By rule that is evaluated: the clients of each episode that is open."""
+    keep_starts: dict[str, int]
+
+    def signal(self, signal: dict[str, Any], client: str, now: int, ticks: list[int]) -> Any:
+        """The value at a tick; `ticks` are those at which the rule was evaluated for the client, this one included."""
+        aggregate = signal.get("aggregate", "Last")
+        if "rule" in signal:
+            if signal["rule"] not in self.open_of:
+                return NOTHING
+            if aggregate == "Active":
+                return any(clients is None or client in clients for clients in self.open_of[signal["rule"]])
+        if aggregate == "Age":
+            return self._age(signal, client, now, ticks)
+        always_known = "rule" in signal or aggregate in ("Count", "Any")
+        if not always_known and not self.world.fresh(client, signal["stream"], now):
+            return NOTHING
+        window = list(self._picked(signal, self._items(signal, client, now)))
+        if "over" in signal:
+            after = now - nanoseconds(signal["over"])
+            if self.world.floor is not None:
+                after = max(after, self.world.floor)
+            window = [item for item in window if item.time > after]
+        return aggregated(aggregate, [(item.time, _value(signal, item)) for item in window])
+
+    def _age(self, signal: dict[str, Any], client: str, now: int, ticks: list[int]) -> float:
+        if "where" not in signal and "stream" in signal:
+            times = [each.time for each in self.world.of(client, signal["stream"], now)]
+        else:
+            seen = [item for tick in ticks for item in self._items(signal, client, tick)]
+            times = [item.time for item in self._picked(signal, seen)]
+        return (now - max(times, default=self.world.known[client].since)) / SECOND
+
+    def _items(self, signal: dict[str, Any], client: str, now: int) -> list[Item]:
+        if "stream" in signal:
+            return [
+                Item(each.time, each.message, {"received": each.received / SECOND, "size": float(len(each.payload))})
+                for each in self.world.kept(client, signal["stream"], now)
+            ]
+        mine = [
+            each
+            for each in self.starts
+            if each.rule == signal["rule"] and each.time <= now and (each.clients is None or client in each.clients)
+        ]
+        kept = [each for each in mine if each.time > now - self.keep_starts[signal["rule"]]] or mine[-1:]
+        return [Item(each.time, each.message, {"received": each.time / SECOND}) for each in kept]
+
+    def _picked(self, signal: dict[str, Any], items: list[Item]) -> Iterator[Item]:
+        for item in items:
+            if truth(signal.get("where"), _variables(item), ("msg", "key", "sample")) is True:
+                yield item
+
+
+def _value(signal: dict[str, Any], item: Item) -> Any:
+    return _evaluated(signal["value"], _variables(item), ("msg", "key", "sample")) if "value" in signal else True
+
+
+def _variables(item: Item) -> dict[str, Any]:
+    return {"msg": item.message, "key": {}, "sample": item.sample}
+
+
+def nanoseconds(text: str) -> int:
+    """A duration."""
+    for unit, factor in (("ms", 10**6), ("s", SECOND), ("m", 60 * SECOND), ("h", 3600 * SECOND)):
+        if text.endswith(unit):
+            return int(text[: -len(unit)]) * factor
+    raise ValueError(text)

@@ -1,0 +1,190 @@
+"""Random rules and random streams for the test of equivalence: small enough to disagree about, mean enough to do so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from hypothesis import strategies as st
+
+HALF = 500_000_000
+"""Nanoseconds; most times are whole multiples, so that samples meet ticks, window edges and timeouts exactly."""
+
+CLIENTS = ("a", "b", "c")
+
+DURATIONS = ("0s", "500ms", "1s", "2s", "3s")
+
+_BIG = 2**53 + 1
+
+_values = st.sampled_from(
+    [
+        0.0,
+        1.0,
+        1.5,
+        2.0,
+        3.0,
+        -1.0,
+        10.0,
+        _BIG,
+        _BIG + 1,
+        float("nan"),
+        float("inf"),
+        None,
+        "x",
+        "y",
+        True,
+        False,
+        [1.0],
+    ]
+)
+
+_messages = st.one_of(
+    st.sampled_from([{"v": 2.0, "w": 1.0}, {"v": 0.0, "w": 1.0}, {"v": 2.0, "w": 0.0}]),
+    st.sampled_from([{"v": 3.0, "w": 1.0}, {"v": 1.0, "w": 1.0}]),
+    st.fixed_dictionaries({"v": st.sampled_from([0.0, 1.0, 1.5, 2.0, 3.0])}),
+    st.fixed_dictionaries({"v": _values, "w": st.sampled_from([0.0, 1.0, 2.0])}),
+    st.sampled_from([{}, {"w": 1.0}]),
+)
+
+_places = st.fixed_dictionaries(
+    {
+        "x": st.sampled_from([0.0, 0.0, 3.0, 4.0, 50.0, None]),
+        "y": st.sampled_from([0.0, 0.0, 0.0, 4.0, float("nan")]),
+        "v": st.sampled_from([0.0, 1.0, 2.0]),
+    }
+)
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message on its way: when it was sent, and how much later it arrives than it should; half seconds."""
+
+    time: int
+    delay: int
+    client: str
+    stream: str
+    message: Any
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Rules, and what happens."""
+
+    rules: dict[str, dict[str, Any]]
+    messages: tuple[Message, ...]
+    data: bool
+    """Whether with clock Data."""
+    gap: tuple[int, int] | None
+    """With clock Wall, from when to when there are no ticks; half seconds."""
+
+
+_message = st.builds(
+    lambda time, delay, client, stream, value, place: Message(
+        time, delay, client, stream, place if stream == "pose" else value
+    ),
+    st.integers(1, 30),
+    st.sampled_from([0, 0, 0, 1, 2, 4, 8]),
+    st.sampled_from((*CLIENTS, "a", "a", "b")),
+    st.sampled_from(["speed", "speed", "speed", "pose", "pose", "rare"]),
+    _messages,
+    _places,
+)
+
+_WINDOWED = ("Min", "Max", "Mean", "Sum", "Count", "Rate", "Delta", "StdDev", "All", "Any", "Distinct")
+_OF_A_SAMPLE = ("Last", "First", "Previous")
+
+
+@st.composite
+def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, Any]:
+    aggregate = draw(st.sampled_from((*_OF_A_SAMPLE, *_WINDOWED, "Last", "Age")))
+    of_rule = bool(others) and draw(st.booleans())
+    signal: dict[str, Any] = {"name": name}
+    if of_rule:
+        signal["rule"] = draw(st.sampled_from(others))
+        aggregate = draw(st.sampled_from(("Active", "Count", "Age", aggregate)))
+        if aggregate == "Active":
+            return {**signal, "aggregate": aggregate}
+    else:
+        signal["stream"] = draw(st.sampled_from(("speed", "speed", "speed", "pose", "rare")))
+    signal["aggregate"] = aggregate
+    if aggregate not in ("Count", "Age"):
+        field = "msg.values.s" if of_rule else "msg.v"
+        signal["value"] = draw(st.sampled_from((field, field, f"{field} > 1", "sample.received > 0")))
+    if aggregate in _WINDOWED or draw(st.integers(0, 3)) == 0:
+        signal["over"] = draw(st.sampled_from(("500ms", "1s", "2s", "3s", "5s")))
+    if draw(st.integers(0, 3)) == 0:
+        signal["where"] = "msg.values.s > 1" if of_rule else draw(st.sampled_from(("msg.v > 0", "msg.w == 1")))
+    return signal
+
+
+_FORMS = (
+    "{} > 1",
+    "{} <= 1.5",
+    "{} >= 2",
+    "{} < 2",
+    "{} > 0",
+    "{} == 2",
+    "{} != 0",
+    "{} * 2 < 5",
+    "{} == 'x'",
+    "{}",
+    "!{}",
+    "size({}) > 1",
+)
+
+
+def _conditions(variables: list[str]) -> st.SearchStrategy[str]:
+    """The distance is known to be a number, so what is said of strings and booleans would not compile."""
+    simple = st.sampled_from(variables).flatmap(
+        lambda name: st.sampled_from(_FORMS[:8] if name == "distance" else _FORMS).map(lambda form: form.format(name))
+    )
+    joined = st.builds(lambda one, by, other: f"({one}) {by} ({other})", simple, st.sampled_from(["&&", "||"]), simple)
+    return st.one_of(simple, joined)
+
+
+_scopes = st.sampled_from(
+    [
+        None,
+        None,
+        {"client": {"where": '"speed" in streams'}},
+        {"pairs": {"position": {"stream": "pose", "x": "msg.x", "y": "msg.y"}, "within": 5}},
+        {
+            "pairs": {
+                "position": {"stream": "pose", "x": "msg.x", "y": "msg.y"},
+                "within": 10,
+                "where": '"speed" in a.streams || distance < 5',
+            }
+        },
+    ]
+)
+
+
+@st.composite
+def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
+    spec: dict[str, Any] = {"signals": [draw(_signal(name, others)) for name in ("s", "t")[: draw(st.integers(1, 2))]]}
+    names = [signal["name"] for signal in spec["signals"]]
+    scope = draw(_scopes)
+    if scope is not None:
+        spec["scope"] = scope
+    if scope is not None and "pairs" in scope:
+        names = [f"{role}.{name}" for name in names for role in "ab"] + ["distance"]
+    spec["when"] = draw(_conditions(names))
+    if draw(st.booleans()):
+        spec["until"] = draw(_conditions(names))
+    for field in ("for", "cooldown", "unknownTimeout"):
+        if draw(st.booleans()):
+            spec[field] = draw(st.sampled_from(DURATIONS))
+    spec["evaluation"] = {"every": draw(st.sampled_from(("500ms", "1s", "1s", "2s")))}
+    return spec
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    """One to three rules, a few dozen messages, either clock."""
+    rules: dict[str, dict[str, Any]] = {}
+    for name in ("r", "q", "z")[: draw(st.integers(1, 3))]:
+        rules[name] = draw(_rule(tuple(rules)))
+    messages = draw(st.lists(_message, min_size=10, max_size=40))
+    data = draw(st.booleans())
+    gap = None if data or draw(st.integers(0, 3)) else draw(st.tuples(st.integers(5, 15), st.integers(16, 25)))
+    return Scene(rules, tuple(messages), data, gap)
