@@ -16,6 +16,7 @@ from detector.actions.file_store import write_tasks_yaml
 from detector.assembly import DetectorError
 from detector.checking import check_documents, summary
 from detector.cluster.errors import NoClusterError
+from detector.comparison import write_comparison
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import is_intake_file, read_intake
 from detector.replay.latched import recorded_arrivals
@@ -103,6 +104,10 @@ def replay(
     output: Annotated[Path, typer.Option(help="The folder for events.jsonl and tasks.yaml.")],
     detector: DetectorFile = None,
     rules: RuleFiles = None,
+    compared: Annotated[
+        tuple[str, str] | None,
+        typer.Option("--compare", help="Compare the episodes of two rules, and write comparison.json."),
+    ] = None,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with Progress(Console(stderr=True)) as progress:
@@ -111,6 +116,8 @@ def replay(
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
         file.writelines(event.to_json() + "\n" for event in outcome.events)
     write_tasks_yaml(output / "tasks.yaml", outcome.tasks.values())
+    if compared is not None:
+        write_comparison(outcome, compared, output)
     for refusal in outcome.refusals:
         typer.echo(str(refusal), err=True)
     for note in outcome.notes:

@@ -41,6 +41,10 @@ class Outcome:
     """What a person should know: pauses, losses, and what was unknown or failed."""
     cut: bool = False
     """The intake file ends in the middle: its writer was killed."""
+    end: int = 0
+    """Up to here all ticks have run; nanoseconds since the epoch."""
+    rules: tuple[str, ...] = ()
+    """The names of all rules that were given at some time."""
     lost: int = 0
     """Arrivals that the intake file does not hold: the disk was too slow for them."""
 
@@ -85,6 +89,7 @@ class Replay:
         """Go on with these rules."""
         compiled, refused = self._rule_book.compile(rules, self._detector, self._entries.fields)
         self.outcome.refusals += refused
+        self.outcome.rules = tuple(sorted({*self.outcome.rules, *(rule.name for rule in rules)}))
         self._note(self._engine.set_rules(compiled))
 
     def restore(self, demands: Sequence[Demand], time: int) -> None:
@@ -112,6 +117,7 @@ class Replay:
 
     def _note(self, events: list[Event]) -> None:
         self.outcome.events += events
+        self.outcome.end = max(self.outcome.end, self._engine.now)
         if self._engine.demands_version == self._version:
             return
         self._version = self._engine.demands_version

@@ -131,6 +131,8 @@ class ModelPoints(Model):
 
     @model_validator(mode="after")
     def _one_for_each_field(self) -> ModelPoints:
+        if len(set(self.fields)) < len(self.fields):
+            raise ValueError("fields: give each once")
         if self.scale and len(self.scale) != len(self.fields):
             raise ValueError(f"scale: {len(self.scale)} values for {len(self.fields)} fields: give one for each")
         return self
