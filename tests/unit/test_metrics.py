@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from prometheus_client.core import CounterMetricFamily
 from prometheus_client.parser import text_string_to_metric_families
 
-from detector.status.metrics import Metrics
+from detector.status.metrics import DETECTOR, RULE, STREAM, Metrics
 from detector.status.model import Status
 from detector.status.server import StatusServer
+from detector.streams.tally import Cause
 from tests.unit.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.unit.test_status import FAST, Kept
 
@@ -79,3 +83,13 @@ def test_pages_are_served_and_what_is_not_well_is_503(server: StatusServer) -> N
 def test_a_port_that_is_taken_is_told_with_the_option(server: StatusServer) -> None:
     with pytest.raises(OSError, match=rf"--metrics-port {server.port}: .*: give another port"):
         StatusServer(server.port, {})
+
+
+def test_the_documentation_names_every_metric_and_every_cause() -> None:
+    text = Path("docs/operations.md").read_text()
+    causes = re.findall(r'cause="([a-z_]+)"', Path("detector/losses.py").read_text())
+    names = [f"{name}_total" if kind is CounterMetricFamily else name for name, kind, *_ in (*DETECTOR, *STREAM, *RULE)]
+    before = [cause.name.lower() for cause in Cause]
+    missing = [each for each in (*names, *causes, *before, "event_unpublished") if f"`{each}`" not in text]
+    assert len(causes) > 5
+    assert missing == []

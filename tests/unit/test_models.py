@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import yaml
 from onnx import helper
 from rosbags.typesys import Stores, get_typestore
 
@@ -338,3 +339,20 @@ def test_the_same_samples_give_the_same_bytes(tmp_path: Path) -> None:
     first = lines()
     assert len(first) > 20
     assert lines() == first
+
+
+def test_the_documentations_example_is_a_rule_that_runs(tmp_path: Path) -> None:
+    text = Path("docs/models.md").read_text()
+    spec = yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])
+    shapes = {"state": ["n", 2], "history": ["n", 20]}
+    nodes = [
+        helper.make_node("ReduceMean", ["state"], ["s"], axes=[1], keepdims=1),
+        helper.make_node("ReduceMean", ["history"], ["h"], axes=[1], keepdims=1),
+        helper.make_node("Add", ["s", "h"], ["risk"]),
+    ]
+    spec["signals"][2]["model"]["file"] = str(onnx_models.saved(tmp_path / "m.onnx", shapes, {"risk": ["n", 1]}, nodes))
+    driven = Driven(a_detector(a_stream("odometry"), a_stream("radar")), a_rule("r", **spec))
+    twist = {"twist": {"twist": {"linear": {"x": 10}}}}
+    sent = [arrival(0.01 * n, "car", twist, "odometry") for n in range(1, 30)]
+    assert driven.take(*sent, arrival(0.5, "car", {"range": 4}, "radar"), until=1) == ["r car started 1"]
+    assert driven.values()["risk"] == 17.0
