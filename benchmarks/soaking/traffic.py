@@ -1,0 +1,91 @@
+"""The traffic of a soak run: the cooperative-recording drive, telemetry, and now and then what must be dropped."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
+sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no package
+
+from cooperative_recording.messages import messages  # noqa: E402
+from cooperative_recording.vehicles import VEHICLES, simulate  # noqa: E402
+
+TELEMETRY_EVERY = 200_000_000
+BAD_EVERY = 60 * 10**9
+"""Of each kind of bad sample there is one in so many nanoseconds."""
+
+FLUSH = 15
+"""Seconds that the clock goes on alone, so that everything before has been evaluated."""
+
+
+@dataclass
+class Sent:
+    """What was sent: by stream what must be taken in, by cause and stream what must be dropped."""
+
+    samples: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+
+def traffic(seed: int, start_ns: int, seconds: int, sent: Sent) -> Iterator[tuple[int, str, bytes]]:
+    """Nanoseconds after the start, key and payload of each message, in order; `sent` is filled on the way."""
+    drive = simulate(seed, horizon_s=seconds)
+    telemetry = _telemetry(start_ns)
+    bad = _bad(start_ns)
+    following, wrong = next(telemetry), next(bad)
+    for message in messages(drive, start_ns, seconds):
+        while following[0] <= message.after_ns:
+            sent.samples["telemetry"] += 1
+            yield following
+            following = next(telemetry)
+        while wrong[0] <= message.after_ns:
+            at, cause, key, payload = wrong
+            stream = "" if cause in ("ahead", "late") else "telemetry"
+            sent.dropped[cause, stream] += 1
+            yield at, key, payload
+            wrong = next(bad)
+        sent.samples[message.key.rsplit("/", 1)[-1]] += 1
+        yield message.after_ns, message.key, message.payload
+    for tenth in range(FLUSH * 10):
+        after = seconds * 10**9 + tenth * 10**8
+        yield after, "clock/clock", json.dumps({"t": (start_ns + after) / 1e9}).encode()
+
+
+def _telemetry(start_ns: int) -> Iterator[tuple[int, str, bytes]]:
+    step = 0
+    while True:
+        after = step * TELEMETRY_EVERY
+        for number, vehicle in enumerate(VEHICLES):
+            speed = 14 + 6 * math.sin(after / 17e9 + number)
+            values = {
+                "t": (start_ns + after) / 1e9,
+                "v": round(speed, 3),
+                "brake": math.sin(after / 5e9 + number) > 0.8,
+                "mode": ("auto", "manual", None)[(after // 20_000_000_000 + number) % 3],
+                "counter": 2**53 + after,
+            }
+            yield after, f"vehicles/{vehicle.name}/telemetry", json.dumps(values).encode()
+        step += 1
+
+
+def _bad(start_ns: int) -> Iterator[tuple[int, str, str, bytes]]:
+    """In turn: no JSON, a key without a valid client, a clock an hour ahead, and one that is ten minutes behind."""
+    key = f"vehicles/{VEHICLES[0].name}/telemetry"
+    number = 0
+    while True:
+        number += 1
+        after = number * BAD_EVERY // 4
+        now = (start_ns + after) / 1e9
+        cause = ("undecodable", "unnamed", "ahead", "late")[number % 4]
+        payload = {
+            "undecodable": b'{"t": ',
+            "unnamed": json.dumps({"t": now}).encode(),
+            "ahead": json.dumps({"t": now + 3600, "v": 0}).encode(),
+            "late": json.dumps({"t": now - 600, "v": 0}).encode(),
+        }[cause]
+        yield after, cause, "vehicles/not!valid/telemetry" if cause == "unnamed" else key, payload
