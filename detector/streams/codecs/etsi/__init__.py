@@ -6,17 +6,16 @@ A message on its way: `packets` takes off GeoNetworking, security and BTP; `mess
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from detector.engine.sample import DecodeError
 from detector.streams.codecs.etsi.asn1 import DefinitionError
 from detector.streams.codecs.etsi.bits import Bits
-from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, Kind, packaged_readers
+from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, Kind, readers
+from detector.streams.codecs.etsi.own import OwnDefinitions, own_definitions
 from detector.streams.codecs.etsi.packets import message_in
-from detector.streams.codecs.etsi.reading import Read
 
-__all__ = ["DefinitionError", "EtsiDecoder"]
+__all__ = ["DefinitionError", "EtsiDecoder", "OwnDefinitions", "own_definitions"]
 
 _HEADER = 6
 """Bytes of ItsPduHeader: protocol version, message number, station. All releases agree on these."""
@@ -25,16 +24,14 @@ _HEADER = 6
 class EtsiDecoder:
     """Reads ITS messages of one kind, or of any."""
 
-    def __init__(self, type_name: str | None = None) -> None:
-        """`type_name` is etsi/cam or the like; None for messages of all kinds.
+    def __init__(self, type_name: str | None = None, own: OwnDefinitions | None = None) -> None:
+        """`type_name` is etsi/cam or the like, None for messages of all kinds; `own` are the user's definitions.
 
         Raises DefinitionError for a kind that is not known or for which there is no definition.
         """
-        kinds = KINDS if type_name is None else (_kind(type_name),)
-        self._only = None if type_name is None else kinds[0]
-        self._readers: dict[int, Mapping[int, Read]] = {kind.number: packaged_readers(kind) for kind in kinds}
-        if self._only is not None and not self._readers[self._only.number]:
-            raise DefinitionError(f"no package has the ASN.1 definition of {type_name}")
+        self._only = None if type_name is None else _kind(type_name)
+        kinds = (self._only,) if self._only is not None else [kind for kind in KINDS if _is_defined(kind, own)]
+        self._readers = {kind.number: readers(kind, own) for kind in kinds}
 
     def decode(self, payload: bytes) -> Any:
         """The message as a map: header, and what its ASN.1 type has beside it. Raises DecodeError."""
@@ -75,6 +72,10 @@ class EtsiDecoder:
             "stationId": float(int.from_bytes(data[2:_HEADER], "big")),
         }
         return kind, message
+
+
+def _is_defined(kind: Kind, own: OwnDefinitions | None) -> bool:
+    return bool(kind.packaged) or (own is not None and own.type(kind.types) is not None)
 
 
 def _kind(type_name: str) -> Kind:

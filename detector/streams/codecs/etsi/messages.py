@@ -9,6 +9,7 @@ from typing import Any
 
 from detector.streams.codecs.etsi import times
 from detector.streams.codecs.etsi.asn1 import DefinitionError
+from detector.streams.codecs.etsi.own import OwnDefinitions
 from detector.streams.codecs.etsi.packaged import packaged_type
 from detector.streams.codecs.etsi.reading import Read, Readers
 
@@ -96,4 +97,21 @@ def packaged_readers(kind: Kind) -> Mapping[int, Read]:
     return readers
 
 
-__all__ = ["BY_NAME", "BY_NUMBER", "KINDS", "PREFIX", "DefinitionError", "Kind", "Stamp", "packaged_readers"]
+def readers(kind: Kind, own: OwnDefinitions | None) -> Mapping[int, Read]:
+    """What reads the kind's messages, by protocol version: by the user's definitions where they have the type.
+
+    Those of the first version, which was read otherwise, stay with the definitions that come with the extra. Raises
+    DefinitionError where there are none at all.
+    """
+    found = None if own is None else own.type(kind.types)
+    if found is None:
+        if not kind.packaged:
+            raise DefinitionError(
+                f"no package has the ASN.1 definition of {PREFIX}{kind.name}: name the files with it in spec.asn1"
+            )
+        return packaged_readers(kind)
+    read = Readers().reader(found)
+    return {**dict.fromkeys(range(1, 256), read), **({1: packaged_readers(kind)[1]} if 1 in kind.packaged else {})}
+
+
+__all__ = ["BY_NAME", "BY_NUMBER", "KINDS", "PREFIX", "DefinitionError", "Kind", "Stamp", "packaged_readers", "readers"]

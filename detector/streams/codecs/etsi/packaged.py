@@ -13,7 +13,7 @@ from detector.streams.codecs.etsi import asn1
 
 REMEDY = "pip install 'wayside[etsi]'"
 
-_ALPHABETS = {
+ALPHABETS = {
     "IA5String": "".join(map(chr, range(128))),
     "VisibleString": "".join(map(chr, range(32, 127))),
     "NumericString": " 0123456789",
@@ -84,8 +84,8 @@ class _Walk:
                 )
             case "OPEN_TYPE":
                 return self._open(found)
-            case _ if kind in _ALPHABETS and getattr(found, "_const_alpha", None) is None:
-                return asn1.Text(_size(found), _ALPHABETS[kind])
+            case _ if kind in ALPHABETS and getattr(found, "_const_alpha", None) is None:
+                return asn1.Text(_size(found), ALPHABETS[kind])
             case _:
                 return asn1.Unreadable(kind)
 

@@ -1,0 +1,211 @@
+"""ASN.1 definitions from files that the user brings: read and resolved by asn1tools (MIT).
+
+asn1tools says what types there are. What it leaves out is looked up in the text itself: which type an open type holds,
+as `{Type IDENTIFIED BY value}` of an information object set tells it.
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+from detector.streams.codecs.etsi import asn1, bounds
+from detector.streams.codecs.etsi.packaged import ALPHABETS, REMEDY
+from detector.streams.codecs.etsi.quantities import UNITS
+
+_SUCCESSORS = re.compile(r"\bWITH\s+(SUCCESSORS|DESCENDANTS)\b")
+"""Says that a later version of a module will do; asn1tools does not know it."""
+
+_COMMENT = re.compile(r"/\*.*?\*/|--.*?(?:--|$)", re.DOTALL | re.MULTILINE)
+
+_OBJECT_SET = re.compile(r"\b([A-Z][\w-]*)\s+([A-Z][A-Z0-9-]*)\s*::=\s*\{")
+_ROW = re.compile(r"\{\s*([A-Z][\w-]*)\s+IDENTIFIED\s+BY\s+([\w-]+)\s*\}")
+
+_Tree = Mapping[str, Any]
+"""A module as asn1tools parses it."""
+
+
+class OwnDefinitions:
+    """The types of some ASN.1 modules, by name."""
+
+    def __init__(self, texts: Sequence[str]) -> None:
+        """`texts` are modules, one or several in each. Raises DefinitionError for what cannot be read or resolved."""
+        self._trees: dict[str, _Tree] = {}
+        self._rows: dict[str, list[tuple[str, str]]] = {}
+        for text in texts:
+            self._trees.update(copy.deepcopy(parsed(text)))
+            self._rows.update(_object_sets(text))
+        bounds.span_constraints(self._trees)
+        self._types = _compiled(self._trees)
+        self._done: dict[int, tuple[Any, asn1.Type]] = {}
+
+    def type(self, names: Iterable[str]) -> asn1.Type | None:
+        """The first type of these names that there is."""
+        for name in names:
+            for types in self._types.values():
+                if name in types:
+                    return self._walk(types[name], name)
+        return None
+
+    def _walk(self, found: Any, name: str = "") -> asn1.Type:
+        """`name` is the type's, where the compiled type itself does not say it."""
+        made = self._done.get(id(found))
+        if made is None:
+            made = self._done[id(found)] = (found, self._convert(found, name or found.type_name))
+        return made[1]
+
+    def _convert(self, found: Any, name: str) -> asn1.Type:
+        kind = type(found).__name__
+        match kind:
+            case "Boolean":
+                return asn1.Boolean()
+            case "Null":
+                return asn1.Null()
+            case "Integer":
+                extensible = bool(found.has_extension_marker)
+                names = bounds.aliases(name, self._trees)
+                unit = next((each for each in names if each in UNITS), name)
+                return asn1.Integer(
+                    unit, found.minimum, found.maximum, extensible, bounds.named_numbers(names, self._trees)
+                )
+            case "Enumerated":
+                additions = found.additions_index_to_data
+                return asn1.Enumerated(
+                    tuple(found.root_index_to_data[index] for index in sorted(found.root_index_to_data)),
+                    None if additions is None else tuple(additions[index] for index in sorted(additions)),
+                )
+            case "BitString":
+                named = found.named_bits or ()
+                return asn1.BitString(_size(found), {int(position): bit for bit, position in named})
+            case "OctetString":
+                return asn1.OctetString(_size(found))
+            case "SequenceOf" | "SetOf":
+                return asn1.SequenceOf(self._walk(found.element_type), _size(found))
+            case "Sequence":
+                return self._sequence(found, name)
+            case "Choice":
+                additions = found.additions_index_to_member
+                return asn1.Choice(
+                    self._alternatives(found.root_index_to_member),
+                    None if additions is None else self._alternatives(additions),
+                )
+            case "OpenType":
+                return asn1.Open("", {})
+            case "UTF8String":
+                return asn1.Text(asn1.ANY_SIZE, None)
+            case _ if kind in ALPHABETS and len(found.permitted_alphabet) == len(ALPHABETS[kind] or ""):
+                return asn1.Text(_size(found), ALPHABETS[kind])
+            case _:
+                return asn1.Unreadable(kind)
+
+    def _alternatives(self, members: Mapping[int, Any]) -> tuple[tuple[str, asn1.Type], ...]:
+        return tuple((members[index].name, self._walk(members[index])) for index in sorted(members))
+
+    def _sequence(self, found: Any, name: str) -> asn1.Sequence:
+        opened = self._open_types(name)
+        root = tuple(self._field(member, opened) for member in found.root_members)
+        if found.additions is None:
+            return asn1.Sequence(name, root, None)
+        additions = [
+            asn1.Group(tuple(self._field(inner, opened) for inner in member.root_members))
+            if type(member).__name__ == "AdditionGroup"
+            else self._field(member, opened)
+            for member in found.additions
+        ]
+        return asn1.Sequence(name, root, tuple(additions))
+
+    def _field(self, member: Any, opened: Mapping[str, asn1.Type]) -> asn1.Field:
+        kind = opened.get(member.name) or self._walk(member)
+        return asn1.Field(member.name, kind, member.optional or member.default is not None, member.default)
+
+    def _open_types(self, name: str) -> dict[str, asn1.Type]:
+        """The open types of a SEQUENCE, by component: what each holds hangs on another component."""
+        opened: dict[str, asn1.Type] = {}
+        for member in bounds.type_tree(name, self._trees).get("members", ()):
+            if not isinstance(member, dict) or not str(member.get("type")).endswith(".&Type"):
+                continue
+            match member.get("table"):
+                case [str(object_set), [str(selector), *_]]:
+                    opened[member["name"]] = asn1.Open(selector, self._table(object_set))
+        return opened
+
+    def _table(self, object_set: str) -> dict[int, asn1.Type]:
+        table: dict[int, asn1.Type] = {}
+        for type_name, value in self._rows.get(object_set, ()):
+            number = int(value) if value.isdigit() else bounds.value_of(value, self._trees)
+            kind = self.type([type_name])
+            if number is not None and kind is not None:
+                table[number] = kind
+        return table
+
+
+@lru_cache(maxsize=64)
+def parsed(text: str) -> dict[str, Any]:
+    """The modules in the text. Raises DefinitionError, with line and column, where it is no ASN.1."""
+    tools = _asn1tools()
+    try:
+        return dict(tools.parse_string(_SUCCESSORS.sub(lambda found: " " * len(found[0]), text)))
+    except tools.ParseError as error:
+        raise asn1.DefinitionError(f"no ASN.1: {error}") from None
+    except RecursionError:
+        raise asn1.DefinitionError("no ASN.1: it is nested too deeply") from None
+
+
+@lru_cache(maxsize=8)
+def own_definitions(texts: tuple[str, ...]) -> OwnDefinitions:
+    """The definitions of these texts, kept for the next time. Raises DefinitionError."""
+    return OwnDefinitions(texts)
+
+
+def _compiled(trees: Mapping[str, _Tree]) -> dict[str, dict[str, Any]]:
+    """asn1tools' types by module and name."""
+    tools = _asn1tools()
+    try:
+        specification = tools.compile_dict(copy.deepcopy(dict(trees)), "uper")
+    except tools.CompileError as error:
+        raise asn1.DefinitionError(
+            f"the ASN.1 modules do not fit together: {error}: give all that they import"
+        ) from None
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise asn1.DefinitionError(f"the ASN.1 modules cannot be resolved: {error!r}") from None
+    return {
+        module: {name: _inner(kind) for name, kind in types.items()} for module, types in specification.modules.items()
+    }
+
+
+def _inner(compiled: Any) -> Any:
+    while hasattr(compiled, "_type"):
+        compiled = compiled._type
+    return compiled
+
+
+def _asn1tools() -> Any:
+    try:
+        import asn1tools  # noqa: PLC0415  it takes a while, and only those who bring ASN.1 need it
+    except ImportError as error:
+        raise asn1.DefinitionError(f"what reads ASN.1 is not installed: {REMEDY}") from error
+    return asn1tools
+
+
+def _size(found: Any) -> asn1.Size:
+    if found.minimum is None:
+        return asn1.ANY_SIZE
+    low = 0 if found.minimum == "MIN" else int(found.minimum)
+    high = None if found.maximum in (None, "MAX") else int(found.maximum)
+    return asn1.Size(low, high, bool(found.has_extension_marker))
+
+
+def _object_sets(text: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    """The information object sets: the rows of type and value, by name."""
+    text = _COMMENT.sub(" ", text)
+    for found in _OBJECT_SET.finditer(text):
+        depth, end = 1, found.end()
+        while depth and end < len(text):
+            depth += {"{": 1, "}": -1}.get(text[end], 0)
+            end += 1
+        rows = _ROW.findall(text[found.end() : end])
+        if rows:
+            yield found[1], rows
