@@ -11,6 +11,7 @@ from detector.engine.liveliness import LIVELINESS
 from detector.engine.sample import Decoder
 from detector.models.binding import bind_models
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
+from detector.streams.codecs.etsi import OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.fields import message_fields
 from wayside.api import Detector, EventRule
 from wayside.keys import KeyPattern
@@ -68,15 +69,17 @@ def inlets(detector: Detector) -> Inlets:
     decoders: dict[str, Decoder] = {}
     fields: dict[str, Fields] = {}
     problems: list[RuleProblem] = []
+    asn1 = _asn1(detector, problems)
     for index, stream in enumerate(detector.spec.streams):
         known: Fields | None = None
         try:
-            decoders[stream.name] = codec_for(stream)
+            decoders[stream.name] = codec_for(stream, asn1)
         except UnknownTypeError as error:
             problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
         except DefinitionError as error:
-            field = "encoding" if stream.type is None else "type"
-            problems.append(RuleProblem(("spec", "streams", index, field), str(error)))
+            if asn1 is not None or not detector.spec.asn1:  # else what is wrong with the modules is told already
+                field = "encoding" if stream.type is None else "type"
+                problems.append(RuleProblem(("spec", "streams", index, field), str(error)))
         else:
             known = message_fields(stream)
         if known is not None:
@@ -99,6 +102,24 @@ def inlets(detector: Detector) -> Inlets:
         return (client, captures) if _CLIENT_NAME.fullmatch(client) else None
 
     return Inlets(decoders, read_key, fields)
+
+
+def _asn1(detector: Detector, problems: list[RuleProblem]) -> OwnDefinitions | None:
+    """The ASN.1 modules that the Detector brings; what is wrong with them is added to the problems."""
+    texts: list[str] = []
+    for index, module in enumerate(detector.spec.asn1):
+        try:
+            texts.append(read_module(module))
+        except DefinitionError as error:
+            field = "file" if module.definition is None else "definition"
+            problems.append(RuleProblem(("spec", "asn1", index, field), str(error)))
+    if not texts or len(texts) < len(detector.spec.asn1):
+        return None
+    try:
+        return own_definitions(tuple(texts))
+    except DefinitionError as error:
+        problems.append(RuleProblem(("spec", "asn1"), str(error)))
+        return None
 
 
 class RuleBook:

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
+from wayside.api.asn1 import Asn1Module
 from wayside.api.base import (
     ClientName,
     Condition,
@@ -223,6 +224,13 @@ class DetectorSpec(Model):
         max_length=128,
         description="The data to take in.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    asn1: list[Asn1Module] = Field(
+        default_factory=list,
+        max_length=32,
+        description="ASN.1 modules for uper streams: of messages that no package defines, such as etsi/cpm, or of "
+        "other versions than the packages have. Give all modules that they import as well.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     buffer: Buffer = Field(default=Buffer(), description="How much is kept.")
     client_timeout: PositiveDuration = Field(

@@ -12,10 +12,10 @@ from detector.engine.sample import DecodeError
 from detector.streams.codecs.etsi.asn1 import DefinitionError
 from detector.streams.codecs.etsi.bits import Bits
 from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, Kind, readers
-from detector.streams.codecs.etsi.own import OwnDefinitions, own_definitions
+from detector.streams.codecs.etsi.own import OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.etsi.packets import message_in
 
-__all__ = ["DefinitionError", "EtsiDecoder", "OwnDefinitions", "own_definitions"]
+__all__ = ["DefinitionError", "EtsiDecoder", "OwnDefinitions", "own_definitions", "read_module"]
 
 _HEADER = 6
 """Bytes of ItsPduHeader: protocol version, message number, station. All releases agree on these."""

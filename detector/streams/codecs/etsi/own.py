@@ -10,11 +10,13 @@ import copy
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from detector.streams.codecs.etsi import asn1, bounds
 from detector.streams.codecs.etsi.packaged import ALPHABETS, REMEDY
 from detector.streams.codecs.etsi.quantities import UNITS
+from wayside.api.asn1 import Asn1Module
 
 _SUCCESSORS = re.compile(r"\bWITH\s+(SUCCESSORS|DESCENDANTS)\b")
 """Says that a later version of a module will do; asn1tools does not know it."""
@@ -154,6 +156,18 @@ def parsed(text: str) -> dict[str, Any]:
         raise asn1.DefinitionError("no ASN.1: it is nested too deeply") from None
 
 
+def read_module(module: Asn1Module) -> str:
+    """The text of ASN.1 modules, found sound. Raises DefinitionError."""
+    text = module.definition
+    if text is None:
+        try:
+            text = Path(module.file or "").read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise asn1.DefinitionError(f"{module.file} cannot be read: {error}") from error
+    parsed(text)
+    return text
+
+
 @lru_cache(maxsize=8)
 def own_definitions(texts: tuple[str, ...]) -> OwnDefinitions:
     """The definitions of these texts, kept for the next time. Raises DefinitionError."""
@@ -167,7 +181,7 @@ def _compiled(trees: Mapping[str, _Tree]) -> dict[str, dict[str, Any]]:
         specification = tools.compile_dict(copy.deepcopy(dict(trees)), "uper")
     except tools.CompileError as error:
         raise asn1.DefinitionError(
-            f"the ASN.1 modules do not fit together: {error}: give all that they import"
+            f"the ASN.1 modules do not fit together: {str(error).rstrip('.')}: give all that they import"
         ) from None
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise asn1.DefinitionError(f"the ASN.1 modules cannot be resolved: {error!r}") from None

@@ -1,0 +1,32 @@
+"""ASN.1 modules that a Detector's user brings, for ETSI ITS messages that no package defines."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from wayside.api.base import Model, validations
+
+_ONE = "give either definition or file"
+
+
+class Asn1Module(Model):
+    """One or several ASN.1 modules, in the Detector itself or in a file."""
+
+    model_config = validations(("has(self.definition) != has(self.file)", _ONE))
+
+    definition: str | None = Field(
+        default=None, min_length=1, max_length=500_000, description="The modules as ASN.1 text."
+    )
+    file: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=1024,
+        description="The file with the modules, as the detector sees it: relative to the folder that it runs in, or "
+        "where a volume is mounted.",
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> Asn1Module:
+        if (self.definition is None) == (self.file is None):
+            raise ValueError(_ONE)
+        return self
