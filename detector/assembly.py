@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from detector.engine.engine import Engine, KeyReader
 from detector.engine.liveliness import LIVELINESS
+from detector.engine.naming import CLIENT_NAME
 from detector.engine.sample import Decoder
 from detector.models.binding import bind_models
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
@@ -25,8 +25,6 @@ from wayside.rules import (
     source_problems,
     stream_problems,
 )
-
-_CLIENT_NAME = re.compile(r"[A-Za-z0-9._:-]{1,63}")
 
 
 class DetectorError(ValueError):
@@ -90,6 +88,7 @@ def inlets(detector: Detector) -> Inlets:
         raise DetectorError(problems)
     patterns = {stream.name: KeyPattern.parse(stream.key) for stream in detector.spec.streams}
     clients = {stream.name: stream.client for stream in detector.spec.streams}
+    by_message = {stream.name for stream in detector.spec.streams if stream.names_by_message}
     if detector.spec.zenoh.liveliness is not None:
         patterns[LIVELINESS], clients[LIVELINESS] = KeyPattern.parse(detector.spec.zenoh.liveliness), None
 
@@ -98,8 +97,10 @@ def inlets(detector: Detector) -> Inlets:
         captures = None if pattern is None else pattern.match(key)
         if captures is None:
             return None
+        if stream in by_message:
+            return "", captures
         client = clients[stream] or captures["client"]
-        return (client, captures) if _CLIENT_NAME.fullmatch(client) else None
+        return (client, captures) if CLIENT_NAME.fullmatch(client) else None
 
     return Inlets(decoders, read_key, fields)
 

@@ -70,7 +70,9 @@ class Counters:
     """Payloads that could not be read when a rule or the clock needed them, by stream."""
     last_undecodable: dict[str, str] = field(default_factory=dict)
     unnamed: Counter[str] = field(default_factory=Counter)
-    """Samples dropped since their key names no valid client, by stream."""
+    """Samples dropped since neither their key nor their message names a valid client, by stream."""
+    last_unnamed: dict[str, str] = field(default_factory=dict)
+    """What the last message said instead, by stream."""
     crowded: Counter[str] = field(default_factory=Counter)
     """Samples dropped since too many clients were known already, by stream."""
     rules: dict[str, RuleCounters] = field(default_factory=dict)
@@ -80,3 +82,8 @@ class Counters:
         if name not in self.rules:
             self.rules[name] = RuleCounters()
         return self.rules[name]
+
+    def unreadable(self, stream: str, key: str, error: Exception) -> None:
+        """Count a payload that could not be read."""
+        self.undecodable[stream] += 1
+        self.last_undecodable[stream] = f"{key}: {error}"

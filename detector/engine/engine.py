@@ -18,6 +18,7 @@ from detector.engine.events import Event
 from detector.engine.inflow import Inflow
 from detector.engine.lanes import lane_makers
 from detector.engine.messages import KeyReader, Messages
+from detector.engine.naming import MessageClients
 from detector.engine.positions import Positions
 from detector.engine.queries import BufferQueries
 from detector.engine.sample import Arrival, Decoder, Sample
@@ -106,7 +107,8 @@ class Engine:
         self.buffer.maximum_bytes = spec.buffer.bytes.bytes
         self.clients.configure({c.name: c.labels for c in spec.clients}, spec.client_timeout.ns)
         self._lane_makers = lane_makers(detector, decoders)
-        self._inflow.configure(detector, read_key, self._lane_makers)
+        names = MessageClients(decoders, compiled, self.counters)
+        self._inflow.configure(detector, read_key, self._lane_makers, names)
         self._messages = Messages(decoders, compiled, read_key, self.counters)
         self._transforms = Transforms(_transform_streams(detector), self.buffer, self._messages, self.counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}

@@ -15,6 +15,7 @@ from detector.engine.counters import Counters
 from detector.engine.lanes import LaneMaker
 from detector.engine.liveliness import LIVELINESS, Token
 from detector.engine.messages import KeyReader
+from detector.engine.naming import MessageClients
 from detector.engine.sample import SAMPLE_OVERHEAD, Arrival, Stamped
 from wayside.api import Detector
 
@@ -28,6 +29,9 @@ MAXIMUM_LOST = 1_000
 """Of so many lost clients the newest samples are kept, for the case that they return; those lost first go first."""
 
 _STREAM = itemgetter(1)
+
+_BY_CLIENT = "/"
+"""Begins what lanes are remembered under that no key stands for: no key begins with a slash."""
 
 _NO_LANES: Mapping[str, Lane] = {}
 
@@ -43,11 +47,19 @@ class Inflow:
         self._lost: dict[str, None] = {}
         """The lost clients of which samples are kept, in the order of their loss."""
 
-    def configure(self, detector: Detector, read_key: KeyReader, lane_makers: Mapping[str, LaneMaker]) -> None:
+    def configure(
+        self,
+        detector: Detector,
+        read_key: KeyReader,
+        lane_makers: Mapping[str, LaneMaker],
+        message_clients: MessageClients,
+    ) -> None:
         """Take in the streams of this Detector from now on; `lane_makers` has one for each."""
+        self._message_clients = message_clients
         self._read_key = read_key
         self._lane_makers = lane_makers
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
+        """By key; of streams whose messages say whose they are, by client, which no key is: see `_lane_of_message`."""
 
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
         """Everything that is received comes through here. `times`: None for the receive times, in order."""
@@ -56,7 +68,7 @@ class Inflow:
             self._insert_in_order(arrivals)
             return
         for time, (_, stream, key, payload) in zip(times, arrivals, strict=True):
-            lane = self._lane(stream, key, time)
+            lane = self._lane(stream, key, time, payload)
             if lane is None:
                 if stream == LIVELINESS:
                     self._token(key, payload, time)
@@ -73,7 +85,7 @@ class Inflow:
             try:
                 lane = lanes[stream][key]
             except KeyError:
-                found = self._lane(stream, key, time)
+                found = self._lane(stream, key, time, payload)
                 if found is None:
                     if stream == LIVELINESS:
                         self._token(key, payload, time)
@@ -93,15 +105,20 @@ class Inflow:
                 held = buffer.bytes
         buffer.bytes = held
 
-    def _lane(self, stream: str, key: str, time: int) -> Lane | None:
+    def _lane(self, stream: str, key: str, time: int, payload: bytes) -> Lane | None:
         """The lane that takes a sample; None, and not counted among those taken in, where there is none for it."""
-        lane = self._lanes.get(stream, _NO_LANES).get(key) or self._route(stream, key, time)
+        if stream in self._message_clients:
+            lane = self._lane_of_message(stream, key, time, payload)
+        else:
+            lane = self._lanes.get(stream, _NO_LANES).get(key) or self._route(stream, key, time)
         if lane is None:
             self._counters.samples[stream] -= 1
         return lane
 
     def client_of(self, arrival: Arrival) -> str | None:
         """Whose the arrival is; None, and counted, where its key names no valid client."""
+        if arrival.stream in self._message_clients:
+            return self._read_message(arrival.stream, arrival.key, arrival.payload)
         lane = self._lanes.get(arrival.stream, _NO_LANES).get(arrival.key)
         return lane.client if lane is not None else self._read(arrival.stream, arrival.key)
 
@@ -148,8 +165,18 @@ class Inflow:
         if stream == LIVELINESS:
             return None
         client = self._read(stream, key)
+        return None if client is None else self._new_lane(stream, key, client, time)
+
+    def _lane_of_message(self, stream: str, key: str, time: int, payload: bytes) -> Lane | None:
+        """The lane for a message that says whose it is."""
+        client = self._read_message(stream, key, payload)
         if client is None:
             return None
+        name = _BY_CLIENT + client
+        return self._lanes[stream].get(name) or self._new_lane(stream, name, client, time)
+
+    def _new_lane(self, stream: str, key: str, client: str, time: int) -> Lane | None:
+        """A lane to remember under the key; None, and counted, where there are too many clients."""
         if client not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS:
             self._counters.crowded[stream] += 1
             return None
@@ -167,3 +194,10 @@ class Inflow:
             self._counters.unnamed[stream] += 1  # also what still came in on a stream that the Detector no longer has
             return None
         return whose[0]
+
+    def _read_message(self, stream: str, key: str, payload: bytes) -> str | None:
+        whose = self._read_key(stream, key)
+        if whose is None:
+            self._counters.unnamed[stream] += 1
+            return None
+        return self._message_clients.client(stream, key, whose[1], payload)

@@ -103,8 +103,7 @@ class Messages:
         return _nanoseconds(expression.evaluate({"msg": decoder.decode(payload)}))
 
     def _unreadable(self, stream: str, key: str, error: Exception) -> None:
-        self._counters.undecodable[stream] += 1
-        self._counters.last_undecodable[stream] = f"{key}: {error}"
+        self._counters.unreadable(stream, key, error)
 
 
 def _nanoseconds(seconds: object) -> int:

@@ -96,8 +96,13 @@ class Stream(Model):
     source: ObjectName = Field(
         default=ZENOH, description="Where the samples come from: zenoh, or the name of one of the Detector's sources."
     )
-    client: ClientName | None = Field(
-        default=None, description="The client that the data belongs to, where the key captures none."
+    client: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=512,
+        pattern=r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$",
+        description="The client that the data belongs to, where the key captures none: a name, or one made from the "
+        "message, as its-${msg.header.stationId}, with CEL over msg, and key for what the key captures.",
     )
     encoding: Encoding = Field(description="cdr (ROS 2 messages), json, or uper (ETSI ITS messages).")
     type: str | None = Field(
@@ -157,6 +162,11 @@ class Stream(Model):
             except ValueError as error:
                 raise ValueError(f"staleAfter: {error}; or Never") from None
         return self
+
+    @property
+    def names_by_message(self) -> bool:
+        """Whether `client` is a template over the message."""
+        return self.client is not None and "${" in self.client
 
     @property
     def stale_after_ns(self) -> int | None:

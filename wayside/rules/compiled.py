@@ -174,7 +174,8 @@ class CompiledRule:
 
 @dataclass(frozen=True, slots=True)
 class CompiledStream:
-    """How a sample of a stream tells the sender's time, where the Detector says so."""
+    """How a sample of a stream tells the sender's time and whose it is, where the Detector says so."""
 
     name: str
     stamp: Expression | None
+    client: CompiledTemplate | None = None

@@ -45,6 +45,7 @@ from wayside.rules.variables import (
     SAMPLE_MEMBERS,
     condition_environment,
     is_taken,
+    naming_environment,
     sample_environment,
     stamp_environment,
 )
@@ -82,7 +83,8 @@ def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> 
     if problems:
         raise RuleError(problems)
     stamp = None if stream.stamp is None else stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
-    return CompiledStream(stream.name, stamp)
+    client = compile_template(stream.client, naming_environment()) if stream.names_by_message else None
+    return CompiledStream(stream.name, stamp, client)
 
 
 def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
@@ -91,6 +93,8 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
         KeyPattern.parse(stream.key)
     except KeyPatternError as error:
         yield RuleProblem(("spec", "streams", index, "key"), str(error))
+    if stream.names_by_message:
+        yield from _naming_problems(stream, ("spec", "streams", index, "client"), fields)
     if stream.stamp is None:
         return
     path: FieldPath = ("spec", "streams", index, "stamp")
@@ -101,6 +105,17 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
         return
     if fields is not None:
         yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, "msg", fields))
+
+
+def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:
+    """What is wrong with a template that names the client by the message."""
+    try:
+        template = compile_template(stream.client, naming_environment())
+    except InterpolationError as error:
+        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        return
+    if fields is not None:
+        yield from (RuleProblem(path, text) for text in unknown_fields(template.paths, "msg", fields))
 
 
 class _RuleCompiler:

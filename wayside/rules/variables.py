@@ -40,6 +40,12 @@ def stamp_environment() -> Environment:
     return Environment({"msg": Kind.DYN})
 
 
+@cache
+def naming_environment() -> Environment:
+    """For a stream's `client`: the decoded message, and the captured chunks of its key."""
+    return Environment({"msg": Kind.DYN, "key": Kind.MAP})
+
+
 @lru_cache(maxsize=1024)
 def is_taken(name: str) -> bool:
     """Whether the name means something to CEL itself, so that no signal can have it."""
