@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.events import Event
 from detector.engine.sample import Arrival
-from tests.unit.driving import SECOND, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
+from tests.unit.driving import SECOND, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled, told
 
 KEPT, STALE, OVER = 4.0, 3.0, 2.0
 """Seconds: the buffer's duration, staleAfter and the windows."""
@@ -367,3 +368,44 @@ def test_first_decodes_only_the_sample_that_it_is() -> None:
     broken = [arrival(0.2 + 0.1 * i, "car", b"{") for i in range(5)]
     assert drive.take(arrival(0.1, "car", {"v": 1}), *broken, until=1) == ["r car started 1"]
     assert drive.engine.counters.undecodable["speed"] == 0
+
+
+ORDERED = a_rule(
+    signals=[
+        {"name": name.lower(), "stream": "speed", "value": "msg.v", "aggregate": name, **over}
+        for name, over in (
+            ("First", {}), ("Last", {}), ("Previous", {}), ("Delta", {"over": "3s"}), ("Rate", {"over": "3s"}),
+            ("Distinct", {"over": "3s"}),
+        )
+    ],
+    when="true",
+    evaluation={"every": "2s"},
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 20), st.integers(0, 9)), min_size=1, max_size=12))
+def test_with_clock_data_samples_count_in_order_of_their_stamps_and_those_of_one_time_as_they_came(
+    sent: list[tuple[int, int]],
+) -> None:
+    detector = a_detector(
+        a_stream("speed", stamp="msg.t"), a_stream("pose", stamp="msg.t"), clock="Data", lateness="3s", maxAhead="1h"
+    )  # so that nothing is too late
+    zero = at(0) / SECOND
+    arrivals = [
+        arrival(i / 100, "car", {"t": zero + tenths / 10, "v": value}) for i, (tenths, value) in enumerate(sent)
+    ]
+    drive = Drive(detector, ORDERED)
+    drive.engine.advance(arrivals, at(0))
+    drive.take(arrival(5, "car", {"t": zero + 10}, "pose"), until=0)
+    in_order = sorted(sent, key=lambda each: each[0])  # stable: those of one time as they came
+    times, values = [tenths / 10 for tenths, _ in in_order], [float(value) for _, value in in_order]
+    assert told(drive.events[:1]) == ["r car started 2"]
+    found = drive.events[0].values
+    assert found["first"] == values[0]
+    assert found["last"] == values[-1]
+    assert found.get("previous") == (values[-2] if len(values) > 1 else None)
+    assert found.get("delta") == (values[-1] - values[0] if len(values) > 1 else None)
+    between = times[-1] - times[0]
+    assert found.get("rate") == (pytest.approx((values[-1] - values[0]) / between) if between else None)
+    assert found["distinct"] == list(dict.fromkeys(values))

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from wayside.expressions.functions.angles import angle_difference, heading_difference, pitch, roll, yaw
 from wayside.expressions.functions.comparing import count_unmatched, nearest, unmatched
-from wayside.expressions.functions.motion import closest_approach, time_to_collision, time_to_contact
+from wayside.expressions.functions.motion import closest_approach, closing, time_to_collision, time_to_contact
 from wayside.expressions.functions.octets import all_zero, byte_count, checksum, number_at, utf8
 from wayside.expressions.functions.places import count_inside, inside, inside_wgs84, wgs84_bearing, wgs84_distance
 
@@ -141,6 +141,8 @@ def test_at_the_time_to_collision_they_touch_and_never_before(
 
     time = time_to_contact(dx, dy, vx, vy, radius)
     nearest_ever = closest_approach(dx, dy, vx, vy)
+    if math.hypot(dx, dy) > 1:
+        assert closing(dx, dy, vx, vy) == pytest.approx((apart(0) - apart(1e-7)) / 1e-7, abs=1e-3)
     assert time >= 0
     assert nearest_ever <= apart(0) * (1 + 1e-12)
     if math.isinf(time):

@@ -120,9 +120,27 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
             "spec.when",
             ["a.parameters has no field maxSped", "did you mean maxSpeed?"],
         ),
+        ({"when": "v > 3 &&\n parameters.maxSpeed == 'x'"}, "spec.when", ["line 2, column 22", "(double, string)"]),
+        ({"when": "parameters.maxSpeed"}, "spec.when", ["must be a boolean, is a number"]),
+        ({"when": "allZero(parameters.maxSpeed)"}, "spec.when", ["`allZero` does not take (double)"]),
+        (
+            {"signals": [{**SPEED, "where": "sample.size > 'x'"}]},
+            "spec.signals[0].where",
+            ["does not take (double, string)"],
+        ),
+        (
+            {"scope": {"pairs": {"position": POSITION, "within": 9}}, "when": "b.parameters.maxSpeed && true"},
+            "spec.when",
+            ["`&&` does not take", "it takes booleans"],
+        ),
+        (
+            {"actions": [a_deploy("go", parameters={"x": "${parameters.maxSpeed + 'x'}"})]},
+            "spec.actions[0].deploy.parameters.x",
+            ["`+` does not take (double, string)"],
+        ),
     ],
 )
-def test_a_parameter_that_is_not_there_is_told_where_it_is_used(
+def test_a_parameter_that_is_not_there_or_does_not_fit_is_told_where_it_is_used(
     spec: dict[str, Any], field: str, parts: list[str]
 ) -> None:
     with pytest.raises(RuleError) as caught:
@@ -152,6 +170,11 @@ def test_a_clients_value_that_does_not_fit_is_told_at_its_place_in_the_detector(
     assert problem.path == ("spec", "clients", 1, "parameters", "too-fast", field)
     assert str(problem).startswith(f"Detector d: spec.clients[1].parameters.too-fast.{field}: ")
     assert all(part in problem.message for part in parts), problem.message
+
+
+def test_has_asks_for_a_parameter_as_for_any_member() -> None:
+    rule = too_fast(when="has(parameters.maxSpeed) && v > parameters.maxSpeed")
+    assert Drive(with_values(), rule).take(arrival(0.5, "car", {"v": 12}), until=1) == ["too-fast car started 1"]
 
 
 @pytest.mark.parametrize(

@@ -78,17 +78,25 @@ _RESERVED: Final = (
 class Environment:
     """The variables that expressions may use. Immutable; compiled expressions are cached."""
 
-    def __init__(self, variables: Mapping[str, Kind]) -> None:
+    def __init__(self, variables: Mapping[str, Kind], members: Mapping[str, Kind] | None = None) -> None:
+        """`members` are those of maps whose kind is known, by their paths, such as `parameters.maxSpeed`.
+
+        They serve to find wrong types when compiling, and change nothing in what an expression yields.
+        """
         for name in variables:
             if not _NAME.fullmatch(name):
                 raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
             if name in _RESERVED.split():
                 raise ValueError(f"variable {name!r}: a word that CEL reserves; choose another name")
         self.variables: Mapping[str, Kind] = MappingProxyType(dict(variables))
-        self._env = cel.NewEnv(
-            variables={name: _TYPES[kind] for name, kind in variables.items()}, functions=list(DECLARATIONS)
-        )
+        self._members: Mapping[str, Kind] = MappingProxyType(dict(members or {}))
+        self._env = _cel_environment(self.variables)
+        self._typed = _cel_environment({**self.variables, **self._members}) if self._members else None
         self._cache: dict[tuple[str, Kind], Expression] = {}
+
+    def knowing(self, members: Mapping[str, Kind]) -> Environment:
+        """The same, with the kinds of more members known."""
+        return Environment(self.variables, {**self._members, **members}) if members else self
 
     def compile(self, source: str, *, result: Kind = Kind.DYN) -> Expression:
         """Compiles `source`; where its type can be told only at evaluation, `result` is checked then.
@@ -107,9 +115,11 @@ class Environment:
         try:
             program = self._env.compile(rewritten.text)
             read, leaves = self._reads(parse(program.serialize()))
+            # `has(a.b)` asks for a member of a map: with `a.b` a variable of its own it would not be a question.
+            typed = program if self._typed is None or "has(" in rewritten.text else self._typed.compile(rewritten.text)
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
             raise diagnose(str(error), source, rewritten, self.variables) from None
-        _check_static(program.return_type(), result, source)
+        _check_static(typed.return_type(), result, source)
         expression = Expression(source, program, read, leaves, result)
         if len(self._cache) >= _CACHE_SIZE:
             self._cache.clear()  # a bound against rules that come and go for months; refilling costs 50 µs each
@@ -124,6 +134,10 @@ class Environment:
             if len(path) > 1 or self.variables[str(path[0])] is Kind.DYN:
                 leaves[path] = Leaf.HANDED
         return paths(node, names), leaves
+
+
+def _cel_environment(variables: Mapping[str, Kind]) -> cel.Env:
+    return cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables.items()}, functions=list(DECLARATIONS))
 
 
 class Expression:

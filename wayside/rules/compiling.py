@@ -36,7 +36,7 @@ from wayside.rules.compiled import (
 )
 from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.models import compile_models
-from wayside.rules.parameters import override_problems, parameters_of
+from wayside.rules.parameters import kinds_of, override_problems, parameters_of
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.scopes import closing_speed_problem, compile_elements, compile_subject, known_members
 from wayside.rules.variables import (
@@ -127,6 +127,7 @@ class _RuleCompiler:
         self.detector = detector
         self.fields = fields
         self.parameters = parameters_of(rule, detector)
+        self.kinds = kinds_of(rule)
         self.problems = [
             RuleProblem(path, message, detector.name) for path, message in override_problems(rule, detector)
         ]
@@ -213,7 +214,7 @@ class _RuleCompiler:
         at: FieldPath = ("spec", "actions", index, "deploy", "parameters")
         parameters: CompiledTemplate
         try:
-            parameters = compile_template(dict(deploy.parameters), environment)
+            parameters = compile_template(dict(deploy.parameters), environment.knowing(self.kinds))
         except InterpolationError as error:
             for each in (error, *error.others):
                 self.problem((*at, _parameter_of(each)), str(each))
@@ -259,7 +260,7 @@ class _RuleCompiler:
         if source is None:
             return None
         try:
-            return environment.compile(source, result=kind)
+            return environment.knowing(self.kinds).compile(source, result=kind)
         except ExpressionError as error:
             for each in (error, *error.others):
                 self.problem(path, str(each))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
-from wayside.expressions import normalise
+from wayside.expressions import Kind, normalise
 
 Values = Mapping[str, Any]
 """Parameters by name, as expressions take them."""
@@ -47,6 +47,17 @@ def parameters_of(rule: EventRule, detector: Detector) -> Parameters:
     return Parameters(own, overridden)
 
 
+def kinds_of(rule: EventRule) -> Mapping[str, Kind]:
+    """The kinds of the rule's parameters, by their paths in expressions, those of a pair's a and b among them."""
+    prefixes = ("", "a.", "b.") if rule.spec.scope.pairs is not None else ("",)
+    return {
+        f"{prefix}parameters.{name}": _KINDS[_kind(value)]
+        for prefix in prefixes
+        for name, value in rule.spec.parameters.items()
+        if _kind(value) in _KINDS
+    }
+
+
 def override_problems(rule: EventRule, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
     """What is wrong with the Detector's values for the rule's parameters: the field of the Detector, and why."""
     own = rule.spec.parameters
@@ -81,6 +92,15 @@ def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
     elif isinstance(own, dict) and isinstance(other, dict):
         for key in own.keys() & other.keys():
             yield from _misfits(f"{name}.{key}", own[key], other[key], rule)
+
+
+_KINDS: Final = {
+    "boolean": Kind.BOOL,
+    "number": Kind.DOUBLE,
+    "text": Kind.STRING,
+    "list": Kind.LIST,
+    "map": Kind.MAP,
+}
 
 
 def _kind(value: object) -> str:

@@ -31,7 +31,10 @@ def sample_environment() -> Environment:
     msg is the decoded message, key the captured chunks, sample has stamp and received (seconds since the epoch),
     latency (seconds) and size (bytes); parameters are those of the sample's client.
     """
-    return Environment({"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP})
+    return Environment(
+        {"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP},
+        {f"sample.{member}": Kind.DOUBLE for member in SAMPLE_MEMBERS},
+    )
 
 
 @cache

@@ -38,6 +38,12 @@ def time_to_contact(dx: float, dy: float, vx: float, vy: float, radius: float) -
     return max(0.0, (apart - radius) * ((apart + radius) / (ahead + reach)) / speed)
 
 
+def closing(dx: float, dy: float, vx: float, vy: float) -> float:
+    """Metres per second at which two come nearer to each other now; at the same place they can only part."""
+    apart = math.hypot(dx, dy)
+    return -(dx / apart * vx + dy / apart * vy) if apart > 0 else -math.hypot(vx, vy)
+
+
 def closest_approach(dx: float, dy: float, vx: float, vy: float) -> float:
     """Metres at which two on straight ways will be nearest to each other, from now on."""
     speed = math.hypot(vx, vy)
@@ -55,6 +61,12 @@ FUNCTIONS = (
         "(m) apart, the one at dx, dy (m) with vx, vy (m/s) as seen from the other; infinite where that never happens",
         (time_to_collision, "gap closingSpeed"),
         (time_to_contact, "dx dy vx vy radius"),
+    ),
+    function(
+        "closing",
+        Yields.NUMBER,
+        "how fast two bodies come nearer, m/s, negative where they part; arguments as for timeToCollision",
+        (closing, "dx dy vx vy"),
     ),
     function(
         "closestApproach",
