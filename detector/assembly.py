@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from detector.engine.engine import Engine, KeyReader
 from detector.engine.liveliness import LIVELINESS
 from detector.engine.naming import CLIENT_NAME
+from detector.engine.plugins import PluginHost
 from detector.engine.sample import Decoder
 from detector.models.binding import bind_models
+from detector.plugins.instances import LocalHost
+from detector.plugins.registry import plugin_problems
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
 from detector.streams.codecs.etsi import OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.fields import message_fields
@@ -142,7 +145,8 @@ class RuleBook:
         wrong = dependency_problems(rules)
         for rule in rules:
             try:
-                compiled.append(bind_models(compile_rule(rule, detector, fields, wrong.get(rule.name, ()))))
+                known = (*wrong.get(rule.name, ()), *plugin_problems(rule, detector))
+                compiled.append(bind_models(compile_rule(rule, detector, fields, known)))
                 good[rule.name] = rule
             except RuleError as error:
                 before = self._good.get(rule.name)
@@ -158,11 +162,20 @@ class RuleBook:
 def _compiled(rule: EventRule, detector: Detector, fields: Mapping[str, Fields]) -> CompiledRule | None:
     """The rule, or None where the Detector no longer allows it."""
     try:
-        return bind_models(compile_rule(rule, detector, fields))
+        return bind_models(compile_rule(rule, detector, fields, plugin_problems(rule, detector)))
     except RuleError:
         return None
 
 
-def make_engine(detector: Detector, entries: Inlets, *, holder: str, start: int) -> Engine:
-    """An engine without rules; `start` is nanoseconds since the epoch."""
-    return Engine(detector, holder=holder, decoders=entries.decoders, read_key=entries.read_key, start=start)
+def make_engine(
+    detector: Detector, entries: Inlets, *, holder: str, start: int, plugins: PluginHost | None = None
+) -> Engine:
+    """An engine without rules; `start` is nanoseconds since the epoch. Without a host, plugins run in this process."""
+    return Engine(
+        detector,
+        holder=holder,
+        decoders=entries.decoders,
+        read_key=entries.read_key,
+        start=start,
+        plugins=plugins or LocalHost(),
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -17,8 +18,11 @@ from detector.assembly import DetectorError
 from detector.checking import check_documents, summary
 from detector.cluster.errors import NoClusterError
 from detector.comparison import write_comparison
+from detector.engine.plugins import PluginHost
+from detector.plugins.outages import Outages
+from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.errors import RecordingError
-from detector.replay.intake_file import is_intake_file, read_intake
+from detector.replay.intake_file import is_intake_file, read_intake, recorded_outages
 from detector.replay.latched import recorded_arrivals
 from detector.replay.progress import Progress
 from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
@@ -110,8 +114,13 @@ def replay(
     ] = None,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
-    with Progress(Console(stderr=True)) as progress:
-        outcome = _replayed(recordings, detector, rules, progress)
+    plugins = ProcessHost(
+        Outages(lambda: recorded_outages(recordings[0]) if detector is None else ()),
+        wait=True,
+        patience=REPLAY_PATIENCE,
+    )
+    with Progress(Console(stderr=True)) as progress, closing(plugins):
+        outcome = _replayed(recordings, detector, rules, progress, plugins)
     output.mkdir(parents=True, exist_ok=True)
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
         file.writelines(event.to_json() + "\n" for event in outcome.events)
@@ -157,7 +166,9 @@ def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folder
 app.command()(inquiry.status)
 
 
-def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] | None, progress: Progress) -> Outcome:
+def _replayed(
+    recordings: list[Path], detector: Path | None, rules: list[Path] | None, progress: Progress, plugins: PluginHost
+) -> Outcome:
     if recordings[0].exists() and is_intake_file(recordings[0]):
         if len(recordings) > 1:
             refuse("an intake file is replayed alone: give one recording")
@@ -168,6 +179,7 @@ def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] |
             progress.watch(read_intake(recordings[0])),
             None if given is None else given.detector,
             given.rules if given is not None and rules else None,
+            plugins,
         )
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
@@ -177,7 +189,7 @@ def _replayed(recordings: list[Path], detector: Path | None, rules: list[Path] |
     rule_set = loaded.rule_set
     router = Router(rule_set.detector.spec.streams)
     arrivals = recorded_arrivals(recordings, router, rule_set.detector)
-    outcome = replay_arrivals(progress.watch(arrivals), rule_set.detector, rule_set.rules)
+    outcome = replay_arrivals(progress.watch(arrivals), rule_set.detector, rule_set.rules, plugins)
     if not outcome.samples:
         keys = ", ".join(router.unrouted) or "none"
         typer.echo(f"no message belongs to a stream of the Detector; keys in the recording: {keys}", err=True)

@@ -20,6 +20,7 @@ from detector.engine.events import Event
 from detector.engine.intake import Intake
 from detector.engine.sample import Arrival
 from detector.losses import Losses
+from detector.plugins.outages import Outages
 from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from wayside.api.detector import Stream
@@ -70,14 +71,19 @@ class Evaluator:
         now: Callable[[], int],
         recorder: Recorder | None = None,
         on_failure: Callable[[BaseException], None],
+        outages: Outages | None = None,
     ) -> None:
-        """`now` gives nanoseconds since the epoch; `on_failure` is told if the thread dies of an error."""
+        """`now` gives nanoseconds since the epoch; `on_failure` is told if the thread dies of an error.
+
+        `outages` are those of the engine's plugins: they are recorded, so that a replay knows them.
+        """
         self._engine = engine
         self._intake = intake
         self._outlet = outlet
         self._now = now
         self._recorder = recorder
         self._on_failure = on_failure
+        self._outages = outages or Outages()
         self._rule_book = RuleBook()
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
@@ -185,7 +191,10 @@ class Evaluator:
         if self._recorder is not None and arrivals:
             self._recorder.arrivals(arrivals)
         self.status.arrived(arrivals)
-        return self._engine.advance(arrivals, now)
+        events = self._engine.advance(arrivals, now)
+        for document in self._outages.news():
+            self._record(self._engine.now, document)
+        return events
 
     def _gap(self, now: int, why: str) -> list[Event]:
         _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)

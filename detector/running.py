@@ -20,6 +20,7 @@ from detector.engine.liveliness import LIVELINESS
 from detector.evaluator import Evaluator
 from detector.event_log import EventLog
 from detector.outlet import LiveOutlet
+from detector.plugins.processes import ProcessHost
 from detector.replay.intake_writer import IntakeWriter
 from detector.rules.selection import RuleSet
 from detector.sources.registry import plugin_problems
@@ -57,7 +58,8 @@ class Running:
         entries = _checked(detector)
         self._tally = Tally()
         self._intake = Intake(time.time_ns)
-        self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns())
+        self._plugins = ProcessHost()
+        self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
         self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams)
         self._log = None if output is None else EventLog(output / "events.jsonl")
         self._outlet = LiveOutlet(self._network(detector), self._log, reconciler)
@@ -69,6 +71,7 @@ class Running:
             now=time.time_ns,
             recorder=self._writer,
             on_failure=self._fail,
+            outages=self._plugins.outages,
         )
         self.answers = Answers(self._evaluator, lambda: self._outlet)
         self._server = None if metrics_port is None else _server(metrics_port, self.answers)
@@ -96,6 +99,7 @@ class Running:
         if self._server is not None:
             self._server.close()
         self._evaluator.stop()
+        self._plugins.close()
         self._outlet.network.close()
         if self._log is not None:
             self._log.close()

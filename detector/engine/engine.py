@@ -19,6 +19,7 @@ from detector.engine.inflow import Inflow
 from detector.engine.lanes import lane_makers
 from detector.engine.messages import KeyReader, Messages
 from detector.engine.naming import MessageClients
+from detector.engine.plugins import NoPlugins, PluginHost, PluginSignals
 from detector.engine.positions import Positions
 from detector.engine.queries import BufferQueries
 from detector.engine.sample import Arrival, Decoder, Sample
@@ -48,8 +49,11 @@ class Engine:
         decoders: Mapping[str, Decoder],
         read_key: KeyReader,
         start: int,
+        plugins: PluginHost | None = None,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `decoders` has one for each stream.
+
+        `plugins` runs them; without it, their signals are unknown.
 
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
@@ -66,6 +70,8 @@ class Engine:
         """Gives nanoseconds of any clock; the shell sets one that runs. What it says is counted and decides nothing."""
         self._floor: int | None = None
         """Windows do not reach back further than the last gap; nanoseconds."""
+        self._plugin_host = plugins or NoPlugins()
+        self._plugins = PluginSignals(self._plugin_host, self.queries)
         self._inflow = Inflow(self.buffer, self.clients, self.counters)
         self._configure(detector, decoders, read_key)
         self._timeline = self._make_timeline(start)
@@ -147,6 +153,7 @@ class Engine:
             for event in runs[name].open_starts() if name in runs else ():
                 self._starts.started(event)
         self._signals.forget(lambda rule, client: rule in kept)
+        self._plugin_host.configure(rules, kept)
         self._ticks.set_periods([rule.every_ns for rule in rules if rule.enabled])
         self._rules_version += 1
         return events
@@ -250,7 +257,7 @@ class Engine:
                     run.counters,
                 )
                 begin = self.stopwatch()
-                happened = [*run.tick(time, views, self.clients)]
+                happened = [*run.tick(time, views, self.clients, self._plugins)]
                 run.counters.timed(time, self.stopwatch() - begin)
                 for event in happened:
                     self._starts.note(event)
@@ -265,6 +272,7 @@ class Engine:
             self._starts.buffer.step_back(time)
         self._floor = time
         self._signals.gap(time)
+        self._plugin_host.reset()
         self._positions.gap(time)
         self.clients.gap(time)
         for run in self._runs.values():

@@ -13,6 +13,7 @@ from detector.engine.counters import RuleCounters
 from detector.engine.demands import Demand
 from detector.engine.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
 from detector.engine.events import Event
+from detector.engine.plugins import PluginSignals
 from detector.engine.scopes import Candidate, Views, candidates
 from detector.engine.snapshots import snapshot
 from detector.engine.subjects import Subject, fits, subject_of
@@ -63,10 +64,11 @@ class RuleRun:
         """Whether the rule is evaluated at this tick."""
         return self.rule.enabled and now % self.rule.every_ns == 0
 
-    def tick(self, now: int, views: Views, clients: Clients) -> Iterator[Event]:
+    def tick(self, now: int, views: Views, clients: Clients, plugins: PluginSignals) -> Iterator[Event]:
         """Evaluate the rule for all subjects; yields what started and ended, in order of the subjects."""
         events = [*self._lost(now, clients)]
-        for candidate in candidates(self.rule, views, clients, self._in_progress()):
+        seen = candidates(self.rule, views, clients, self._in_progress())
+        for candidate in plugins.added(self.rule, seen, self.counters):
             self.counters.evaluations += 1
             events += self._subject(now, candidate)
         self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}

@@ -28,6 +28,10 @@ from wayside.expressions import UNKNOWN
 _STAMP = attrgetter("stamp")
 
 
+class QueryError(ValueError):
+    """A query that asks for what cannot be; the text says what is wrong with it."""
+
+
 class DecodedSample(NamedTuple):
     """One sample as a plugin sees it."""
 
@@ -44,7 +48,10 @@ class DecodedSample(NamedTuple):
 
 
 class Queries(Protocol):
-    """The buffer at one tick. `client=None` means all clients; samples that cannot be decoded are left out, counted."""
+    """The buffer at one tick. `client=None` means all clients; samples that cannot be decoded are left out, counted.
+
+    All raise QueryError for a stream that the Detector does not have.
+    """
 
     @property
     def now(self) -> int:
@@ -176,7 +183,7 @@ class BufferQueries:
     def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
         """See Queries."""
         if not streams:
-            raise ValueError("tuples: name at least one stream")
+            raise QueryError("tuples: name at least one stream")
         samples = [self._stamped(client, stream) for stream in streams]
         found = []
         for members in matched([[each[0] for each in of_stream] for of_stream in samples], slop):
@@ -196,12 +203,17 @@ class BufferQueries:
     def _names(self, client: str | None) -> list[str]:
         return list(self._clients) if client is None else [client]
 
+    def _lane(self, client: str, stream: str) -> Lane | None:
+        if stream not in self._stale_after:
+            raise QueryError(f"the Detector has no stream {stream!r}; it has {', '.join(self._stale_after)}")
+        return self._buffer.lane(client, stream)
+
     def _newest_first(
         self, client: str | None, stream: str, after: int | None, until: int, frame: str | None
     ) -> Iterator[DecodedSample]:
         """Of several clients, merged by time; of equal times, the client with the greater name first."""
         names = self._names(client)
-        lanes = [lane for name in names if (lane := self._buffer.lane(name, stream)) is not None]
+        lanes = [lane for name in names if (lane := self._lane(name, stream)) is not None]
         if len(lanes) == 1:
             yield from self._of_lane(lanes[0], after, until, frame)
             return
@@ -219,7 +231,7 @@ class BufferQueries:
         """The lane's samples with their stamps, in order of these, then of their times; computed once a tick."""
         known = self._by_stamp.get((client, stream))
         if known is None:
-            lane = self._buffer.lane(client, stream)
+            lane = self._lane(client, stream)
             samples = [] if lane is None else list(lane.newest_first(None, self._now))[::-1]
             known = []
             for index, sample in enumerate(samples):

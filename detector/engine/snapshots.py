@@ -15,6 +15,11 @@ _MEMBERS = 100
 def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
     """Signals, positions, distance and closing speed, where known; of a fleet its first members and their number."""
     variables = candidate.variables
+    of_the_subject = {plugin.name: variables[plugin.name] for plugin in rule.plugins if plugin.name in variables}
+    return {**_of_the_scope(rule, variables), **of_the_subject}
+
+
+def _of_the_scope(rule: CompiledRule, variables: Mapping[str, Any]) -> dict[str, Any]:
     match rule.subject:
         case PairSubject():
             values: dict[str, Any] = {

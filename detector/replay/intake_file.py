@@ -18,6 +18,7 @@ from mcap.records import Channel, DataEnd, Header, McapRecord, Message
 from mcap.stream_reader import StreamReader
 
 from detector.engine.sample import Arrival
+from detector.plugins.outages import KIND as OUTAGE
 from detector.replay.errors import DAMAGE, RecordingError
 
 LIBRARY = "wayside intake 1"
@@ -84,6 +85,11 @@ def read_intake(path: Path) -> Iterator[Arrival | Control]:
             if item is not None:
                 time = item[0]
                 yield item
+
+
+def recorded_outages(path: Path) -> Iterator[dict[str, Any]]:
+    """When the plugins of rules did not run, as the file says. Raises RecordingError."""
+    return (each.document for each in read_intake(path) if isinstance(each, Control) and each.kind == OUTAGE)
 
 
 def _item(record: McapRecord, channels: dict[int, Channel]) -> Arrival | Control | None:

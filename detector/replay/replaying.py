@@ -16,6 +16,7 @@ from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
 from detector.engine.demands import Demand, from_task, to_task
 from detector.engine.engine import Engine
 from detector.engine.events import Event
+from detector.engine.plugins import PluginHost
 from detector.engine.sample import Arrival
 from detector.losses import Losses
 from detector.replay.errors import RecordingError
@@ -53,9 +54,16 @@ class Replay:
     """An engine, and the bookkeeping of what it says."""
 
     def __init__(
-        self, detector: Detector, rules: Sequence[EventRule], *, holder: str, start: int, outcome: Outcome
+        self,
+        detector: Detector,
+        rules: Sequence[EventRule],
+        *,
+        holder: str,
+        start: int,
+        outcome: Outcome,
+        plugins: PluginHost | None = None,
     ) -> None:
-        """`start` is when the detector started, in nanoseconds since the epoch.
+        """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
 
         Raises:
             DetectorError: the Detector cannot run.
@@ -64,7 +72,7 @@ class Replay:
         self._entries: Inlets = inlets(detector)
         self._detector = detector
         self._rule_book = RuleBook()
-        self._engine: Engine = make_engine(detector, self._entries, holder=holder, start=start)
+        self._engine: Engine = make_engine(detector, self._entries, holder=holder, start=start, plugins=plugins)
         self._demands: dict[str, Demand] = {}
         self._version: tuple[int, int] | None = None
         self.set_rules(rules)
@@ -132,9 +140,14 @@ class Replay:
 
 
 def replay_intake(
-    records: Iterable[Arrival | Control], detector: Detector | None, rules: Sequence[EventRule] | None
+    records: Iterable[Arrival | Control],
+    detector: Detector | None,
+    rules: Sequence[EventRule] | None,
+    plugins: PluginHost | None = None,
 ) -> Outcome:
     """Replay an intake file: with what it holds, or with another Detector or other rules where given.
+
+    `plugins` runs them; without it they run in this process.
 
     Raises:
         RecordingError: it does not begin with a start.
@@ -152,7 +165,7 @@ def replay_intake(
                 batch = []
             continue
         if replay is None:
-            replay = _begin(record, detector, rules, outcome)
+            replay = _begin(record, detector, rules, outcome, plugins)
             continue
         replay.take(batch, _until(record, batch))
         batch = []
@@ -171,7 +184,13 @@ def _until(control: Control, batch: Sequence[Arrival]) -> int:
     return int(control.document.get("until", control.time))
 
 
-def _begin(record: Control, detector: Detector | None, rules: Sequence[EventRule] | None, outcome: Outcome) -> Replay:
+def _begin(
+    record: Control,
+    detector: Detector | None,
+    rules: Sequence[EventRule] | None,
+    outcome: Outcome,
+    plugins: PluginHost | None,
+) -> Replay:
     document = record.document
     if record.kind != "start":
         raise RecordingError(f"the intake file begins with {record.kind!r}, not with a start: record again")
@@ -181,6 +200,7 @@ def _begin(record: Control, detector: Detector | None, rules: Sequence[EventRule
         holder=document["holder"],
         start=record.time,
         outcome=outcome,
+        plugins=plugins,
     )
 
 
@@ -204,15 +224,17 @@ def _control(
         case "lost":
             outcome.lost += int(document["arrivals"])
         case _:
-            pass  # end: what came before has been taken in
+            pass  # end: what came before has been taken in; plugin: their host knows it already
 
 
 def _rules(document: Mapping[str, Any]) -> list[EventRule]:
     return [EventRule.model_validate(rule) for rule in document["rules"]]
 
 
-def replay_arrivals(arrivals: Iterable[Arrival], detector: Detector, rules: Sequence[EventRule]) -> Outcome:
-    """Replay what any other recording holds, as the live intake would have queued it.
+def replay_arrivals(
+    arrivals: Iterable[Arrival], detector: Detector, rules: Sequence[EventRule], plugins: PluginHost | None = None
+) -> Outcome:
+    """Replay what any other recording holds, as the live intake would have queued it; `plugins` as for an intake file.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -223,7 +245,8 @@ def replay_arrivals(arrivals: Iterable[Arrival], detector: Detector, rules: Sequ
     last = 0
     for arrival in arrivals:
         if replay is None:
-            replay = Replay(detector, rules, holder=detector.name, start=arrival.received - 1, outcome=outcome)
+            start = arrival.received - 1
+            replay = Replay(detector, rules, holder=detector.name, start=start, outcome=outcome, plugins=plugins)
         elif arrival.received - last > PAUSE:
             replay.take(batch, last)
             batch = []
@@ -238,7 +261,7 @@ def replay_arrivals(arrivals: Iterable[Arrival], detector: Detector, rules: Sequ
             replay.take(batch, last - 1)
             batch = []
     if replay is None:
-        replay = Replay(detector, rules, holder=detector.name, start=0, outcome=outcome)
+        replay = Replay(detector, rules, holder=detector.name, start=0, outcome=outcome, plugins=plugins)
     replay.take(batch, last)
     outcome.notes += replay.report()
     return outcome

@@ -24,6 +24,7 @@ from wayside.api.base import (
 from wayside.api.classification import Classification
 from wayside.api.constants import Constants
 from wayside.api.model import ModelSource
+from wayside.api.plugin import SignalPlugin
 from wayside.api.scopes import ClientScope, Each, Scope
 
 
@@ -77,7 +78,7 @@ class Evaluation(Model):
 
 
 class Signal(Model):
-    """A value computed from the samples of a stream, or from the episodes of another rule."""
+    """A value computed from a stream's samples, from another rule's episodes, by a model, or by a plugin."""
 
     model_config = validations(
         (
@@ -85,7 +86,7 @@ class Signal(Model):
             "all aggregates but Last, First, Previous, Age and Active need a window: give over, e.g. over: 5s",
         ),
         (
-            "has(self.model) || (self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
+            "has(self.model) || has(self.plugin) || (self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
             "give value, e.g. value: msg.speed; but none for the aggregates Count, Age and Active, "
             "which look at no value",
         ),
@@ -94,12 +95,12 @@ class Signal(Model):
             "the aggregate Active is for a signal over a rule, and takes neither over nor where",
         ),
         (
-            "[has(self.stream), has(self.rule), has(self.model)].filter(given, given).size() == 1",
-            "give exactly one of stream, rule and model",
+            "[has(self.stream), has(self.rule), has(self.model), has(self.plugin)].filter(given, given).size() == 1",
+            "give exactly one of stream, rule, model and plugin",
         ),
         (
-            "!has(self.model) || !(has(self.where) || has(self.over) || has(self.value))",
-            "a model's signal has no value, where or over: remove them",
+            "!(has(self.model) || has(self.plugin)) || !(has(self.where) || has(self.over) || has(self.value))",
+            "the signal of a model or plugin has no value, where or over: remove them",
         ),
     )
 
@@ -113,6 +114,11 @@ class Signal(Model):
     )
     model: ModelSource | None = Field(
         default=None, description="Instead of a stream, an ONNX model over other signals, an image or a point cloud."
+    )
+    plugin: SignalPlugin | None = Field(
+        default=None,
+        description="Instead of a stream, Python code that computes the value for the rule's subject at each "
+        "evaluation. In a pairs scope the value is the pair's: expressions use it by its name alone.",
     )
     value: Expression | None = Field(
         default=None,
@@ -136,11 +142,11 @@ class Signal(Model):
 
     @model_validator(mode="after")
     def _complete(self) -> Signal:
-        if sum(source is not None for source in (self.stream, self.rule, self.model)) != 1:
-            raise ValueError("give exactly one of stream, rule and model")
-        if self.model is not None:
+        if sum(source is not None for source in (self.stream, self.rule, self.model, self.plugin)) != 1:
+            raise ValueError("give exactly one of stream, rule, model and plugin")
+        if self.model is not None or self.plugin is not None:
             if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
-                raise ValueError("a model's signal has no value, where, over or aggregate: remove them")
+                raise ValueError("the signal of a model or plugin has no value, where, over or aggregate: remove them")
             return self
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")

@@ -35,6 +35,16 @@ def episode_stream(rule: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
+class CompiledPlugin:
+    """A signal that a plugin computes."""
+
+    name: str
+    plugin: str
+    parameters: Mapping[str, Any] = field(hash=False)
+    """As written; the plugin's own model makes more of them."""
+
+
+@dataclass(frozen=True, slots=True)
 class CompiledPosition:
     """How a client's position is computed."""
 
@@ -147,6 +157,7 @@ class CompiledRule:
     name: str
     subject: CompiledSubject
     signals: tuple[CompiledSignal, ...]
+    plugins: tuple[CompiledPlugin, ...]
     when: Expression
     until: Expression | None
     every_ns: int

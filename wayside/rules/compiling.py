@@ -27,6 +27,7 @@ from wayside.expressions import (
 from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.compiled import (
     CompiledDeploy,
+    CompiledPlugin,
     CompiledRule,
     CompiledSignal,
     CompiledStream,
@@ -138,6 +139,7 @@ class _RuleCompiler:
         elements = compile_elements(self, self.spec.each)
         signals = [self._signal(index, signal) for index, signal in enumerate(self.spec.signals)]
         models = compile_models(self, [signal for signal in signals if signal is not None])
+        plugins = [(each.name, each.plugin) for each in self.spec.signals if each.plugin is not None]
         environment = condition_environment(self.spec)
         when = self.condition(("spec", "when"), self.spec.when, environment)
         until = self.condition(("spec", "until"), self.spec.until, environment)
@@ -154,6 +156,7 @@ class _RuleCompiler:
             name=self.rule.name,
             subject=subject,
             signals=tuple(signal for signal in signals if signal is not None),
+            plugins=tuple(CompiledPlugin(name, plugin.name, plugin.parameters) for name, plugin in plugins),
             when=when,
             until=until,
             every_ns=spec.evaluation.every.ns,
@@ -176,11 +179,10 @@ class _RuleCompiler:
             self.problem((*at, "name"), f"{signal.name} is a name that every scope gives itself: choose another")
         elif is_taken(signal.name):
             self.problem((*at, "name"), f"{signal.name} is a word of CEL itself: choose another name")
-        if signal.model is not None:
-            return None
         if signal.rule is not None:
             return self._episode_signal(at, signal, signal.rule)
-        assert signal.stream is not None  # noqa: S101  the model holds exactly one source
+        if signal.stream is None:
+            return None  # a model's, or a plugin's
         stream = self.stream((*at, "stream"), signal.stream)
         value = self.sample((*at, "value"), signal.value, stream, Kind.DYN)
         where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL)

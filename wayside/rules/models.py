@@ -87,6 +87,8 @@ def _signal_problems(names: Iterable[str], by_name: Mapping[str, Signal]) -> Ite
             yield ("signals", position), f"the rule has no signal {name}; it has {known}"
         elif signal.model is not None:
             yield ("signals", position), f"{name} is computed by a model, which no other model can build on"
+        elif signal.plugin is not None:
+            yield ("signals", position), f"{name} is computed by a plugin, which no model can build on"
 
 
 def _window_problems(window: ModelWindow, by_name: Mapping[str, Signal], detector: Detector) -> Iterator[Located]:

@@ -123,7 +123,8 @@ def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:
     """The maps among the variables whose fields are known, and these: CEL itself does not know what is in them."""
     yield "parameters", dict.fromkeys(spec.parameters)
     if spec.scope.pairs is not None:
-        member: dict[str, Any] = dict.fromkeys((*MEMBER_OF_CLIENT, *(signal.name for signal in spec.signals)))
+        signals = (signal.name for signal in spec.signals if signal.plugin is None)
+        member: dict[str, Any] = dict.fromkeys((*MEMBER_OF_CLIENT, *signals))
         geographic = spec.scope.pairs.position.latitude is not None
         member["parameters"] = dict.fromkeys(spec.parameters)
         member["position"] = dict.fromkeys(("latitude", "longitude") if geographic else ("x", "y", "z"))

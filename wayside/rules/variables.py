@@ -89,12 +89,24 @@ def element_of(spec: EventRuleSpec) -> str | None:
 
 
 def signal_names(spec: EventRuleSpec) -> tuple[str, ...]:
-    """The signals that expressions can name."""
-    return tuple(signal.name for signal in spec.signals if not is_taken(signal.name))
+    """The signals that each client has and that expressions can name."""
+    return tuple(signal.name for signal in spec.signals if signal.plugin is None and not is_taken(signal.name))
 
 
 def condition_environment(spec: EventRuleSpec) -> Environment:
     """For `when`, `until` and the actions of a rule."""
+    plugins = tuple(signal.name for signal in spec.signals if signal.plugin is not None and not is_taken(signal.name))
+    return _with(_scope_environment(spec), plugins) if plugins else _scope_environment(spec)
+
+
+@lru_cache(maxsize=256)
+def _with(environment: Environment, plugins: tuple[str, ...]) -> Environment:
+    """And the signals that the subject has as a whole."""
+    return Environment({**environment.variables, **dict.fromkeys(plugins, Kind.DYN)})
+
+
+def _scope_environment(spec: EventRuleSpec) -> Environment:
+    """What the scope gives."""
     element = element_of(spec)
     if spec.scope.pairs is not None:
         return pairs_environment(element)

@@ -1,0 +1,116 @@
+"""Signals that plugins compute: what the engine asks of them, and what it makes of their answers.
+
+A plugin's value is computed at each evaluation, for the rule's subject, from the buffer as it is at the tick. Where and
+how a plugin runs is its host's business (detector/plugins); the engine only calls, in a fixed order, and takes a value,
+nothing, or a failure for an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+from detector.engine.counters import RuleCounters
+from detector.engine.queries import Queries
+from detector.engine.scopes import Candidate
+from wayside.expressions import Reason, Value
+from wayside.rules import CompiledRule
+
+
+class PluginCall(NamedTuple):
+    """One evaluation of a plugin's signal."""
+
+    rule: str
+    signal: str
+    subject: str
+    """As in events: `car1+car2~north`."""
+    clients: tuple[str, ...]
+    """The client, the two of a pair in order, or the fleet's members at this tick."""
+    element: str | None
+    """The element of `each`, where the rule has one."""
+
+
+class PluginFailedError(Exception):
+    """A plugin gave no value: it failed (Reason.ERROR), or it is not running (Reason.ABSENT). The text says why."""
+
+    def __init__(self, reason: Reason, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class PluginHost(Protocol):
+    """Runs the plugins of all rules. Called by the one thread that drives the engine."""
+
+    def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
+        """These rules are evaluated from now on; those that are not among `kept` begin without any state."""
+
+    def value(self, call: PluginCall, queries: Queries) -> Value:
+        """The signal's value, None where it has none. Raises PluginFailedError."""
+
+    def keep(self, rule: str, subjects: Collection[str]) -> None:
+        """The rule was evaluated for these subjects: the state of all others goes."""
+
+    def reset(self) -> None:
+        """Time jumped: all state goes, since windows begin anew."""
+
+
+class NoPlugins:
+    """The host of an engine that is given none."""
+
+    def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
+        """Nothing to prepare."""
+
+    def value(self, call: PluginCall, queries: Queries) -> Value:
+        """Raises PluginFailedError."""
+        raise PluginFailedError(Reason.ABSENT, "this engine runs no plugins")
+
+    def keep(self, rule: str, subjects: Collection[str]) -> None:
+        """Nothing to drop."""
+
+    def reset(self) -> None:
+        """Nothing to drop."""
+
+
+class PluginSignals:
+    """Adds the values of plugins to what the conditions of a rule see."""
+
+    def __init__(self, host: PluginHost, queries: Callable[[], Queries]) -> None:
+        """`queries` gives the buffer at the tick."""
+        self._host = host
+        self._queries = queries
+
+    def added(self, rule: CompiledRule, candidates: Iterable[Candidate], counters: RuleCounters) -> Iterator[Candidate]:
+        """The candidates with the values of the rule's plugin signals among their variables."""
+        if not rule.plugins:
+            yield from candidates
+            return
+        queries = self._queries()
+        subjects: set[str] = set()
+        for candidate in candidates:
+            subjects.add(candidate.subject.text)
+            values = dict(self._values(rule, candidate, queries, counters))
+            yield replace(candidate, variables={**candidate.variables, **values})
+        self._host.keep(rule.name, subjects)
+
+    def _values(
+        self, rule: CompiledRule, candidate: Candidate, queries: Queries, counters: RuleCounters
+    ) -> Iterator[tuple[str, Value]]:
+        subject = candidate.subject
+        clients = subject.clients or tuple(member["client"] for member in _members(candidate))
+        for plugin in rule.plugins:
+            call = PluginCall(rule.name, plugin.name, subject.text, clients, subject.element)
+            try:
+                value = self._host.value(call, queries)
+            except PluginFailedError as failure:
+                counters.note(failure.reason, f"signal {plugin.name}: plugin {plugin.plugin}: {failure}")
+                continue
+            if value is None:
+                counters.note(Reason.ABSENT, f"signal {plugin.name}: plugin {plugin.plugin} gave no value")
+            else:
+                yield plugin.name, value
+
+
+def _members(candidate: Candidate) -> list[dict[str, Any]]:
+    members: list[dict[str, Any]] = candidate.variables.get("members", [])
+    return members

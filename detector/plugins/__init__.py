@@ -1,0 +1,25 @@
+"""Plugins: Python classes that compute a signal from the buffer. See docs/plugins.md.
+
+What a plugin needs is here; everything else in this package is how the detector runs it.
+"""
+
+from detector.engine.geometry import Pose
+from detector.engine.poses import PoseError, pose_in
+from detector.engine.queries import DecodedSample, Queries, QueryError
+from detector.engine.transforms import TransformError
+from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
+
+__all__ = [
+    "DecodedSample",
+    "Plugin",
+    "PluginParameters",
+    "Pose",
+    "PoseError",
+    "Queries",
+    "QueryError",
+    "Seconds",
+    "StreamName",
+    "Subject",
+    "TransformError",
+    "pose_in",
+]

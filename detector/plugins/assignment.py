@@ -1,0 +1,29 @@
+"""Which of two sets of points belong together: as many pairs within a gate as there can be, the nearest of these."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+Point = tuple[float, float]
+"""Metres."""
+
+
+def assigned(first: Sequence[Point], second: Sequence[Point], gate: float) -> dict[int, int]:
+    """From indices of the one to indices of the other, each used at most once, at most `gate` metres apart.
+
+    Of all assignments with the greatest number of pairs, one with the smallest sum of distances.
+    """
+    if not first or not second:
+        return {}
+    # Not at the top: it takes half a second to import.
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415
+
+    distances = np.array([[math.dist(a, b) for b in second] for a in first])
+    within = distances <= gate
+    # Dearer than all pairs within the gate together: so it is taken only where there is no pair left.
+    beyond = (gate + 1.0) * (min(len(first), len(second)) + 1)
+    rows, columns = linear_sum_assignment(np.where(within, distances, beyond))
+    return {int(row): int(column) for row, column in zip(rows, columns, strict=True) if within[row, column]}

@@ -1,0 +1,93 @@
+"""The objects of one plugin signal, one for each subject; and a host that calls them in the detector's own process."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from detector.engine.plugins import PluginCall, PluginFailedError
+from detector.engine.queries import Queries
+from detector.plugins.base import Plugin, Subject
+from detector.plugins.registry import prepare
+from detector.plugins.values import plain
+from wayside.expressions import Reason, Value
+from wayside.rules import CompiledPlugin, CompiledRule
+
+
+class Instances:
+    """The objects of one signal."""
+
+    def __init__(self, plugin: str, parameters: Mapping[str, Any]) -> None:
+        """Raises PluginError."""
+        self._plugin, self._parameters = prepare(plugin, parameters)
+        self._objects: dict[str, Plugin[Any]] = {}
+
+    def value(self, subject: Subject, clients: tuple[str, ...], queries: Queries) -> Value:
+        """The signal's value. Raises whatever the plugin raises, and TypeError where its value is no plain data."""
+        found = self._objects.get(subject.text)
+        if found is None:
+            found = self._objects[subject.text] = self._plugin(self._parameters, subject)
+        return plain(found.value(queries, clients))
+
+    def keep(self, subjects: Collection[str]) -> None:
+        """Drop the objects of all other subjects."""
+        for subject in [each for each in self._objects if each not in subjects]:
+            del self._objects[subject]
+
+    def reset(self) -> None:
+        """Drop all objects."""
+        self._objects.clear()
+
+    def __len__(self) -> int:
+        return len(self._objects)
+
+
+def failure_text(error: BaseException) -> str:
+    """What a plugin raised, in one line, with the place in the plugin's own code where it did."""
+    place, trace = "", error.__traceback__
+    while trace is not None:
+        name = trace.tb_frame.f_code.co_filename
+        if "/detector/plugins/" not in name or name.endswith("unmatched.py"):
+            place = f" ({name.rsplit('/', 1)[-1]}:{trace.tb_lineno})"
+        trace = trace.tb_next
+    return f"{type(error).__name__}: {error}{place}"[:500]
+
+
+class LocalHost:
+    """Runs plugins in the detector's own process: for tests and debuggers. One that hangs is not stopped."""
+
+    def __init__(self) -> None:
+        self._signals: dict[tuple[str, str], Instances] = {}
+
+    def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
+        """See PluginHost."""
+        self._signals = {
+            place: self._signals[place] if place in self._signals and rule.name in kept else _instances(plugin)
+            for rule in rules
+            for plugin in rule.plugins
+            if (place := (rule.name, plugin.name))
+        }
+
+    def value(self, call: PluginCall, queries: Queries) -> Value:
+        """See PluginHost."""
+        try:
+            return self._signals[call.rule, call.signal].value(
+                Subject(call.subject, call.element), call.clients, queries
+            )
+        except Exception as error:  # a plugin may raise whatever it likes
+            raise PluginFailedError(Reason.ERROR, failure_text(error)) from error
+
+    def keep(self, rule: str, subjects: Collection[str]) -> None:
+        """See PluginHost."""
+        for (of_rule, _), instances in self._signals.items():
+            if of_rule == rule:
+                instances.keep(subjects)
+
+    def reset(self) -> None:
+        """See PluginHost."""
+        for instances in self._signals.values():
+            instances.reset()
+
+
+def _instances(plugin: CompiledPlugin) -> Instances:
+    return Instances(plugin.plugin, plugin.parameters)

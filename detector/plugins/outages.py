@@ -1,0 +1,58 @@
+"""Which calls of plugins found none running: told live, recorded with the intake, and given again by its replay.
+
+Calls of a signal are counted from the engine's start; that count is the same live and in a replay, whatever the clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from detector.engine.plugins import PluginCall
+
+KIND = "plugin"
+"""Of the controls in an intake file."""
+
+
+class Outages:
+    """Notes when a plugin goes and comes back; in a replay, knows it beforehand."""
+
+    def __init__(self, recorded: Callable[[], Iterable[Mapping[str, Any]]] | None = None) -> None:
+        """`recorded` gives the controls of an intake file; it is called when the first plugin is."""
+        self._recorded = recorded
+        self._expected: dict[tuple[str, str], list[tuple[int, bool]]] | None = None
+        self._calls: dict[tuple[str, str], int] = {}
+        self._away: set[tuple[str, str]] = set()
+        self._news: list[dict[str, Any]] = []
+
+    def expects(self, call: PluginCall) -> bool:
+        """Whether the plugin ran at this call, as far as a recording says; to be asked once for each call."""
+        place = call.rule, call.signal
+        number = self._calls[place] = self._calls.get(place, 0) + 1
+        if self._expected is None:
+            self._expected = {}
+            for document in () if self._recorded is None else self._recorded():
+                changes = self._expected.setdefault((document["rule"], document["signal"]), [])
+                changes.append((document["call"], document["running"]))
+        changes = self._expected.get(place, [])
+        return next((running for since, running in reversed(changes) if since <= number), True)
+
+    def note(self, call: PluginCall, *, running: bool) -> None:
+        """Whether the plugin ran at this call."""
+        place = call.rule, call.signal
+        if running is (place in self._away):
+            (self._away.discard if running else self._away.add)(place)
+            self._news.append(
+                {
+                    "kind": KIND,
+                    "rule": call.rule,
+                    "signal": call.signal,
+                    "call": self._calls[place],
+                    "running": running,
+                }
+            )
+
+    def news(self) -> list[dict[str, Any]]:
+        """What changed since the last call, as controls for the intake file."""
+        news, self._news = self._news, []
+        return news

@@ -1,0 +1,177 @@
+"""The process of one plugin signal, as the detector sees it: started, asked, stopped, and started again.
+
+One that does not give its value within the patience is killed, and its state with it; it is started again after growing
+pauses, three times, and then stays stopped until its rule changes.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+from detector.engine.plugins import PluginCall, PluginFailedError
+from detector.engine.queries import Queries
+from detector.plugins.wire import ClosedError, Wire
+from wayside.expressions import Reason, Value
+from wayside.rules import CompiledPlugin
+
+_log = logging.getLogger(__name__)
+
+PATIENCE = 0.5
+"""Seconds in which a live plugin must give its value: less than the stall from which on ticks are not made up for."""
+
+START_PATIENCE = 60.0
+"""Seconds in which a plugin must have started, where one waits for it."""
+
+_PAUSES = (1.0, 10.0, 60.0)
+"""Seconds before a stopped plugin is started again; after the last time it is not."""
+
+_GLANCE = 0.0005
+"""Seconds for a look at whether it has started."""
+
+_QUERIES = frozenset({"clients", "streams", "newest", "last", "between", "nearest", "pose", "tuples", "transform"})
+
+
+class StoppedError(Exception):
+    """The process was stopped, or ended by itself; the text says why."""
+
+
+class SignalProcess:
+    """The process of one signal."""
+
+    def __init__(self, rule: str, plugin: CompiledPlugin, monotonic: Callable[[], float]) -> None:
+        self._rule = rule
+        self._plugin = plugin
+        self._monotonic = monotonic
+        self._process: subprocess.Popen[bytes] | None = None
+        self._wire: Wire | None = None
+        self._ready = False
+        self._subjects: set[str] = set()
+        self._starts = 0
+        self._again_at = 0.0
+        self.why = "its process is starting"
+
+    def start(self) -> None:
+        """Start the process, unless it was started before; returns at once."""
+        if not self._starts:
+            self._launch()
+
+    def _launch(self) -> None:
+        self._starts += 1
+        self.why = "its process is starting"
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603  our own module
+                [sys.executable, "-m", "detector.plugins.worker", str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=2,  # what a plugin prints belongs to the log
+                pass_fds=(theirs.fileno(),),
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
+            )
+        self._wire = Wire(ours)
+        self._wire.send("start", self._plugin.plugin, self._plugin.parameters)
+
+    def is_ready(self, within: float, *, again: bool) -> bool:
+        """Whether it can be asked, after waiting so many seconds for its start; `again`: a stopped one may start."""
+        if self._process is None and again and self._starts <= len(_PAUSES) and self._monotonic() >= self._again_at:
+            self._launch()
+        if self._ready or self._wire is None:
+            return self._ready
+        try:
+            answer, *content = self._wire.receive(max(within, _GLANCE))
+        except TimeoutError:
+            if within:
+                self._end(f"did not start within {within:g} s")
+            return False
+        except ClosedError:
+            self._end("ended while it was starting")
+            return False
+        if answer == "refused":
+            self._end(f"cannot run: {content[0]}")
+        self._ready = answer == "ready"
+        return self._ready
+
+    def ask(self, call: PluginCall, queries: Queries, patience: float) -> Value:
+        """The signal's value. Raises PluginFailedError where the plugin failed, StoppedError where it is no more."""
+        wire = self._wire
+        assert wire is not None  # noqa: S101  it is ready
+        self._subjects.add(call.subject)
+        try:
+            wire.send("value", call.subject, call.element, call.clients, queries.now, within=patience)
+            while True:
+                asked = self._monotonic()
+                answer, *content = wire.receive(max(patience, 0.0))
+                patience -= self._monotonic() - asked  # the time that we take for the queries is not the plugin's
+                match answer:
+                    case "query":
+                        _reply(wire, queries, *content)
+                    case "failed":
+                        raise PluginFailedError(Reason.ERROR, content[0])
+                    case _:
+                        value: Value = content[0]
+                        return value
+        except TimeoutError:
+            raise StoppedError(self._end("gave no value in time")) from None
+        except ClosedError:
+            raise StoppedError(self._end("ended by itself")) from None
+
+    def keep(self, subjects: Collection[str]) -> None:
+        """Drop the state of all other subjects."""
+        if not self._subjects <= set(subjects):
+            self._subjects &= set(subjects)
+            self._tell("keep", sorted(self._subjects))
+
+    def reset(self) -> None:
+        """Drop all state."""
+        if self._subjects:
+            self._subjects.clear()
+            self._tell("reset")
+
+    def stop(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        if self._wire is not None:
+            self._wire.close()
+        self._process = self._wire = None
+        self._ready = False
+
+    def _tell(self, *message: Any) -> None:
+        if self._ready and self._wire is not None:
+            try:
+                self._wire.send(*message, within=PATIENCE)
+            except (TimeoutError, ClosedError):
+                self._end("ended by itself, or does not read what it is told")
+
+    def _end(self, why: str) -> str:
+        self.stop()
+        self._subjects.clear()
+        if self._starts <= len(_PAUSES):
+            pause = _PAUSES[self._starts - 1]
+            self._again_at = self._monotonic() + pause
+            then = f"it is stopped, and started again after {pause:g} s"
+        else:
+            then = "it stays stopped until its rule changes"
+        self.why = f"its process {why}; {then}"
+        _log.error(
+            "EventRule %s, signal %s, plugin %s: %s", self._rule, self._plugin.name, self._plugin.plugin, self.why
+        )
+        return self.why
+
+
+def _reply(wire: Wire, queries: Queries, method: str, arguments: list[Any], options: Mapping[str, Any]) -> None:
+    try:
+        if method not in _QUERIES:
+            raise ValueError(f"there is no query {method}")
+        answer: tuple[Any, ...] = "answer", getattr(queries, method)(*arguments, **options)
+        wire.send(*answer, within=PATIENCE)
+    except (ClosedError, TimeoutError):
+        raise
+    except Exception as error:  # noqa: BLE001  what a plugin asks for must not stop the engine
+        wire.send("raised", type(error).__name__, str(error))

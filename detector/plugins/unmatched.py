@@ -1,0 +1,176 @@
+"""Objects of one list without a counterpart in another: what one of two perceptions sees and the other does not.
+
+The two lists are those of one client, or one of each client of a pair. Samples of about the same stamp are compared:
+the objects are brought into one frame, matched by position (as many pairs within the gate as there can be, and of these
+the nearest), and what is left over is followed over time. The signal is the list of those that have been left over for
+long enough; a rule says e.g. `when: size(unmatched) > 0`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from detector.engine.geometry import NO_MOTION, Pose
+from detector.engine.queries import DecodedSample, Queries, frame_of
+from detector.engine.transforms import TransformError
+from detector.engine.tuples import matched
+from detector.plugins.assignment import Point, assigned
+from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
+from detector.plugins.tracking import Tracks
+from wayside.expressions import Value
+
+_SAMPLES = 100
+"""So many samples of each list are looked at, from the newest on."""
+
+_LATE = 1_000_000_000
+"""Nanoseconds for which what was compared last stands, while the transforms of newer samples are not known."""
+
+_OBJECTS = 500
+"""The longest list; matching takes the cube of it."""
+
+Metres = Annotated[float, Field(gt=0, le=10_000)]
+
+
+class PoseStream(PluginParameters):
+    """Where the client is, in the common frame."""
+
+    stream: StreamName
+    at: str = ""
+    """The path to the pose in the message; without it pose, pose.pose or transform."""
+
+
+class ObjectList(PluginParameters):
+    """Where a list of objects is, and in which frame its positions are."""
+
+    stream: StreamName
+    list: str = "objects"
+    """The path to the list in the message, such as `objects` or `perception.tracks`."""
+    x: str = "x"
+    y: str = "y"
+    """The paths to the position in an object, in metres."""
+    frame: str | None = None
+    """The common frame: tf takes positions from the message's header.frame_id into it, at the message's stamp."""
+    pose: PoseStream | None = None
+    """Instead of tf: positions are relative to the client, which is there."""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> ObjectList:
+        if self.frame is not None and self.pose is not None:
+            raise ValueError("give frame (by tf) or pose (by a stream), not both; neither: the frame is common already")
+        return self
+
+
+class UnmatchedParameters(PluginParameters):
+    """What is compared with what, and how."""
+
+    objects: ObjectList
+    counterparts: ObjectList | None = None
+    """Default: as objects, which makes sense for a pair."""
+    of: Literal["a", "b"] = "a"
+    """In a pairs scope: whose objects are looked for among the other's."""
+    within: Metres = 2.0
+    """The gate: how far an object and its counterpart may be apart, in metres."""
+    slop: Seconds = 0.1
+    """How far apart the stamps of samples that are compared may be."""
+    persist: Seconds = 1.0
+    """How long an object must be without a counterpart."""
+    gap: Seconds = 0.0
+    """How long it may be out of sight, or matched, in between."""
+    speed: Annotated[float, Field(ge=0, le=1000)] = 15.0
+    """How fast objects move at most, in m/s: what is further away is another one."""
+
+
+class UnmatchedObjects(Plugin[UnmatchedParameters]):
+    """Objects of a list without a counterpart: a list of {x, y, seconds} in the common frame, oldest first."""
+
+    Parameters = UnmatchedParameters
+
+    def __init__(self, parameters: UnmatchedParameters, subject: Subject) -> None:
+        super().__init__(parameters, subject)
+        self._tracks = Tracks(parameters.within, parameters.speed, round(parameters.gap * 1e9))
+        self._last: int | None = None
+        """The stamp of the objects that were compared last."""
+
+    def value(self, queries: Queries, clients: tuple[str, ...]) -> Value:
+        """None until two samples could be compared, and where one of the streams is stale."""
+        if len(clients) > 2:
+            raise ValueError(f"it compares one client or two, not {len(clients)}: use it in a client or pairs scope")
+        parameters = self.parameters
+        seer, other = (clients[0], clients[-1]) if parameters.of == "a" else (clients[-1], clients[0])
+        theirs = parameters.counterparts or parameters.objects
+        if parameters.objects.stream not in queries.streams(seer) or theirs.stream not in queries.streams(other):
+            return None
+        objects = _by_stamp(queries.last(seer, parameters.objects.stream, _SAMPLES))
+        counterparts = _by_stamp(queries.last(other, theirs.stream, _SAMPLES))
+        stamps = [[sample.stamp for sample in objects], [sample.stamp for sample in counterparts]]
+        error: TransformError | None = None
+        newest = 0
+        for mine, its in matched(stamps, round(parameters.slop * 1e9)):
+            newest = objects[mine].stamp
+            if self._last is None or newest > self._last:
+                try:
+                    self._compare(queries, parameters.objects, objects[mine], theirs, counterparts[its])
+                except TransformError as now_unknown:
+                    error = now_unknown  # it may still come
+        if error is not None and (self._last is None or newest - self._last > _LATE):
+            raise error
+        if self._last is None:
+            return None
+        lasting = self._tracks.lasting(self._last, round(parameters.persist * 1e9))
+        return [
+            {"x": track.place[0], "y": track.place[1], "seconds": (self._last - track.since) / 1e9} for track in lasting
+        ]
+
+    def _compare(
+        self, queries: Queries, mine: ObjectList, objects: DecodedSample, theirs: ObjectList, others: DecodedSample
+    ) -> None:
+        """Follow what the one sample has and the other has not. Raises TransformError."""
+        points = _points(mine, objects, _frame(queries, mine, objects))
+        counterparts = _points(theirs, others, _frame(queries, theirs, others))
+        found = assigned(points, counterparts, self.parameters.within)
+        self._tracks.follow([point for index, point in enumerate(points) if index not in found], objects.stamp)
+        self._last = objects.stamp
+
+
+def _by_stamp(samples: list[DecodedSample]) -> list[DecodedSample]:
+    return sorted(samples, key=lambda sample: sample.stamp)
+
+
+def _frame(queries: Queries, of: ObjectList, sample: DecodedSample) -> Pose:
+    """What takes the list's positions into the common frame, at the sample's stamp. Raises TransformError."""
+    if of.pose is not None:
+        pose = queries.pose(sample.client, of.pose.stream, sample.stamp, at=of.pose.at)
+        if pose is None:
+            raise TransformError(f"stream {of.pose.stream} of {sample.client} has no poses around {sample.stamp} ns")
+        return pose
+    if of.frame is None:
+        return NO_MOTION
+    source = frame_of(sample.message)
+    if source is None:
+        raise ValueError(f"a message of stream {of.stream} has no header.frame_id, which frame: {of.frame} needs")
+    return queries.transform(sample.client, of.frame, source, sample.stamp)
+
+
+def _points(of: ObjectList, sample: DecodedSample, frame: Pose) -> list[Point]:
+    """Where the objects are in the common frame; those that say no place are left out."""
+    objects = _at(sample.message, of.list)
+    if not isinstance(objects, list):
+        raise ValueError(f"a message of stream {of.stream} has no list at {of.list!r}")
+    if len(objects) > _OBJECTS:
+        raise ValueError(f"a message of stream {of.stream} has {len(objects)} objects: at most {_OBJECTS} are compared")
+    places = ((_at(each, of.x), _at(each, of.y)) for each in objects)
+    return [frame.apply((x, y, 0.0))[:2] for x, y in places if _is_place(x) and _is_place(y)]
+
+
+def _is_place(value: Any) -> bool:
+    return isinstance(value, float | int) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _at(message: Any, path: str) -> Any:
+    here = message
+    for name in path.split("."):
+        here = here.get(name) if isinstance(here, dict) else None
+    return here

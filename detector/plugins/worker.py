@@ -1,0 +1,152 @@
+"""The process in which the plugin of one signal runs: `python -m detector.plugins.worker FD`.
+
+It only answers; its queries go back to the detector, which answers them from its buffer while it waits for the value.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from detector.engine.geometry import Pose
+from detector.engine.poses import PoseError
+from detector.engine.queries import DecodedSample, QueryError
+from detector.engine.transforms import TransformError
+from detector.plugins.base import Subject
+from detector.plugins.instances import Instances, failure_text
+from detector.plugins.registry import PluginError
+from detector.plugins.wire import ClosedError, Wire
+
+_RAISED = {kind.__name__: kind for kind in (TransformError, PoseError, QueryError)}
+
+_Samples = list[DecodedSample]
+
+
+class RemoteQueries:
+    """The queries of Queries, asked of the detector."""
+
+    def __init__(self, wire: Wire, now: int) -> None:
+        self._wire = wire
+        self._now = now
+
+    @property
+    def now(self) -> int:
+        """See Queries."""
+        return self._now
+
+    def clients(self) -> list[str]:
+        """See Queries."""
+        found: list[str] = self._ask(list[str], "clients")
+        return found
+
+    def streams(self, client: str) -> list[str]:
+        """See Queries."""
+        found: list[str] = self._ask(list[str], "streams", client)
+        return found
+
+    def newest(self, client: str | None, stream: str, *, frame: str | None = None) -> DecodedSample | None:
+        """See Queries."""
+        found: DecodedSample | None = self._ask(DecodedSample | None, "newest", client, stream, frame=frame)
+        return found
+
+    def last(self, client: str | None, stream: str, count: int, *, frame: str | None = None) -> list[DecodedSample]:
+        """See Queries."""
+        found: _Samples = self._ask(_Samples, "last", client, stream, count, frame=frame)
+        return found
+
+    def between(
+        self, client: str | None, stream: str, after: int, until: int, *, frame: str | None = None
+    ) -> list[DecodedSample]:
+        """See Queries."""
+        found: _Samples = self._ask(_Samples, "between", client, stream, after, until, frame=frame)
+        return found
+
+    def nearest(self, client: str | None, stream: str, stamp: int, *, frame: str | None = None) -> DecodedSample | None:
+        """See Queries."""
+        found: DecodedSample | None = self._ask(DecodedSample | None, "nearest", client, stream, stamp, frame=frame)
+        return found
+
+    def pose(self, client: str, stream: str, stamp: int, *, at: str = "") -> Pose | None:
+        """See Queries."""
+        found: Pose | None = self._ask(Pose | None, "pose", client, stream, stamp, at=at)
+        return found
+
+    def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
+        """See Queries."""
+        found: list[tuple[DecodedSample, ...]] = self._ask(
+            list[tuple[DecodedSample, ...]], "tuples", client, list(streams), slop
+        )
+        return found
+
+    def transform(self, client: str, target: str, source: str, stamp: int | None = None) -> Pose:
+        """See Queries."""
+        found: Pose = self._ask(Pose, "transform", client, target, source, stamp)
+        return found
+
+    def _ask(self, kind: Any, method: str, *arguments: Any, **options: Any) -> Any:
+        self._wire.send("query", method, arguments, options)
+        answer, *content = self._wire.receive()
+        if answer == "raised":
+            name, text = content
+            raise _RAISED.get(name, QueryError)(text)
+        return msgspec.convert(content[0], kind)
+
+
+def serve(wire: Wire) -> None:
+    """Answer until the detector hangs up."""
+    _, plugin, parameters = wire.receive()
+    try:
+        instances = Instances(plugin, parameters)
+    except PluginError as error:
+        wire.send("refused", str(error))
+        return
+    wire.send("ready")
+    while True:
+        what, *content = wire.receive()
+        match what:
+            case "value":
+                wire.send(*_value(instances, wire, *content))
+            case "keep":
+                instances.keep(set(content[0]))
+            case "reset":
+                instances.reset()
+
+
+def _value(
+    instances: Instances, wire: Wire, subject: str, element: str | None, clients: list[str], now: int
+) -> tuple[str, Any]:
+    try:
+        return "result", instances.value(Subject(subject, element), tuple(clients), RemoteQueries(wire, now))
+    except ClosedError:
+        raise
+    except Exception as error:  # noqa: BLE001  a plugin may raise whatever it likes
+        return "failed", failure_text(error)
+
+
+def _leave_with_the_detector() -> None:
+    """However the detector ended, and whatever the plugin is doing: nobody is left behind."""
+    parent = os.getppid()
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(0)
+
+
+def main() -> None:
+    """Run until the detector hangs up; it stops this process, not the terminal's Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with_the_detector, daemon=True).start()
+    with contextlib.suppress(ClosedError):
+        serve(Wire(socket.socket(fileno=int(sys.argv[1]))))
+
+
+if __name__ == "__main__":
+    main()

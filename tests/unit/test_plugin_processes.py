@@ -1,0 +1,150 @@
+"""Plugins in processes of their own: the same values, and one that hangs or dies is stopped while the others go on."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import pytest
+
+from detector.engine.events import Event
+from detector.engine.sample import Arrival
+from detector.plugins.instances import LocalHost
+from detector.plugins.outages import Outages
+from detector.plugins.processes import ProcessHost
+from tests.unit.driving import a_detector, arrival
+from tests.unit.plugin_rules import PluginDrive, plugin_rule, plugins
+
+__all__ = ["plugins"]  # a fixture
+
+pytestmark = pytest.mark.usefixtures("plugins")
+
+PATIENT = 60.0
+"""Seconds: no plugin of a test is as slow as that, however busy the machine."""
+
+
+class Clock:
+    """Time for pauses between starts, as the test wants it."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def host() -> Iterator[ProcessHost]:
+    with closing(ProcessHost(wait=True, patience=PATIENT)) as made:
+        yield made
+
+
+def values(events: list[Event]) -> list[Any]:
+    return [event.to_json() for event in events]
+
+
+def some_arrivals() -> list[Arrival]:
+    """At tick t the newest value of client a is 4t - 6, from tick 2 on."""
+    return [arrival(1.3 + n / 4, "ab"[n % 2], {"v": n}) for n in range(24)]
+
+
+def test_in_a_process_the_events_are_those_of_the_own_process(host: ProcessHost) -> None:
+    rule = plugin_rule(when="p.count >= 3 && p.v != 12", parameters={"raiseAt": 6})
+    driven = [PluginDrive(a_detector(), rule, host=each) for each in (host, LocalHost())]
+    for drive in driven:
+        drive.take(*some_arrivals(), until=7)
+    assert driven[0].events
+    assert values(driven[0].events) == values(driven[1].events)
+    counters = [drive.engine.counters.rule("r") for drive in driven]
+    assert counters[0].errors == counters[1].errors > 0
+    assert counters[0].last_error == counters[1].last_error
+
+
+def stuck(host: ProcessHost, **parameters: Any) -> PluginDrive:
+    """A drive in which the plugin of rule r goes wrong at 2.5 s; rule z goes on."""
+    rules = plugin_rule("r", parameters=parameters), plugin_rule("z", when="p.count >= 5")
+    drive = PluginDrive(a_detector(), *rules, host=host)
+    for seconds, value in ((0.5, 1), (2.4, 7), (3.5, 1)):
+        drive.take(arrival(seconds, "a", {"v": value}), until=math.floor(seconds))
+    return drive
+
+
+def test_one_that_ends_is_told_and_the_others_go_on(host: ProcessHost) -> None:
+    drive = stuck(host, exitAt=7)
+    assert drive.take(until=6) == ["z a started 5"]
+    counters = drive.engine.counters.rule("r")
+    assert counters.errors == 1
+    assert counters.last_error.startswith("signal p: plugin counting: its process ended by itself; it is stopped")
+    assert counters.unknowns == 3 + 4  # the signal's, and those of the condition
+
+
+def test_one_that_hangs_is_stopped_and_told(caplog: pytest.LogCaptureFixture) -> None:
+    with closing(ProcessHost(wait=True, patience=PATIENT)) as host:
+        drive = PluginDrive(a_detector(), plugin_rule("r", parameters={"hangAt": 7}), plugin_rule("z"), host=host)
+        drive.take(arrival(0.5, "a", {"v": 1}), until=1)
+        process = host._signals["r", "p"]._process
+        host._patience = 0.2
+        assert drive.take(arrival(1.5, "a", {"v": 7}), until=2) == []
+        host._patience = PATIENT
+        assert drive.take(until=4) == ["z a started 3"]
+        assert process is not None
+        assert process.returncode is not None
+        assert "its process gave no value in time; it is stopped" in caplog.text
+        assert "EventRule r, signal p, plugin counting" in caplog.text
+
+
+def test_live_it_is_started_again_after_a_pause_three_times() -> None:
+    clock = Clock()
+    with closing(ProcessHost(patience=PATIENT, monotonic=clock)) as host:
+        drive = PluginDrive(a_detector(), plugin_rule(parameters={"exitAt": 7}), host=host)
+        for start, pause in enumerate((1, 10, 60, 1000)):
+            wait_for_it(host, drive, start * 100)
+            drive.take(arrival(start * 100 + 50, "a", {"v": 7}), until=start * 100 + 51)
+            assert host._signals["r", "p"]._process is None
+            clock.now += pause
+        assert "stays stopped until its rule changes" in host._signals["r", "p"].why
+        drive.take(until=500)
+        assert host._signals["r", "p"]._process is None
+
+
+def wait_for_it(host: ProcessHost, drive: PluginDrive, seconds: int) -> None:
+    """Evaluate until the plugin gives values; the process starts while we do."""
+    drive.take(arrival(seconds + 0.5, "a", {"v": 1}), until=seconds + 1)
+    assert host._signals["r", "p"].is_ready(PATIENT, again=False)
+
+
+def test_what_did_not_run_is_the_same_when_it_is_told_beforehand() -> None:
+    """Live, the plugin starts, gives values, ends, and is started again; a replay with the same outages agrees."""
+    clock = Clock()
+    rule = plugin_rule(when="p.count >= 2", until="p.count >= 4", parameters={"exitAt": 6})
+    with closing(ProcessHost(patience=PATIENT, monotonic=clock)) as host:
+        live = PluginDrive(a_detector(), rule, host=host)
+        wait_for_it(host, live, 0)
+        live.take(*some_arrivals(), until=6)
+        clock.now += 5
+        live.take(until=7)
+        wait_for_it(host, live, 7)
+        live.take(until=14)
+        told = host.outages.news()
+    assert [(each["call"], each["running"]) for each in told][:2] == [(1, False), (2, True)]
+    assert len(told) == 4
+    again = [arrival(0.5, "a", {"v": 1}), *some_arrivals(), arrival(7.5, "a", {"v": 1})]
+    with closing(ProcessHost(Outages(lambda: told), wait=True, patience=PATIENT)) as host:
+        replayed = PluginDrive(a_detector(), rule, host=host)
+        for each, until in ((again[:1], 1), (again[1:-1], 7), (again[-1:], 14)):
+            replayed.take(*each, until=until)
+        assert host.outages.news() == []
+    assert live.events
+    assert values(live.events) == values(replayed.events)
+
+
+def test_a_rule_that_goes_takes_its_process_along(host: ProcessHost) -> None:
+    drive = PluginDrive(a_detector(), plugin_rule(), host=host)
+    drive.take(arrival(0.5, "a", {"v": 1}), until=1)
+    process = host._signals["r", "p"]._process
+    assert process is not None
+    drive.engine.set_rules([])
+    with pytest.raises(ProcessLookupError):
+        os.kill(process.pid, 0)
