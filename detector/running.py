@@ -122,7 +122,7 @@ class Running:
             self._rule_set = replace(wanted, detector=detector)
             self._evaluator.configure(self._rule_set)
             spec = detector.spec
-            if spec.zenoh != before.zenoh or _keys(spec.streams) != _keys(before.streams):
+            if spec.zenoh != before.zenoh or _subscribed(spec.streams) != _subscribed(before.streams):
                 await asyncio.to_thread(self._outlet.move, self._network(detector))
             await asyncio.to_thread(self._sources.follow, detector)
 
@@ -136,6 +136,7 @@ class Running:
             self._putter,
             on_failure=self._fail,
             answering=lambda session: Answering(session, holder, self.answers.answer),
+            tally=self._tally,
         )
 
     def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
@@ -203,6 +204,6 @@ def _checked(detector: Detector) -> Inlets:
     return entries
 
 
-def _keys(streams: Iterable[Stream]) -> list[tuple[str, str]]:
+def _subscribed(streams: Iterable[Stream]) -> list[tuple[object, ...]]:
     """What the network has to know of the streams."""
-    return [(stream.name, stream.key) for stream in streams if stream.source == ZENOH]
+    return [(stream.name, stream.key, stream.history, stream.recover) for stream in streams if stream.source == ZENOH]

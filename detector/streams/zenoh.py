@@ -22,9 +22,10 @@ from detector.engine.liveliness import LIVELINESS
 from detector.streams.answering import Answering
 from detector.streams.liveliness import TokenWatch
 from detector.streams.session import Connections, NetworkError, await_session, open_session
+from detector.streams.subscribing import Subscription, subscribe
+from detector.streams.tally import Tally
 from wayside.api.detector import Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
-from wayside.keys import KeyPattern
 
 log = logging.getLogger(__name__)
 
@@ -55,19 +56,17 @@ class Network:
         capacity: int = 4096,
         on_failure: Callable[[BaseException], None] = lambda error: None,
         answering: Callable[[zenoh.Session], Answering] | None = None,
+        tally: Tally | None = None,
     ) -> None:
         """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
 
-        `answering` answers queries once there is a session.
-
-        `on_failure` is told if a thread dies of an error. Raises KeyPatternError.
+        `answering` answers queries once there is a session. What was lost before the detector goes into the `tally`.
+        `on_failure` is told if a thread dies of an error.
         """
         self._on_failure = on_failure
         self._config = config
-        self._subscriptions = [
-            (stream.name, zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression), putter(stream.name))
-            for stream in streams
-        ]
+        self._streams = [(stream, putter(stream.name)) for stream in streams]
+        self._tally = Tally() if tally is None else tally
         self._liveliness = config.liveliness
         self._put_token = putter(LIVELINESS)
         self._tokens: TokenWatch | None = None
@@ -135,9 +134,10 @@ class Network:
 
     def _join(self, session: zenoh.Session) -> None:
         self._connections = Connections(session)
-        for name, expression, put in self._subscriptions:
-            subscriber = session.declare_subscriber(expression, zenoh.handlers.FifoChannel(_CHANNEL))
-            thread = threading.Thread(target=self._receive, args=(subscriber, put), name=f"stream {name}", daemon=True)
+        for stream, put in self._streams:
+            subscription = subscribe(session, stream, _CHANNEL, self._tally)
+            name = f"stream {stream.name}"
+            thread = threading.Thread(target=self._receive, args=(subscription, put), name=name, daemon=True)
             thread.start()
             self._receivers.append(thread)
         if self._liveliness is not None:
@@ -146,10 +146,10 @@ class Network:
         if self._make_answering is not None:
             self._answering = self._make_answering(session)
 
-    def _receive(self, subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]], put: Put) -> None:
+    def _receive(self, subscription: Subscription, put: Put) -> None:
         """Hands over what comes on a stream, until the session is closed."""
         try:
-            _pump(subscriber.handler, put)
+            _pump(subscription.handler, put)
         except Exception as error:  # noqa: BLE001  this thread's edge: without it, the stream would be silent for ever
             if not self._stop.is_set():
                 log.critical("a stream's thread ended, nothing is received on it any more: %s", error)

@@ -49,6 +49,13 @@ class Encoding(StrEnum):
     UPER = "uper"
 
 
+class History(Model):
+    """How much of what publishers remember is asked for; without limits, all of it."""
+
+    samples: int | None = Field(default=None, ge=1, le=100_000, description="The newest so many samples on each key.")
+    age: PositiveDuration | None = Field(default=None, description="Samples that are not older than this.")
+
+
 class StreamBuffer(Model):
     """How much of a stream is kept, per client."""
 
@@ -95,6 +102,16 @@ class Stream(Model):
     )
     source: ObjectName = Field(
         default=ZENOH, description="Where the samples come from: zenoh, or the name of one of the Detector's sources."
+    )
+    history: History | None = Field(
+        default=None,
+        description="Over Zenoh: what was published before the detector or its publisher came is asked for, of "
+        "Advanced Publishers that remember it.",
+    )
+    recover: bool = Field(
+        default=False,
+        description="Over Zenoh: samples lost on the way are asked for again, of Advanced Publishers that number and "
+        "remember them; what stays lost is counted.",
     )
     client: str | None = Field(
         default=None,

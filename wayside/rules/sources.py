@@ -27,6 +27,12 @@ def source_problems(detector: Detector) -> Iterator[RuleProblem]:
             )
     for index, stream in enumerate(detector.spec.streams):
         if stream.source in (ZENOH, *names):
+            if stream.source != ZENOH and (stream.history is not None or stream.recover):
+                field = "recover" if stream.history is None else "history"
+                yield RuleProblem(
+                    ("spec", "streams", index, field),
+                    f"is for streams over Zenoh, not for source {stream.source}: remove it",
+                )
             continue
         close = difflib.get_close_matches(stream.source, names, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join([ZENOH, *names])}"

@@ -1,0 +1,61 @@
+"""How a stream is subscribed to: plainly, or as an Advanced Subscriber that asks publishers for what it missed.
+
+A plain subscriber is the faster one, so streams that ask for neither history nor recovery get it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import zenoh
+from zenoh import ext
+
+from detector.streams.tally import Cause, Tally
+from wayside.api.detector import Stream
+from wayside.keys import KeyPattern
+
+
+class Subscription(Protocol):
+    """A subscriber of either kind; withdrawn when nothing refers to it any more."""
+
+    @property
+    def handler(self) -> zenoh.handlers.Handler[zenoh.Sample]:
+        """The channel in which samples wait."""
+
+
+class _Watched:
+    """An Advanced Subscriber and what listens to its misses, which live as long as each other."""
+
+    def __init__(
+        self, subscriber: ext.AdvancedSubscriber[zenoh.handlers.Handler[zenoh.Sample]], missed: Callable[[int], None]
+    ) -> None:
+        self._subscriber = subscriber
+        self._listener = subscriber.sample_miss_listener(lambda miss: missed(miss.nb))
+
+    @property
+    def handler(self) -> zenoh.handlers.Handler[zenoh.Sample]:
+        return self._subscriber.handler
+
+
+def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tally) -> Subscription:
+    """Subscribes to the stream's key; at most `capacity` samples wait. Raises KeyPatternError, zenoh.ZError."""
+    expression = zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression)
+    channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(capacity)
+    if stream.history is None and not stream.recover:
+        return session.declare_subscriber(expression, channel)
+    history = stream.history
+    subscriber = ext.declare_advanced_subscriber(
+        session,
+        expression,
+        channel,
+        history=None
+        if history is None
+        else ext.HistoryConfig(
+            detect_late_publishers=True,
+            max_samples=history.samples,
+            max_age=None if history.age is None else history.age.seconds,
+        ),
+        recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True) if stream.recover else None,
+    )
+    return _Watched(subscriber, lambda count: tally.add(Cause.MISSED, stream.name, count))
