@@ -104,7 +104,9 @@ def run(
 
 @app.command()
 def replay(
-    recordings: Annotated[list[Path], typer.Argument(help="Intake files, MCAP files, rosbag2 folders, JSON lines.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Intake files, MCAP files, rosbag2 folders, ROS 1 bags, JSON lines.")
+    ],
     output: Annotated[Path, typer.Option(help="The folder for events.jsonl and tasks.yaml.")],
     detector: DetectorFile = None,
     rules: RuleFiles = None,

@@ -1,0 +1,59 @@
+"""The plugin `bag`: plays recordings into the running detector, at their own speed or another."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from pydantic import BaseModel, Field
+
+from detector.replay.recordings import open_recordings
+from detector.replay.routing import Router
+from detector.sources.base import Feed, Source
+from wayside.api.base import Model
+
+_LONGEST_WAIT = 0.5
+"""Seconds at most between two looks whether to stop."""
+
+
+class BagParameters(Model):
+    """Which recordings to play, and how."""
+
+    paths: list[Annotated[str, Field(min_length=1, max_length=1024)]] = Field(
+        min_length=1,
+        max_length=16,
+        description="The recordings: rosbag2 folders, ROS 1 bags, MCAP files, JSON lines. They are played as one.",
+    )
+    rate: float = Field(default=1.0, gt=0, le=1000, description="How many times as fast as recorded.")
+    loop: bool = Field(default=False, description="Whether to begin anew at the end.")
+
+
+class BagSource(Source[BagParameters]):
+    """Recordings, played as if they happened now: with clock Wall, messages are received when they are played."""
+
+    Parameters: ClassVar[type[BaseModel]] = BagParameters
+
+    def run(self, feed: Feed) -> None:
+        """Play to the end. Raises RecordingError where a recording is missing, damaged, or does not fit a stream."""
+        while not feed.stopping:
+            self._play(feed)
+            if not self.parameters.loop:
+                return
+            feed.wait(0.01)  # a recording of no length must not keep the processor busy
+
+    def _play(self, feed: Feed) -> None:
+        router = Router([stream.spec for stream in feed.streams])
+        recordings = open_recordings([Path(path) for path in self.parameters.paths], router.wanted)
+        first: int | None = None
+        began = time.monotonic()
+        for arrival in router.arrivals(recordings):
+            if first is None:
+                first, began = arrival.received, time.monotonic()
+            due = began + (arrival.received - first) / 1e9 / self.parameters.rate
+            while (ahead := due - time.monotonic()) > 0:
+                if feed.wait(min(ahead, _LONGEST_WAIT)):
+                    return
+            if feed.stopping:
+                return
+            feed.deliver(arrival.stream, arrival.key, arrival.payload)
