@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 
 import msgspec
 
 from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
-from detector.status.model import Drops, Status, to_json
+from detector.status.model import Drops, Explanation, Status, to_json
+
+_PATIENCE = 5.0
+"""Seconds in which the evaluation should have time for a question."""
 
 _SILENT = 30.0
 """Seconds without a look after which the evaluation is taken for dead; one that is merely slow says so itself."""
@@ -57,8 +61,25 @@ class Answers:
             return to_json(status)
         rules = [each for each in status.rules if each.name == rule]
         if not rules:
-            raise ValueError(f"detector {status.holder} has no rule {rule!r}; it has {_listed(status)}")
-        return to_json(msgspec.structs.replace(status, rules=rules))
+            raise ValueError(f"detector {status.holder} has no rule {rule}; it has {_listed(status)}")
+        explanation = self._explanation(rule, given.get("subject"), given.get("wait", "1"))
+        return to_json(msgspec.structs.replace(status, rules=rules, explanation=explanation))
+
+    def _explanation(self, rule: str, subject: str | None, wait: str) -> Explanation | None:
+        """What the rule's next evaluation sees; None where there is none within so many seconds."""
+        if not re.fullmatch(r"[0-9]{1,2}(\.[0-9]{1,3})?", wait):
+            raise ValueError(f"wait={wait}: give seconds below 100, e.g. wait=2.5")
+        watching = None
+        try:
+            watching = self._evaluator.call(lambda: self._evaluator.status.watch(rule, subject)).result(_PATIENCE)
+            return watching.result(float(wait))
+        except ValueError as error:
+            return Explanation(0.0, [], [str(error)])
+        except TimeoutError:
+            return None
+        finally:
+            if watching is not None:
+                watching.cancel()
 
 
 def _listed(status: Status) -> str:

@@ -34,14 +34,22 @@ def status(
     name: Name = None,
     connect: Connect = None,
     rule: Annotated[str | None, typer.Option(help="Tell only about this rule.")] = None,
+    subject: Annotated[
+        str | None, typer.Option(help="With --rule: the subject, e.g. car1, car1+car2 or ~fleet; default: the first.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each detector.")] = False,
     timeout: Timeout = 3.0,
 ) -> None:
-    """Say what running detectors take in, evaluate and lose."""
+    """Say what running detectors take in, evaluate and lose; of a rule also what it sees, and what is unknown."""
+    if subject is not None and rule is None:
+        refuse("--subject goes with --rule: of which rule?")
+    given = {"rule": rule, "subject": subject, "wait": f"{min(timeout * 0.6, 99):.3f}"} if rule is not None else {}
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
-    for answer in inquire("status", {} if rule is None else {"rule": rule}, detector, name, connect, timeout):
+    for answer in inquire(
+        "status", {name: value for name, value in given.items() if value is not None}, detector, name, connect, timeout
+    ):
         if as_json:
             typer.echo(json.dumps(json.loads(answer.payload)))
         else:

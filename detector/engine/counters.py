@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 from wayside.expressions import Reason
 
+_MAXIMUM_NOTES = 1000
+
 _MAXIMUM_REASONS = 16
 """So many different reasons are kept for each rule: some name values, of which there is no end."""
 
@@ -38,8 +40,13 @@ class RuleCounters:
     crowded_pairs: int = 0
     """Pairs within reach that were not looked at, there being more than `maxPairs`; each at each evaluation."""
 
+    notes: list[str] | None = None
+    """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
+
     def note(self, reason: Reason, message: str) -> None:
         """Count an expression's unknown result."""
+        if self.notes is not None and len(self.notes) < _MAXIMUM_NOTES:
+            self.notes.append(message)
         if reason is Reason.ERROR:
             self.errors += 1
             self.last_error = message

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from detector.engine.clients import Clients
 from detector.engine.counters import RuleCounters
@@ -47,6 +47,17 @@ class Episode:
     """Actions that changed since: their demands hold until they can be rendered anew."""
 
 
+class Sight(NamedTuple):
+    """What the evaluation of a rule saw of one subject, after it has decided. Times are nanoseconds."""
+
+    now: int
+    candidate: Candidate
+    when: Truth
+    until: Truth
+    is_open: bool
+    onset: int | None
+
+
 class RuleRun:
     """A rule and the states of its subjects."""
 
@@ -55,6 +66,8 @@ class RuleRun:
         self.counters = counters
         self._identity = identity
         self._timing = _timing(rule)
+        self.witness: Callable[[Sight], None] | None = None
+        """Told what each evaluation sees, while somebody wants to know. It decides nothing."""
         self.version = 0
         """Changes whenever the demands do."""
         self._states: dict[Subject, SubjectState] = {}
@@ -186,6 +199,8 @@ class RuleRun:
                 if episode is not None and (episode.outdated or len(episode.demands) < len(self.rule.deploys)):
                     episode.variables = variables
                     self._render(episode)
+        if self.witness is not None:
+            self.witness(Sight(now, candidate, when, until, state.is_open, state.onset))
 
     def _truth(self, expression: Expression, variables: Mapping[str, Any]) -> Truth:
         value = expression.evaluate_or_unknown(variables, self.counters.note)

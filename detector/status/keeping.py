@@ -11,6 +11,7 @@ import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from importlib.metadata import version
 from itertools import islice
 
@@ -20,7 +21,17 @@ from detector.engine.engine import Engine
 from detector.engine.evaluation import RuleRun
 from detector.engine.sample import Arrival
 from detector.losses import Losses
-from detector.status.model import ClientStatus, Drops, Histogram, RuleState, RuleStatus, Status, StreamStatus
+from detector.status.explaining import Watching
+from detector.status.model import (
+    ClientStatus,
+    Drops,
+    Explanation,
+    Histogram,
+    RuleState,
+    RuleStatus,
+    Status,
+    StreamStatus,
+)
 
 BOUNDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Of the latencies' histograms, in seconds."""
@@ -72,6 +83,7 @@ class StatusKeeper:
         self._stream_latencies: dict[str, _Latencies] = {}
         self._rule_latencies: dict[str, _Latencies] = {}
         self._version = version("wayside")
+        self._watching: list[Watching] = []
         self.gaps = 0
         self.latest: Status = self._take(self._started)
 
@@ -90,9 +102,16 @@ class StatusKeeper:
         self._refusals = {refusal.rule.name: refusal for refusal in refusals}
         self._taken = 0
 
+    def watch(self, rule: str, subject: str | None) -> Future[Explanation]:
+        """What the rule's next evaluation sees: of a subject, or of the first ones. Raises ValueError."""
+        watching = Watching(self._engine, rule, subject)
+        self._watching.append(watching)
+        return watching.future
+
     def looked(self) -> None:
         """The evaluation has done what was due."""
         self._beat = time.monotonic()
+        self._watching = [watching for watching in self._watching if not watching.is_over()]
         now = self._now()
         if self._engine.on_wall_clock:
             for name, run in self._engine.rules.items():

@@ -6,6 +6,7 @@ Counts are since the detector's start, times are seconds, sizes bytes.
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Any
 
 import msgspec
 
@@ -101,6 +102,37 @@ class RuleStatus(msgspec.Struct, frozen=True, rename="camel"):
     """From the receipt of the newest sample that an evaluation saw to the evaluation's end; clock Wall only."""
 
 
+class SubjectStatus(msgspec.Struct, frozen=True, rename="camel"):
+    """What one evaluation of a rule saw of a subject; None stands for unknown."""
+
+    subject: str
+    looked_at: bool
+    why: str = ""
+    """Why it was not looked at."""
+    in_scope: bool | None = None
+    near: bool | None = None
+    """Whether an episode may start: a pair within reach."""
+    when: bool | None = None
+    until: bool | None = None
+    open: bool = False
+    pending: float | None = None
+    """For how long `when` has held, of a subject that waits for `for`."""
+    values: dict[str, Any] = {}
+    """As an event would have them."""
+    unknown: dict[str, str] = {}
+    """The signals without a value, and why."""
+
+
+class Explanation(msgspec.Struct, frozen=True, rename="camel"):
+    """What one evaluation of a rule saw."""
+
+    tick: float
+    """Its time on the detector's axis, seconds since the epoch."""
+    subjects: list[SubjectStatus]
+    notes: list[str]
+    """What expressions missed, or failed on."""
+
+
 class ClientStatus(msgspec.Struct, frozen=True, rename="camel"):
     """A client that is known."""
 
@@ -134,6 +166,8 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     streams: list[StreamStatus]
     rules: list[RuleStatus]
     drops: list[Drops]
+    explanation: Explanation | None = None
+    """Of the one rule that was asked for, if it was evaluated in the meantime."""
     connected: bool = False
     """Whether a router or peer is connected."""
 

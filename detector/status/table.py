@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from detector.status.model import Histogram, RuleStatus, Status
+from detector.status.model import Explanation, Histogram, RuleStatus, Status
 
 _CLIENTS = 20
 
@@ -40,7 +41,8 @@ def _parts(status: Status) -> Iterator[RenderableType]:
             _size(stream.buffered_bytes),
             _median(stream.latency),
         )
-    yield streams
+    if status.explanation is None:
+        yield streams
     rules = _table("rule", "state", "evaluations", "time", "latency", "unknowns", "errors", "open", "started", "ended")
     for rule in status.rules:
         rules.add_row(
@@ -58,6 +60,9 @@ def _parts(status: Status) -> Iterator[RenderableType]:
     yield rules
     for rule in status.rules:
         yield from _remarks(rule)
+    if status.explanation is not None:
+        yield from _explained(status.explanation)
+        return
     if any(drops.count for drops in status.drops):
         lost = _table("lost", "count", "the last")
         for drops in status.drops:
@@ -68,6 +73,33 @@ def _parts(status: Status) -> Iterator[RenderableType]:
         shown = ", ".join(f"{client.name} ({_ago(client.age)})" for client in status.clients[:_CLIENTS])
         more = status.client_count - _CLIENTS
         yield f"clients: {shown}" + (f" and {more} more" if more > 0 else "")
+
+
+def _explained(explanation: Explanation) -> Iterator[RenderableType]:
+    for subject in explanation.subjects:
+        if not subject.looked_at:
+            yield f"{subject.subject}: not looked at: {subject.why}"
+            continue
+        state = "an episode is open" if subject.open else "no episode"
+        if subject.pending is not None:
+            state = f"when has held for {subject.pending:.1f} s"
+        truths = (
+            ("in scope", subject.in_scope),
+            ("near", subject.near),
+            ("when", subject.when),
+            ("until", subject.until),
+        )
+        yield f"{subject.subject}: {state}; " + ", ".join(f"{what} {_truth(value)}" for what, value in truths)
+        for name, value in subject.values.items():
+            yield f"    {name} = {json.dumps(value, ensure_ascii=False):.120}"
+        for name, why in subject.unknown.items():
+            yield f"    {name} is unknown: {why}"
+    for note in explanation.notes:
+        yield f"in this evaluation: {note}"
+
+
+def _truth(value: bool | None) -> str:
+    return "unknown" if value is None else str(value).lower()
 
 
 def _remarks(rule: RuleStatus) -> Iterator[str]:

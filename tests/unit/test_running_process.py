@@ -130,6 +130,12 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
         for sample in family.samples
     }
     assert metrics["stream_samples_total", "speed"] == 101
+    (answer,) = ask(process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "2"}, 5)
+    told = read_status(answer.payload).explanation
+    assert told is not None
+    assert [(each.subject, each.when, each.values) for each in told.subjects] == [("car2", False, {"v": 1.0})]
+    with pytest.raises(NoAnswerError, match="detector d has no rule slow; it has fast"):
+        ask(process.network, "d", "status", {"rule": "slow"}, 5)
     assert metrics["rule_episodes_open", "fast"] == 1
     assert metrics["process_resident_memory_bytes",] > 0
     assert "looked" in process.page("/healthz")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -11,16 +11,18 @@ import pytest
 
 from detector.assembly import Refusal
 from detector.engine.intake import Intake
+from detector.engine.sample import Arrival
 from detector.evaluator import Evaluator
 from detector.inquiry import inquire
 from detector.losses import Losses
+from detector.status.explaining import Watching
 from detector.status.keeping import StatusKeeper
-from detector.status.model import RuleState, Status, read_status, to_json
+from detector.status.model import Explanation, RuleState, Status, read_status, to_json
 from detector.status.table import status_view
 from detector.streams.answering import Answering
 from detector.streams.asking import NoAnswerError, ask
 from detector.streams.zenoh import Network
-from tests.unit.driving import Drive, a_detector, a_rule, a_stream, arrival, at
+from tests.unit.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.rules import RuleProblem
 
@@ -173,3 +175,79 @@ def test_the_detectors_file_tells_where_it_listens(endpoint: str, tmp_path: Path
     file.write_text(a_detector(zenoh={"listen": [endpoint]}).model_dump_json(by_alias=True, exclude_none=True))
     (answer,) = inquire("status", {}, file, None, None, 5)
     assert answer.key == "wayside/detectors/d/status"
+
+
+def explained(
+    drive: Drive, rule: str, subject: str | None = None, *, until: float, sent: Sequence[Arrival] = ()
+) -> Explanation:
+    watching = Watching(drive.engine, rule, subject)
+    assert not watching.is_over()
+    drive.take(*sent, until=until)
+    assert watching.is_over()
+    return watching.future.result(0)
+
+
+def test_an_evaluation_tells_what_it_saw_and_why_a_signal_is_unknown() -> None:
+    gap = {"name": "gap", "stream": "pose", "value": "msg.gap"}
+    rule = a_rule("r", signals=[SPEED, gap], when="v > 10 && gap < 5", **{"for": "2s"})
+    drive = Drive(a_detector(a_stream("pose", staleAfter="2s"), a_stream("speed")), rule)
+    sent = [arrival(0.1, "a", {"v": 20}), arrival(0.2, "a", {"gap": 1}, "pose"), arrival(0.3, "b", {"v": 20})]
+    found = {each.subject: each for each in explained(drive, "r", until=1, sent=sent).subjects}
+    assert (found["a"].when, found["a"].pending, found["a"].open, found["a"].values) == (
+        True,
+        0.0,
+        False,
+        {"v": 20.0, "gap": 1.0},
+    )
+    assert found["b"].when is None
+    assert found["b"].unknown == {"gap": "no sample of stream pose has come from b"}
+    drive.take(until=2)
+    (later,) = explained(drive, "r", "a", until=3).subjects
+    assert later.unknown == {"gap": "stream pose of a is stale: its newest sample is 2.8 s old, more than staleAfter"}
+    (third,) = explained(drive, "r", "b", until=4, sent=[arrival(3.5, "b", {"other": 1}, "pose")]).subjects
+    assert third.unknown == {"gap": "what came of stream pose from b has no such value in its window"}
+    assert drive.engine.rules["r"].witness is None
+
+
+def test_what_expressions_missed_or_failed_on_is_told() -> None:
+    drive = Drive(a_detector(), a_rule("r", signals=[SPEED], when="v.x > 10"))
+    explanation = explained(drive, "r", until=1, sent=[arrival(0.1, "a", {"v": 20}), arrival(0.2, "b", {})])
+    assert any("v" in note for note in explanation.notes)
+    assert len(explanation.subjects) == 2
+
+
+@pytest.mark.parametrize(
+    ("subject", "why"),
+    [
+        ("a+b", "the pair is not within 100 m, or a place is unknown, or a role does not fit"),
+        ("a+nobody", "client nobody is not known: nothing came from it within clientTimeout"),
+        ("a", "the rule is about pairs: write car1+car2"),
+    ],
+)
+def test_a_subject_that_is_not_looked_at_is_told_why(subject: str, why: str) -> None:
+    drive = Drive(a_detector(), a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="true"))
+    sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 900, "y": 0}, "pose")]
+    (told,) = explained(drive, "near", subject, until=1, sent=sent).subjects
+    assert not told.looked_at
+    assert told.why == why
+
+
+def test_of_a_pair_each_ones_signals_are_told() -> None:
+    scope = {"pairs": {"position": POSITION, "within": 100}}
+    drive = Drive(a_detector(), a_rule("near", scope=scope, signals=[SPEED], when="a.v + b.v > 1"))
+    sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 9, "y": 0}, "pose")]
+    (told,) = explained(drive, "near", "a+b", until=1, sent=[*sent, arrival(0.3, "b", {"v": 3})]).subjects
+    assert told.near is True
+    assert told.unknown == {"a.v": "no sample of stream speed has come from a"}
+
+
+def test_a_rule_that_is_gone_is_watched_no_more_and_one_at_a_time() -> None:
+    drive = Drive(a_detector(), FAST)
+    watching = Watching(drive.engine, "fast", None)
+    with pytest.raises(ValueError, match="somebody else asks about rule fast"):
+        Watching(drive.engine, "fast", None)
+    drive.engine.set_rules([])
+    assert watching.is_over()
+    assert watching.future.result(0).subjects == []
+    with pytest.raises(ValueError, match="rule fast is not evaluated"):
+        Watching(drive.engine, "fast", None)

@@ -1,0 +1,139 @@
+"""Why a rule does or does not fire: what its next evaluation sees of each subject.
+
+The evaluation is watched, not repeated: it tells what it saw on the way, so looking changes nothing and nothing is
+computed for it beyond what is computed anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
+from typing import Any
+
+from detector.engine.buffer import NEVER
+from detector.engine.demands import plain
+from detector.engine.engine import Engine
+from detector.engine.evaluation import Sight
+from detector.engine.snapshots import snapshot
+from detector.status.model import Explanation, SubjectStatus
+from wayside.expressions import UNKNOWN
+from wayside.names import parse_subject
+from wayside.rules import ClientSubject, FleetSubject, PairSubject
+
+MAXIMUM_SUBJECTS = 20
+"""So many subjects are told of, those with an open episode and those whose condition holds first."""
+
+_MAXIMUM_NOTES = 20
+
+
+class Watching:
+    """Watches one rule until it has been evaluated. For the evaluation thread alone."""
+
+    def __init__(self, engine: Engine, rule: str, subject: str | None) -> None:
+        """Raises ValueError where there is no such rule, or it is watched already."""
+        run = engine.rules.get(rule)
+        if run is None:
+            raise ValueError(f"rule {rule} is not evaluated: its state and message say why")
+        if run.witness is not None:
+            raise ValueError(f"somebody else asks about rule {rule} just now: ask again")
+        self.future: Future[Explanation] = Future()
+        self._engine = engine
+        self._run = run
+        self._subject = subject
+        self._ticks = run.counters.ticks
+        self._seen: list[tuple[int, SubjectStatus]] = []
+        run.witness = self._see
+        run.counters.notes = []
+
+    def is_over(self) -> bool:
+        """Whether the rule was evaluated meanwhile, is gone, or nobody waits any more; then the future says so."""
+        gone = self._engine.rules.get(self._run.rule.name) is not self._run
+        if self._run.counters.ticks == self._ticks and not gone and not self.future.cancelled():
+            return False
+        notes, self._run.witness, self._run.counters.notes = self._run.counters.notes or [], None, None
+        if self.future.set_running_or_notify_cancel():
+            tick = self._run.counters.last_tick / 1e9
+            self.future.set_result(Explanation(tick, self._told(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))
+        return True
+
+    def _told(self) -> list[SubjectStatus]:
+        told = [status for _, status in sorted(self._seen, key=lambda each: (each[0], each[1].subject))]
+        if self._subject is not None and not told:
+            return [SubjectStatus(self._subject, looked_at=False, why=self._why_not(self._subject))]
+        return told[:MAXIMUM_SUBJECTS]
+
+    def _see(self, sight: Sight) -> None:
+        text, variables = sight.candidate.subject.text, sight.candidate.variables
+        if self._subject not in (None, text):
+            return
+        order = 0 if sight.is_open else 1 if sight.when is True else 2
+        status = SubjectStatus(
+            subject=text,
+            looked_at=True,
+            in_scope=_plain(sight.candidate.in_scope),
+            near=_plain(sight.candidate.near),
+            when=_plain(sight.when),
+            until=_plain(sight.until),
+            open=sight.is_open,
+            pending=None if sight.onset is None else (sight.now - sight.onset) / 1e9,
+            values=plain(snapshot(self._run.rule, sight.candidate)),
+            unknown=dict(self._unknowns(variables)),
+        )
+        self._seen.append((order, status))
+
+    def _unknowns(self, variables: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """By signal, as expressions name it, why it has no value."""
+        match self._run.rule.subject:
+            case PairSubject():
+                for role in ("a", "b"):
+                    yield from ((f"{role}.{name}", why) for name, why in self._of_view(variables[role]))
+            case ClientSubject():
+                yield from self._of_view(variables)
+            case FleetSubject():
+                return
+
+    def _of_view(self, view: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        rule, client = self._run.rule, view["client"]
+        for signal in rule.signals:
+            if signal.name not in view:
+                yield signal.name, self._of_stream(client, signal.stream)
+        for model in rule.models:
+            if model.name not in view:
+                yield model.name, "an input of the model is unknown, or the model failed"
+        if isinstance(rule.subject, PairSubject) and "position" not in view:
+            yield "position", self._of_stream(client, rule.subject.position.stream)
+
+    def _of_stream(self, client: str, stream: str) -> str:
+        lane = self._engine.buffer.lane(client, stream)
+        spec = self._engine.detector.spec.stream(stream)
+        if spec is None:
+            return f"nothing of {stream} has such a value"
+        if lane is None or lane.latest == NEVER:
+            return f"no sample of stream {stream} has come from {client}"
+        age = (self._engine.now - lane.latest) / 1e9
+        limit = self._engine.detector.spec.stale_after_ns(spec)
+        if limit is not None and age > limit / 1e9:
+            return f"stream {stream} of {client} is stale: its newest sample is {age:.1f} s old, more than staleAfter"
+        return f"what came of stream {stream} from {client} has no such value in its window"
+
+    def _why_not(self, text: str) -> str:
+        try:
+            clients, _ = parse_subject(text)
+        except ValueError:
+            return f"{text!r} is no subject: write car1, car1+car2, ~fleet, or with an element car1~north"
+        missing = [client for client in clients if client not in self._engine.clients]
+        if missing:
+            return f"client {missing[0]} is not known: nothing came from it within clientTimeout"
+        match self._run.rule.subject:
+            case PairSubject() as pairs if len(clients) == 2:
+                return f"the pair is not within {pairs.within:g} m, or a place is unknown, or a role does not fit"
+            case PairSubject():
+                return "the rule is about pairs: write car1+car2"
+            case FleetSubject():
+                return "the rule is about the fleet: write ~fleet"
+            case ClientSubject():
+                return "the rule is about single clients, and elements where it has `each`: write car1, or car1~north"
+
+
+def _plain(truth: Any) -> bool | None:
+    return None if truth is UNKNOWN else truth
