@@ -70,7 +70,17 @@ class Signals:
         always_known = signal.aggregate in _ALWAYS_KNOWN
         if lane is None or not (always_known or self._is_fresh(client, signal.stream, now)):
             return _ALWAYS_KNOWN[signal.aggregate] if always_known else self._no_value(counters)
-        window = self._window(rule, signal, lane, client, now, counters, at_most=_ENOUGH.get(signal.aggregate))
+        aggregate = signal.aggregate
+        window = self._window(
+            rule,
+            signal,
+            lane,
+            client,
+            now,
+            counters,
+            at_most=_ENOUGH.get(aggregate),
+            oldest_first=aggregate is Aggregate.FIRST,
+        )
         value = _aggregated(signal, window, counters)
         return self._no_value(counters) if value is UNKNOWN else value
 
@@ -122,18 +132,18 @@ class Signals:
         counters: RuleCounters,
         *,
         at_most: int | None = None,
+        oldest_first: bool = False,
     ) -> list[tuple[Sample, Value | Unknown]]:
         """The samples in the window with their values, newest first, without those that `where` leaves out.
 
-        For First the oldest comes first.
-        `at_most` so many of them are looked for.
+        `at_most` so many of them are looked for, from the newest or from the oldest on.
         """
         key = (rule, signal.name, client)
         known = self._extracted.get(key, {})
         looked_at: dict[Sample, Value | Unknown | None] = {}
         values: list[tuple[Sample, Value | Unknown]] = []
         samples: Iterable[Sample] = self._in_window(signal, lane, now)
-        if signal.aggregate is Aggregate.FIRST:
+        if oldest_first:
             samples = reversed(list(samples))  # so that only the oldest is decoded, not all that came since
         for sample in samples:
             # By the sample itself: its value follows from what it holds, so two that are equal have the same.

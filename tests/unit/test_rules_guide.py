@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from tests.unit.driving import a_detector, a_rule, a_stream
+from wayside.expressions import UNKNOWN, Environment, Kind
 from wayside.rules import CompiledRule, compile_rule
 
 GUIDE = Path(__file__).parents[2].joinpath("docs", "rules.md").read_text()
@@ -42,6 +43,16 @@ def accepted(example: dict[str, Any]) -> CompiledRule | None:
 @pytest.mark.parametrize("example", [each for _, each in examples()], ids=str)
 def test_an_example_is_accepted(example: dict[str, Any]) -> None:
     accepted(example)
+
+
+def test_unknowns_are_as_the_table_says() -> None:
+    table = GUIDE.split("with `u` unknown:", 1)[1].split("\n## ", 1)[0]
+    rows = re.findall(r"^\| `(.*)` \| (\w+) \|$", table, re.MULTILINE)
+    environment = Environment({"u": Kind.DYN, "m": Kind.MAP})
+    found = {source: environment.compile(source).evaluate_or_unknown({"m": {"u": None}}) for source, _ in rows}
+    wanted: dict[str, object] = {"unknown": UNKNOWN, "true": True, "false": False, "1": 1.0}
+    assert found == {source: wanted[text] for source, text in rows}
+    assert len(rows) == 10
 
 
 def test_every_section_has_an_example() -> None:

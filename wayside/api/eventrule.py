@@ -122,11 +122,11 @@ class Signal(Model):
     )
     value: Expression | None = Field(
         default=None,
-        description="CEL over msg (the decoded sample), key (the captured chunks) and sample (stamp, received, "
-        "latency, size). Not needed for Count, Age and Active.",
+        description="CEL over msg (the decoded sample), key (the captured chunks), sample (stamp, received, latency, "
+        "size) and parameters. Not needed for Count, Age and Active.",
     )
     where: Expression | None = Field(
-        default=None, description="CEL over msg, key and sample: only samples for which it is true count."
+        default=None, description="CEL over msg, key, sample, parameters: only samples for which it is true count."
     )
     over: PositiveDuration | None = Field(
         default=None,

@@ -128,7 +128,8 @@ class _RuleCompiler:
         self.detector = detector
         self.fields = fields
         self.parameters = parameters_of(rule, detector)
-        self.kinds = kinds_of(rule)
+        self._kinds = kinds_of(rule)
+        self._knowing: dict[Environment, Environment] = {}
         self.problems = [
             RuleProblem(path, message, detector.name) for path, message in override_problems(rule, detector)
         ]
@@ -216,7 +217,7 @@ class _RuleCompiler:
         at: FieldPath = ("spec", "actions", index, "deploy", "parameters")
         parameters: CompiledTemplate
         try:
-            parameters = compile_template(dict(deploy.parameters), environment.knowing(self.kinds))
+            parameters = compile_template(dict(deploy.parameters), self._typed(environment))
         except InterpolationError as error:
             for each in (error, *error.others):
                 self.problem((*at, _parameter_of(each)), str(each))
@@ -262,11 +263,17 @@ class _RuleCompiler:
         if source is None:
             return None
         try:
-            return environment.knowing(self.kinds).compile(source, result=kind)
+            return self._typed(environment).compile(source, result=kind)
         except ExpressionError as error:
             for each in (error, *error.others):
                 self.problem(path, str(each))
             return None
+
+    def _typed(self, environment: Environment) -> Environment:
+        """The environment, knowing of which kinds the rule's parameters are."""
+        if environment not in self._knowing:
+            self._knowing[environment] = environment.knowing(self._kinds)
+        return self._knowing[environment]
 
     def kept_ns(self, stream: Stream) -> int:
         """How long the Detector keeps the stream's samples, in nanoseconds."""
