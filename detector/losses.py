@@ -116,6 +116,8 @@ class Losses:
             yield Loss(misplaced, rule.misplaced, rule.last_misplaced, cause="misplaced", rule=name)
             crowded = f"looks at pairs left out for EventRule {name}, more than maxPairs being near"
             yield Loss(crowded, rule.crowded_pairs, cause="crowded_pairs", rule=name)
+            kept = f"times a parameter that follows kept its last value in EventRule {name}"
+            yield Loss(kept, rule.unfollowed, rule.last_unfollowed, cause="unfollowed", rule=name)
 
 
 def _line(loss: Loss, count: int) -> str:

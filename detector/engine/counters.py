@@ -40,6 +40,9 @@ class RuleCounters:
     crowded_pairs: int = 0
     """Pairs within reach that were not looked at, there being more than `maxPairs`; each at each evaluation."""
 
+    unfollowed: int = 0
+    """Parameters that should follow and kept their last value, being unknown or failing; each at each evaluation."""
+    last_unfollowed: str = ""
     notes: list[str] | None = None
     """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from detector.engine.clients import Clients
@@ -13,6 +13,7 @@ from detector.engine.counters import RuleCounters
 from detector.engine.demands import Demand
 from detector.engine.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
 from detector.engine.events import Event
+from detector.engine.following import followed
 from detector.engine.plugins import PluginSignals
 from detector.engine.scopes import Candidate, Views, candidates
 from detector.engine.snapshots import snapshot
@@ -196,9 +197,11 @@ class RuleRun:
                 yield self._ended(now, self._open.pop(candidate.subject), reason, snapshot(self.rule, candidate))
             case None:
                 episode = self._open.get(candidate.subject)
-                if episode is not None and (episode.outdated or len(episode.demands) < len(self.rule.deploys)):
-                    episode.variables = variables
-                    self._render(episode)
+                if episode is not None:
+                    if episode.outdated or len(episode.demands) < len(self.rule.deploys):
+                        episode.variables = variables
+                        self._render(episode)
+                    self._follow(episode, variables)
         if self.witness is not None:
             self.witness(Sight(now, candidate, when, until, state.is_open, state.onset))
 
@@ -252,6 +255,16 @@ class RuleRun:
                 episode.demands[deploy.action] = self._demand(episode, deploy, parameters)
                 episode.outdated.discard(deploy.action)
                 self.version += 1
+
+    def _follow(self, episode: Episode, variables: Mapping[str, Any]) -> None:
+        """Evaluate anew the parameters of the actions that say so."""
+        for deploy in self.rule.deploys:
+            demand = episode.demands.get(deploy.action)
+            if deploy.follow and demand is not None and deploy.action not in episode.outdated:
+                parameters = followed(deploy, demand.parameters, variables, self.counters)
+                if parameters != demand.parameters:
+                    episode.demands[deploy.action] = replace(demand, parameters=parameters)
+                    self.version += 1
 
     def _demand(self, episode: Episode, deploy: CompiledDeploy, parameters: Any) -> Demand:
         return Demand(

@@ -134,8 +134,9 @@ class Replay:
         for name in self._demands.keys() - demands.keys():
             demand = self._demands[name]
             self.outcome.tasks[name] = to_task(demand, ends.get(demand.episode, self._engine.now))
-        for name in demands.keys() - self._demands.keys():
-            self.outcome.tasks[name] = to_task(demands[name])
+        for name, demand in demands.items():
+            if self._demands.get(name) != demand:
+                self.outcome.tasks[name] = to_task(demand)
         self._demands = demands
 
 

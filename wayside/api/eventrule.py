@@ -171,6 +171,11 @@ class Deploy(Model):
         max_length=64,
         description="The template's parameters, with ${…} over the rule's variables at the start of the episode.",
     )
+    follow: bool = Field(
+        default=False,
+        description="true: the parameters are evaluated again at each evaluation while the episode lasts, and the task "
+        "is patched when they change. One that is unknown or fails keeps its last value.",
+    )
 
 
 class Action(Model):

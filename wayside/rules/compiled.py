@@ -115,6 +115,10 @@ class CompiledDeploy:
     source: str
     """The parameters as written, in canonical JSON."""
     parameters: CompiledTemplate = field(compare=False)
+    follow: bool = False
+    """Whether the parameters are evaluated again at each evaluation."""
+    each_parameter: Mapping[str, CompiledTemplate] = field(default_factory=dict, compare=False)
+    """The parameters one by one, where they follow."""
 
 
 class ModelRunner(Protocol):

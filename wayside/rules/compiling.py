@@ -224,7 +224,13 @@ class _RuleCompiler:
             return None
         for embedded in parameters.embedded:
             self._members((*at, _parameter_of(embedded)), embedded.expression.paths)
-        return CompiledDeploy(action, deploy.template, deploy.priority, _canonical(deploy.parameters), parameters)
+        one_by_one = {
+            name: compile_template(value, environment, path=name)
+            for name, value in deploy.parameters.items()
+            if deploy.follow
+        }
+        source = _canonical(deploy.parameters)
+        return CompiledDeploy(action, deploy.template, deploy.priority, source, parameters, deploy.follow, one_by_one)
 
     def stream(self, path: FieldPath, name: str) -> Stream | None:
         """The Detector's stream of that name; None, and a problem, where it has none."""
