@@ -1,11 +1,12 @@
 """Who is there: a client is known from its first sample until nothing was received from it for `clientTimeout`.
 
 One with a liveliness token is known as long as it has one, and lost at the first tick after its last one was dropped.
+One that is expected is known from the detector's start on, whether or not anything comes from it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from detector.engine.buffer import NEVER, Buffer
@@ -27,12 +28,24 @@ class Clients:
         """`labels` are those of clients known beforehand; `timeout` is in nanoseconds."""
         self._labels = labels
         self._timeout = timeout
+        self._expected: frozenset[str] = frozenset()
         self._present: dict[str, Presence] = {}
         self.tokens = Tokens()
 
-    def configure(self, labels: Mapping[str, Mapping[str, str]], timeout: int) -> None:
-        """The Detector changed: other labels, another timeout."""
+    def configure(
+        self, labels: Mapping[str, Mapping[str, str]], timeout: int, expected: Collection[str], now: int
+    ) -> None:
+        """The Detector changed: other labels, another timeout, other clients that are expected from `now` on.
+
+        The timeout of one that no longer is counts from `now` at the earliest.
+        """
         self._labels, self._timeout = labels, timeout
+        for client in self._expected.difference(expected):
+            self.still_heard(client, now)
+        self._expected = frozenset(expected)
+        for client in self._expected:
+            if client not in self._present:
+                self._present[client] = Presence(now, now)
 
     def heard(self, client: str, time: int) -> None:
         """A sample of the client, or a restored episode about it."""
@@ -47,12 +60,16 @@ class Clients:
             presence.last = time
 
     def lose(self, now: int) -> list[str]:
-        """Forget the clients that have timed out without a token, or dropped their last one; returns them."""
+        """Forget the clients that have timed out without a token, or dropped their last one; returns them.
+
+        One that is expected is never lost.
+        """
         tokens = self.tokens
         lost = [
             name
             for name, presence in self._present.items()
-            if (now - presence.last > self._timeout and not tokens.hold(name)) or tokens.dropped(name)
+            if ((now - presence.last > self._timeout and not tokens.hold(name)) or tokens.dropped(name))
+            and name not in self._expected
         ]
         tokens.forget_dropped()
         for name in lost:

@@ -73,7 +73,7 @@ class Engine:
         self._plugin_host = plugins or NoPlugins()
         self._plugins = PluginSignals(self._plugin_host, self.queries)
         self._inflow = Inflow(self.buffer, self.clients, self.counters)
-        self._configure(detector, decoders, read_key)
+        self._configure(detector, decoders, read_key, start)
         self._timeline = self._make_timeline(start)
 
     def set_detector(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
@@ -86,7 +86,7 @@ class Engine:
             RuleError: an expression of one of the Detector's streams does not compile; nothing has changed then.
         """
         before = self.detector.spec
-        self._configure(detector, decoders, read_key)
+        self._configure(detector, decoders, read_key, self._timeline.now)
         kept = {stream.name for stream in detector.spec.streams if _reads_like(stream, before.stream(stream.name))}
         self.buffer.keep(kept)
         if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
@@ -106,12 +106,17 @@ class Engine:
             self._timeline = self._make_timeline(now)
             self._gap(now, backwards=detector.spec.clock is not before.clock)
 
-    def _configure(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
+    def _configure(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader, now: int) -> None:
         spec = detector.spec
         compiled = {stream.name: compile_stream(stream, index) for index, stream in enumerate(spec.streams)}
         self.detector = detector
         self.buffer.maximum_bytes = spec.buffer.bytes.bytes
-        self.clients.configure({c.name: c.labels for c in spec.clients}, spec.client_timeout.ns)
+        self.clients.configure(
+            {client.name: client.labels for client in spec.clients},
+            spec.client_timeout.ns,
+            {client.name for client in spec.clients if client.expected},
+            now,
+        )
         self._lane_makers = lane_makers(detector, decoders)
         names = MessageClients(decoders, compiled, self.counters)
         self._inflow.configure(detector, read_key, self._lane_makers, names)

@@ -39,6 +39,11 @@ class Client(Model):
         description="Values for this client of the parameters that rules have, by rule and name. In a pairs scope they "
         "are those of a or b.",
     )
+    expected: bool = Field(
+        default=False,
+        description="true: the client is known from the detector's start on, whether or not anything comes, and "
+        "is never lost. So a rule can tell that a roadside station is silent.",
+    )
 
 
 class Encoding(StrEnum):
