@@ -19,6 +19,7 @@ from detector.engine.inflow import Inflow
 from detector.engine.lanes import lane_makers
 from detector.engine.messages import KeyReader, Messages
 from detector.engine.naming import MessageClients
+from detector.engine.open_episodes import OpenEpisode, ended_while_away, episode_of
 from detector.engine.plugins import NoPlugins, PluginHost, PluginSignals
 from detector.engine.positions import Positions
 from detector.engine.queries import BufferQueries
@@ -26,7 +27,6 @@ from detector.engine.sample import Arrival, Decoder, Sample
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
 from detector.engine.starts import Starts
-from detector.engine.subjects import subject_of
 from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Ticks, Timeline, WallTimeline
 from detector.engine.transforms import Transforms, TransformStream
 from wayside.api import Detector
@@ -163,23 +163,41 @@ class Engine:
         self._rules_version += 1
         return events
 
-    def restore(self, demands: Sequence[Demand], now: int) -> list[Event]:
-        """Take up the episodes that were open before a restart; those whose rule changed meanwhile end."""
-        episodes: dict[tuple[str, str, str], list[Demand]] = {}
+    def restore(self, demands: Sequence[Demand], now: int, episodes: Sequence[OpenEpisode] = ()) -> list[Event]:
+        """Take up the episodes that were open before a restart; those whose rule changed meanwhile end.
+
+        First those of the demands, then of `episodes` those that had none.
+        """
+        demanded: dict[tuple[str, str, str], list[Demand]] = {}
         for demand in demands:
-            episodes.setdefault((demand.rule, demand.subject, demand.episode), []).append(demand)
+            demanded.setdefault((demand.rule, demand.subject, demand.episode), []).append(demand)
         events: list[Event] = []
-        for (name, _, _), of_one in sorted(episodes.items()):
-            run = self._runs.get(name)
-            if run is not None and run.can_restore(of_one[0]):
-                for event in run.restore(of_one):
-                    self._starts.started(event)
-                for client in of_one[0].subjects:
-                    self.clients.heard(client, now)
-            else:
-                events.append(_ended_while_away(of_one[0], now))
+        for _, of_one in sorted(demanded.items()):
+            episode = episode_of(of_one[0])
+            whole = episode.subject.text == of_one[0].subject
+            events += self._take_up(episode, of_one, now) if whole else [self._ended_while_away(episode, now)]
+        known = {demand.episode for demand in demands}
+        for episode in sorted(episodes, key=lambda each: (each.rule, each.subject.text, each.episode)):
+            if episode.episode not in known:
+                events += self._take_up(episode, (), now)
         self._rules_version += 1
         return events
+
+    def _take_up(self, episode: OpenEpisode, demands: Sequence[Demand], now: int) -> list[Event]:
+        run = self._runs.get(episode.rule)
+        if run is None or not run.can_restore(episode):
+            return [self._ended_while_away(episode, now)]
+        self._starts.started(run.restore(episode, demands))
+        for client in episode.subject.clients:
+            self.clients.heard(client, now)
+        return []
+
+    def _ended_while_away(self, episode: OpenEpisode, now: int) -> Event:
+        return ended_while_away(episode, self.identity.holder, now)
+
+    def open_episodes(self) -> list[OpenEpisode]:
+        """All episodes that have not ended."""
+        return [episode for run in self._runs.values() for episode in run.open_episodes()]
 
     def demands(self) -> dict[str, Demand]:
         """What the open episodes ask for, by the names of the tasks."""
@@ -329,23 +347,4 @@ def _reads_like(stream: Stream, before: Stream | None) -> bool:
         before.encoding,
         before.type,
         before.latched,
-    )
-
-
-def _ended_while_away(demand: Demand, now: int) -> Event:
-    """The end of an episode whose rule changed or went while the detector was not running."""
-    subject = subject_of(demand.subjects, demand.subject)
-    return Event(
-        holder=demand.holder,
-        rule=demand.rule,
-        subject=demand.subject,
-        subjects=demand.subjects,
-        element=None if subject is None else subject.element,
-        episode=demand.episode,
-        onset_time=demand.onset_time,
-        start_time=demand.start_time,
-        end_time=now,
-        reason=Reason.RULE_CHANGED,
-        values={},
-        classification=demand.classification,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -14,10 +14,11 @@ from detector.engine.demands import Demand
 from detector.engine.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
 from detector.engine.events import Event
 from detector.engine.following import followed
+from detector.engine.open_episodes import OpenEpisode
 from detector.engine.plugins import PluginSignals
 from detector.engine.scopes import Candidate, Views, candidates
 from detector.engine.snapshots import snapshot
-from detector.engine.subjects import Subject, fits, subject_of
+from detector.engine.subjects import Subject, fits
 from wayside.expressions import UNKNOWN, Expression, InterpolationError
 from wayside.rules import CompiledDeploy, CompiledRule
 
@@ -104,40 +105,48 @@ class RuleRun:
             state.gap()
             state.rests_until = min(state.rests_until, time + self._timing.cooldown)
 
-    def can_restore(self, demand: Demand) -> bool:
-        """Whether the demand's episode is one of this rule, as it is now."""
-        subject = subject_of(demand.subjects, demand.subject)
+    def can_restore(self, episode: OpenEpisode) -> bool:
+        """Whether the episode is one of this rule, as it is now."""
         return (
             self.rule.enabled
-            and self.rule.digest == demand.rule_digest
-            and subject is not None
-            and fits(self.rule, subject)
-            and subject not in self._open
+            and self.rule.digest == episode.rule_digest
+            and fits(self.rule, episode.subject)
+            and episode.subject not in self._open
         )
 
-    def restore(self, demands: list[Demand]) -> Iterator[Event]:
-        """Take up an episode that was open before a restart, from the demands of its actions.
+    def restore(self, episode: OpenEpisode, demands: Sequence[Demand]) -> Event:
+        """Take up an episode that was open before a restart, with the demands of its actions.
 
-        Yields the event that told of its start then. Where an action is not what it was, its demand holds until it is
+        Returns the event that told of its start then. Where an action is not what it was, its demand holds until it is
         rendered anew, at the next evaluation.
         """
-        first = demands[0]
-        subject = subject_of(first.subjects, first.subject)
-        if subject is None:
-            return
         deploys = {deploy.action: (deploy.template, deploy.priority) for deploy in self.rule.deploys}
-        self._states[subject] = SubjectState(is_open=True)
-        self._open[subject] = Episode(
-            first.episode,
-            subject,
-            first.onset_time,
-            first.start_time,
-            first.values,
+        self._states[episode.subject] = SubjectState(is_open=True)
+        self._open[episode.subject] = Episode(
+            episode.episode,
+            episode.subject,
+            episode.onset_time,
+            episode.start_time,
+            episode.values,
             None,
             {d.action: d for d in demands if d.action in deploys},
             {d.action for d in demands if d.action in deploys and deploys[d.action] != (d.template, d.priority)},
         )
-        yield self._event(self._open[subject], None, None, first.values)
+        return self._event(self._open[episode.subject], None, None, episode.values)
+
+    def open_episodes(self) -> Iterator[OpenEpisode]:
+        """The episodes that have not ended."""
+        for episode in self._open.values():
+            yield OpenEpisode(
+                self.rule.name,
+                episode.subject,
+                episode.id,
+                episode.onset,
+                episode.start,
+                episode.values,
+                self.rule.classification,
+                self.rule.digest,
+            )
 
     def change_actions(self, rule: CompiledRule) -> None:
         """Go on with a rule that differs in nothing that decides which episodes there are.

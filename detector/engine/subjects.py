@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from wayside.names import parse_subject, subject_text
+from wayside.names import subject_text
 from wayside.rules import ClientSubject, CompiledRule, FleetSubject, PairSubject
 
 
@@ -19,15 +19,6 @@ class Subject(NamedTuple):
     def text(self) -> str:
         """As in events' keys: `car1`, `car1+car2~north`, `~fleet`."""
         return subject_text(self.clients, self.element)
-
-
-def subject_of(clients: tuple[str, ...], text: str) -> Subject | None:
-    """The subject of a task or a stored episode; None where its text is none."""
-    try:
-        _, element = parse_subject(text)
-    except ValueError:
-        return None
-    return Subject(clients, element)
 
 
 def fits(rule: CompiledRule, subject: Subject) -> bool:

@@ -1,0 +1,106 @@
+"""Open episodes as they are kept beyond a restart, and recorded where one takes them up again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from detector.engine.demands import Demand, plain
+from detector.engine.episodes import Reason
+from detector.engine.events import Event
+from detector.engine.subjects import Subject
+from wayside.api.base import JsonValue
+from wayside.names import parse_subject
+from wayside.times import format_time, parse_time
+
+
+@dataclass(frozen=True, slots=True)
+class OpenEpisode:
+    """An episode that has not ended. Times are nanoseconds since the epoch."""
+
+    rule: str
+    subject: Subject
+    episode: str
+    """The episode's id."""
+    onset_time: int
+    start_time: int
+    values: Mapping[str, JsonValue]
+    """What its rule saw at the start."""
+    classification: Mapping[str, JsonValue] | None
+    rule_digest: str
+    """Of the rule's semantics under which it started."""
+
+    def to_document(self) -> dict[str, Any]:
+        """The episode as JSON carries it."""
+        return {
+            "rule": self.rule,
+            "subject": self.subject.text,
+            "episode": self.episode,
+            "onsetTime": format_time(self.onset_time),
+            "startTime": format_time(self.start_time),
+            "values": plain(self.values),
+            **({} if self.classification is None else {"classification": dict(self.classification)}),
+            "ruleDigest": self.rule_digest,
+        }
+
+
+def from_document(document: Mapping[str, Any]) -> OpenEpisode:
+    """The episode of what `to_document` made.
+
+    Raises:
+        ValueError: the document is not one of an episode; the text says which field is wrong.
+    """
+    texts = ("rule", "subject", "episode", "onsetTime", "startTime", "ruleDigest")
+    for field in texts:
+        if not isinstance(document.get(field), str):
+            raise ValueError(f"an episode's {field} must be a text, is {document.get(field)!r:.80}")
+    values, classification = document.get("values"), document.get("classification")
+    if not isinstance(values, dict) or not isinstance(classification, dict | None):
+        raise ValueError("an episode's values must be a map, and so its classification where it has one")
+    return OpenEpisode(
+        rule=document["rule"],
+        subject=Subject(*parse_subject(document["subject"])),
+        episode=document["episode"],
+        onset_time=parse_time(document["onsetTime"]),
+        start_time=parse_time(document["startTime"]),
+        values=values,
+        classification=classification,
+        rule_digest=document["ruleDigest"],
+    )
+
+
+def episode_of(demand: Demand) -> OpenEpisode:
+    """The episode that a demand is of. Its subject's text differs from the demand's where that one is none."""
+    try:
+        _, element = parse_subject(demand.subject)
+    except ValueError:
+        element = None
+    return OpenEpisode(
+        rule=demand.rule,
+        subject=Subject(demand.subjects, element),
+        episode=demand.episode,
+        onset_time=demand.onset_time,
+        start_time=demand.start_time,
+        values=demand.values,
+        classification=demand.classification,
+        rule_digest=demand.rule_digest,
+    )
+
+
+def ended_while_away(episode: OpenEpisode, holder: str, now: int) -> Event:
+    """The end of an episode whose rule changed or went while the detector was not running."""
+    return Event(
+        holder=holder,
+        rule=episode.rule,
+        subject=episode.subject.text,
+        subjects=episode.subject.clients,
+        episode=episode.episode,
+        onset_time=episode.onset_time,
+        start_time=episode.start_time,
+        end_time=now,
+        reason=Reason.RULE_CHANGED,
+        values={},
+        classification=episode.classification,
+        element=episode.subject.element,
+    )
