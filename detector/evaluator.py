@@ -18,9 +18,11 @@ from detector.engine.demands import Demand, to_task
 from detector.engine.engine import Engine
 from detector.engine.events import Event
 from detector.engine.intake import Intake
+from detector.engine.open_episodes import OpenEpisode
 from detector.engine.sample import Arrival
 from detector.losses import Losses
 from detector.plugins.outages import Outages
+from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from wayside.api.detector import Stream
@@ -54,6 +56,9 @@ class Outlet(Protocol):
 
     def events(self, events: Sequence[Event]) -> None:
         """What started and ended, in order."""
+
+    def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
+        """What is open may have changed; `episodes` tells what is, and is to be called at once or not at all."""
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
@@ -97,7 +102,7 @@ class Evaluator:
         engine.stopwatch = time.perf_counter_ns
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
-    def start(self, rule_set: RuleSet, restored: Sequence[Demand]) -> None:
+    def start(self, rule_set: RuleSet, restored: Restored) -> None:
         """Begin with these rules and the episodes that were open before; returns at once."""
         start = self._engine.now
         self._record(
@@ -110,11 +115,19 @@ class Evaluator:
             },
         )
         events = self._apply_rules(rule_set)
-        if restored:
-            self._record(start, {"kind": "restore", "tasks": [to_task(demand).to_json() for demand in restored]})
-        self._demands = {demand.name: demand for demand in restored}
-        events += self._engine.restore(restored, start)
+        if restored.demands or restored.episodes:
+            self._record(
+                start,
+                {
+                    "kind": "restore",
+                    "tasks": [to_task(demand).to_json() for demand in restored.demands],
+                    "episodes": [episode.to_document() for episode in restored.episodes],
+                },
+            )
+        self._demands = {demand.name: demand for demand in restored.demands}
+        events += self._engine.restore(restored.demands, start, restored.episodes)
         self._hand_over(events)
+        self._outlet.open_episodes(self._engine.open_episodes)
         self._thread.start()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
@@ -231,6 +244,7 @@ class Evaluator:
     def _hand_over(self, events: Sequence[Event]) -> None:
         if events:
             self._outlet.events(events)
+            self._outlet.open_episodes(self._engine.open_episodes)
         version = self._engine.demands_version
         if version != self._version:
             self._version = version

@@ -13,10 +13,12 @@ from typing import TypeVar
 from detector.actions.deploy import DemandReconciler
 from detector.actions.kubernetes_store import KubernetesTaskStore
 from detector.actions.lease import HolderLease
-from detector.actions.stores import TaskStore, restore
+from detector.actions.stores import TaskStore
 from detector.cluster.connection import connect
+from detector.restoring import what_was_open
 from detector.rules.kubernetes import ClusterRules
 from detector.running import Running
+from detector.state import state_file
 
 Result = TypeVar("Result")
 
@@ -62,13 +64,14 @@ async def _run_while_held(
     first = await _unless(stopping, anext(changes))
     if first is None or await _unless(stopping, lease.held.wait()) is None:
         return
-    restored = await _unless(stopping, restore(store))
+    state = state_file(first.detector, name)
+    restored = await _unless(stopping, what_was_open(store, state))
     if restored is None:
         return
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            with Running(first, name, reconciler, output, record, restored, metrics_port) as running:
+            with Running(first, name, reconciler, output, record, restored, metrics_port, state) as running:
                 following = group.create_task(running.follow(changes))
                 await running.until(stopping)
                 following.cancel()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from detector.actions.deploy import DemandReconciler
 from detector.engine.demands import Demand
 from detector.engine.events import Event
+from detector.engine.open_episodes import OpenEpisode
 from detector.event_log import EventLog
+from detector.state import StateFile
 from detector.streams.zenoh import Network, NetworkError
 
 _log = logging.getLogger(__name__)
@@ -17,7 +19,10 @@ _log = logging.getLogger(__name__)
 class LiveOutlet:
     """Events go to Zenoh and into the log, demands to the reconciler; nothing here waits."""
 
-    def __init__(self, network: Network, log: EventLog | None, reconciler: DemandReconciler) -> None:
+    def __init__(
+        self, network: Network, log: EventLog | None, reconciler: DemandReconciler, state: StateFile | None
+    ) -> None:
+        self._state = state
         self.network = network
         self._log = log
         self._reconciler = reconciler
@@ -52,6 +57,11 @@ class LiveOutlet:
             self.network.start()
         except NetworkError as error:
             _log.error("the changed Detector has no network, correct it: %s", error)
+
+    def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
+        """Have what is open written to the state volume, where there is one."""
+        if self._state is not None:
+            self._state.save(episodes())
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """Hand the demands over."""

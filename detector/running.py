@@ -14,7 +14,6 @@ from pathlib import Path
 from detector.actions.deploy import DemandReconciler
 from detector.answers import Answers
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
-from detector.engine.demands import Demand
 from detector.engine.intake import Intake
 from detector.engine.liveliness import LIVELINESS
 from detector.evaluator import Evaluator
@@ -22,11 +21,13 @@ from detector.event_log import EventLog
 from detector.outlet import LiveOutlet
 from detector.plugins.processes import ProcessHost
 from detector.replay.intake_writer import IntakeWriter
+from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.sources.registry import plugin_problems
 from detector.sources.supervision import Sources
 from detector.status.server import StatusServer
 from detector.streams.answering import Answering
+from detector.state import StateFile
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
 from wayside.api import Detector
@@ -46,8 +47,9 @@ class Running:
         reconciler: DemandReconciler,
         output: Path | None,
         record: Path | None,
-        restored: Sequence[Demand],
+        restored: Restored,
         metrics_port: int | None = None,
+        state: StateFile | None = None,
     ) -> None:
         """Raises DetectorError where the Detector cannot run, OSError where a file or the port cannot be had."""
         self._loop = asyncio.get_running_loop()
@@ -62,7 +64,8 @@ class Running:
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
         self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams)
         self._log = None if output is None else EventLog(output / "events.jsonl")
-        self._outlet = LiveOutlet(self._network(detector), self._log, reconciler)
+        self._outlet = LiveOutlet(self._network(detector), self._log, reconciler, state)
+        self._state = state
         self._reconciler = reconciler
         self._evaluator = Evaluator(
             self._engine,
@@ -90,8 +93,10 @@ class Running:
             "Detector %s runs with %d rules and %d restored demands",
             self._rule_set.detector.name,
             len(self._engine.rules),
-            len(self._restored),
+            len(self._restored.demands),
         )
+        if self._restored.episodes:
+            _log.info("%d open episodes of the state volume", len(self._restored.episodes))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -100,6 +105,8 @@ class Running:
             self._server.close()
         self._evaluator.stop()
         self._plugins.close()
+        if self._state is not None:
+            self._state.close()
         self._outlet.network.close()
         if self._log is not None:
             self._log.close()

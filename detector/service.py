@@ -15,10 +15,11 @@ from pathlib import Path
 
 from detector.actions.deploy import DemandReconciler
 from detector.actions.file_store import FileTaskStore, write_tasks_yaml
-from detector.actions.stores import restore
+from detector.restoring import what_was_open
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files
 from detector.running import Running, tune_garbage_collection
+from detector.state import state_file
 
 _log = logging.getLogger(__name__)
 
@@ -82,12 +83,13 @@ async def _run_from_files(files: Files, options: Options, stopping: asyncio.Even
     folder = files.output / "tasks"
     store = FileTaskStore(folder, holder)
     reconciler = DemandReconciler(store)
-    restored = await restore(store)
+    state = state_file(loaded.rule_set.detector, holder)
+    restored = await what_was_open(store, state)
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
             record, port = options.record_intake, options.metrics_port
-            with Running(loaded.rule_set, holder, reconciler, files.output, record, restored, port) as running:
+            with Running(loaded.rule_set, holder, reconciler, files.output, record, restored, port, state) as running:
                 following = group.create_task(running.follow(follow_files(files.detector, files.rules)))
                 await running.until(stopping)
                 following.cancel()

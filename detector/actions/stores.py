@@ -104,9 +104,14 @@ async def restore(store: TaskStore) -> list[Demand]:
     async with aclosing(store.follow()) as changes:
         async for change in changes:
             if isinstance(change, Snapshot):
-                live = (from_task(each.task) for each in change.tasks.values() if each.live and not each.leaving)
-                return sorted((demand for demand in live if demand), key=lambda each: (each.start_time, each.name))
+                return live_demands(change)
     raise AssertionError("a store's changes never end")
+
+
+def live_demands(snapshot: Snapshot) -> list[Demand]:
+    """The demands of the tasks that have not ended, oldest first."""
+    live = (from_task(each.task) for each in snapshot.tasks.values() if each.live and not each.leaving)
+    return sorted((demand for demand in live if demand), key=lambda each: (each.start_time, each.name))
 
 
 def belongs_to(task: ApplicationTask, holder: str) -> bool:

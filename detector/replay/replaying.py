@@ -16,6 +16,7 @@ from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
 from detector.engine.demands import Demand, from_task, to_task
 from detector.engine.engine import Engine
 from detector.engine.events import Event
+from detector.engine.open_episodes import OpenEpisode, from_document
 from detector.engine.plugins import PluginHost
 from detector.engine.sample import Arrival
 from detector.losses import Losses
@@ -100,12 +101,12 @@ class Replay:
         self.outcome.rules = tuple(sorted({*self.outcome.rules, *(rule.name for rule in rules)}))
         self._note(self._engine.set_rules(compiled))
 
-    def restore(self, demands: Sequence[Demand], time: int) -> None:
+    def restore(self, demands: Sequence[Demand], time: int, episodes: Sequence[OpenEpisode] = ()) -> None:
         """Take up the episodes that were open before the recording."""
         for demand in demands:
             self._demands[demand.name] = demand
             self.outcome.tasks[demand.name] = to_task(demand)
-        self._note(self._engine.restore(demands, time))
+        self._note(self._engine.restore(demands, time, episodes))
 
     def report(self) -> Iterator[str]:
         """What was lost, and how the evaluations went, a line each."""
@@ -212,7 +213,8 @@ def _control(
     match record.kind:
         case "restore":
             tasks = [ApplicationTask.model_validate(task) for task in document["tasks"]]
-            replay.restore([demand for task in tasks if (demand := from_task(task)) is not None], record.time)
+            demands = [demand for task in tasks if (demand := from_task(task)) is not None]
+            replay.restore(demands, record.time, [from_document(each) for each in document.get("episodes", ())])
         case "rules":
             if detector is None and "detector" in document:
                 replay.set_detector(Detector.model_validate(document["detector"]))

@@ -223,6 +223,17 @@ class Clock(StrEnum):
     DATA = "Data"
 
 
+class State(Model):
+    """Where open episodes are kept, so that a restart does not lose them."""
+
+    path: str = Field(
+        min_length=1,
+        max_length=1024,
+        description="A folder on a volume that outlives the process, e.g. /var/lib/wayside. It is made where it is "
+        "missing. A change takes effect at the next start.",
+    )
+
+
 class RuleSelector(Model):
     """Picks EventRules of the Detector's namespace by their labels."""
 
@@ -281,6 +292,10 @@ class DetectorSpec(Model):
     max_ahead: Duration = Field(
         default=Duration("1s"),
         description="With clock Data: a sample whose stamp is further ahead of the rest is dropped and counted.",
+    )
+    state: State | None = Field(
+        default=None,
+        description="Where open episodes are kept. Without it, a restart takes up only those that have a live task.",
     )
     rules: RuleSelector = Field(default=RuleSelector(), description="Which EventRules of the namespace are evaluated.")
 

@@ -1,0 +1,39 @@
+"""What was open when the detector stopped: first the episodes of its own live tasks, then those of its state volume."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import aclosing
+from dataclasses import dataclass
+
+from detector.actions.stores import Snapshot, TaskStore, live_demands
+from detector.engine.demands import Demand
+from detector.engine.open_episodes import OpenEpisode
+from detector.state import StateFile
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """What the engine takes up again."""
+
+    demands: Sequence[Demand] = ()
+    """Of live tasks, oldest first."""
+    episodes: Sequence[OpenEpisode] = ()
+    """Of the state volume, without those whose task has ended: the detector ended it and was killed before it wrote."""
+
+
+async def what_was_open(store: TaskStore, state: StateFile | None) -> Restored:
+    """Look at both. Waits for as long as the store is away; cancel it to give up."""
+    async with aclosing(store.follow()) as changes:
+        async for change in changes:
+            if isinstance(change, Snapshot):
+                episodes = [] if state is None else state.load()
+                over = _ended(change)
+                return Restored(live_demands(change), [each for each in episodes if each.episode not in over])
+    raise AssertionError("a store's changes never end")
+
+
+def _ended(snapshot: Snapshot) -> set[str]:
+    """The ids of the episodes whose tasks have ended."""
+    specs = (stored.task.spec for stored in snapshot.tasks.values() if not stored.live)
+    return {spec.event.id for spec in specs if spec.event is not None}

@@ -1,0 +1,154 @@
+"""The state volume: open episodes as one file, so that those without tasks survive a restart, even a kill -9.
+
+The file is replaced in one step by a thread of its own, so the evaluation never waits for the disk and nobody ever
+reads half a file. Only the newest set of episodes waits to be written: a slow disk writes less often, and what a kill
+costs is what happened since the last write. An episode that ended then is open again after the restart, and ends again,
+with the same id.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from detector.engine.open_episodes import OpenEpisode, from_document
+from wayside.api import Detector
+from wayside.names import encode
+
+_log = logging.getLogger(__name__)
+
+_VERSION = 1
+_RETRY = 5.0
+"""Seconds after which a write that failed is tried again, if nothing changes before."""
+
+
+def state_file(detector: Detector, holder: str) -> StateFile | None:
+    """The Detector's state volume, where it has one. Raises OSError where that cannot be written."""
+    state = detector.spec.state
+    return None if state is None else StateFile(Path(state.path), detector.namespace, holder)
+
+
+class StateFile:
+    """The open episodes of one holder, in a folder. `save` from one thread at a time."""
+
+    def __init__(self, folder: Path, namespace: str, holder: str) -> None:
+        """Make the folder where it is missing, and prepare. Raises OSError where the folder cannot be written."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._whose = {"namespace": namespace, "holder": holder}
+        self.path = folder / f"{encode(namespace)}_{encode(holder)}.json"
+        self._draft = self.path.with_suffix(".new")
+        self._draft.touch()
+        self._changed = threading.Condition()
+        self._wanted: Sequence[OpenEpisode] | None = None
+        self._closing = False
+        self._thread: threading.Thread | None = None
+        self.failures = 0
+        """Writes that the disk refused; each was tried again."""
+        self.set_aside = 0
+        """Files that could not be read."""
+
+    def load(self) -> list[OpenEpisode]:
+        """The episodes that were open when the file was last written; none where there is no file.
+
+        A file that cannot be read is said and set aside, beside the other under a free name: nothing is restored then.
+        """
+        try:
+            text = self.path.read_bytes()
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            _log.error("%s cannot be read, no episode is restored from it: %s", self.path, error)
+            return []
+        try:
+            return self._read(text)
+        except (ValueError, RecursionError) as error:
+            self._set_aside(error)
+            return []
+
+    def _read(self, text: bytes) -> list[OpenEpisode]:
+        document: Any = json.loads(text)
+        if not isinstance(document, dict) or document.get("version") != _VERSION:
+            raise ValueError(f"it is not of version {_VERSION}")
+        if document.get("of") != self._whose:
+            raise ValueError(f"it is of {document.get('of')}, not of {self._whose}")
+        episodes = document.get("episodes")
+        if not isinstance(episodes, list) or not all(isinstance(each, dict) for each in episodes):
+            raise ValueError("its episodes are not a list of maps")
+        return [from_document(each) for each in episodes]
+
+    def _set_aside(self, error: Exception) -> None:
+        number = 1
+        while (aside := self.path.with_suffix(f".unreadable-{number}")).exists():
+            number += 1
+        self.set_aside += 1
+        try:
+            self.path.rename(aside)
+        except OSError as refused:
+            _log.error("%s is unreadable and cannot be set aside (%s): %s", self.path, refused, error)
+        else:
+            _log.error("the state is unreadable, set aside as %s, and nothing restored from it: %s", aside, error)
+
+    def save(self, episodes: Sequence[OpenEpisode]) -> None:
+        """These are open now. Never waits; only the newest counts."""
+        with self._changed:
+            self._wanted = episodes
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="state", daemon=True)
+                self._thread.start()
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Write what waits; returns when that is done, or the disk has refused it."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join()
+        self._draft.unlink(missing_ok=True)
+
+    def _run(self) -> None:
+        failed, closing = False, False
+        while not closing:
+            with self._changed:
+                if failed:
+                    self._changed.wait(_RETRY)
+                else:
+                    self._changed.wait_for(lambda: self._wanted is not None or self._closing)
+                wanted, self._wanted = self._wanted, None
+                closing = self._closing
+            if wanted is None:
+                continue
+            try:
+                self._write(wanted)
+            except OSError as error:
+                self.failures += 1
+                if not failed:
+                    _log.error("the state cannot be written, and is as soon as possible: %s", error)
+                failed = True
+                with self._changed:
+                    if self._wanted is None:
+                        self._wanted = wanted
+            else:
+                failed = False
+
+    def _write(self, episodes: Sequence[OpenEpisode]) -> None:
+        document = {
+            "version": _VERSION,
+            "of": self._whose,
+            "episodes": [episode.to_document() for episode in episodes],
+        }
+        with self._draft.open("w", encoding="utf-8") as file:
+            json.dump(document, file, separators=(",", ":"), allow_nan=False)
+            file.flush()
+            os.fsync(file.fileno())
+        self._draft.replace(self.path)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # else the old name might come back after a loss of power
+        finally:
+            os.close(folder)
