@@ -25,9 +25,9 @@ from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.sources.registry import plugin_problems
 from detector.sources.supervision import Sources
+from detector.state import StateFile
 from detector.status.server import StatusServer
 from detector.streams.answering import Answering
-from detector.state import StateFile
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
 from wayside.api import Detector

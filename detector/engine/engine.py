@@ -197,7 +197,7 @@ class Engine:
 
     def open_episodes(self) -> list[OpenEpisode]:
         """All episodes that have not ended."""
-        return [episode for run in self._runs.values() for episode in run.open_episodes()]
+        return [episode for run in self._runs.values() for episode in run.episodes()]
 
     def demands(self) -> dict[str, Demand]:
         """What the open episodes ask for, by the names of the tasks."""

@@ -134,7 +134,7 @@ class RuleRun:
         )
         return self._event(self._open[episode.subject], None, None, episode.values)
 
-    def open_episodes(self) -> Iterator[OpenEpisode]:
+    def episodes(self) -> Iterator[OpenEpisode]:
         """The episodes that have not ended."""
         for episode in self._open.values():
             yield OpenEpisode(
