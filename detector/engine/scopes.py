@@ -16,7 +16,7 @@ from detector.engine.positions import Place, Positions, described, distance, poi
 from detector.engine.signals import Signals
 from detector.engine.subjects import Subject
 from wayside.expressions import UNKNOWN, Expression
-from wayside.rules import ClientSubject, CompiledElement, CompiledRule, FleetSubject, PairSubject
+from wayside.rules import ClientSubject, CompiledElement, CompiledRule, CompiledSignal, FleetSubject, PairSubject
 
 CLOSING_NS = 1_000_000_000
 """Over so long the closing speed is measured, in nanoseconds."""
@@ -57,14 +57,21 @@ class Views:
         self._positions = positions
         self._stale_after = stale_after
         self._counters = counters
+        self._common = rule.common_signals
         self._views: dict[str, dict[str, Any]] = {}
+        self._of_elements: dict[tuple[str, str | None], dict[str, Any]] = {}
         self._earlier: dict[str, Place | None] = {}
 
-    def of(self, client: str) -> dict[str, Any]:
-        """client, labels, streams and the known signals."""
+    def of(self, client: str, element: CompiledElement) -> dict[str, Any]:
+        """client, labels, streams and the known signals, those that read the element among them."""
         if client not in self._views:
             self.prepare((client,))
-        return self._views[client]
+        if not element.signals:
+            return self._views[client]
+        at = (client, element.name)
+        if at not in self._of_elements:
+            self._of_elements[at] = {**self._views[client], **self._values(element.signals, client)}
+        return self._of_elements[at]
 
     def prepare(self, clients: Iterable[str]) -> None:
         """Look at these clients together: models are run once for all of them."""
@@ -80,11 +87,15 @@ class Views:
             "streams": fresh_streams(client, self._stale_after, self._buffer, self._now),
             "parameters": self._rule.parameters.of(client),
         }
-        for signal in self._rule.signals:
-            value = self._signals.value(self._rule.name, signal, client, self._now, self._counters)
-            if value is not UNKNOWN:
-                view[signal.name] = value
-        return view
+        return {**view, **self._values(self._common, client)}
+
+    def _values(self, signals: Iterable[CompiledSignal], client: str) -> dict[str, Any]:
+        """Those of the signals that are known."""
+        computed = {
+            signal.name: self._signals.value(self._rule.name, signal, client, self._now, self._counters)
+            for signal in signals
+        }
+        return {name: value for name, value in computed.items() if value is not UNKNOWN}
 
     def place(self, subject: PairSubject, client: str) -> Place | None:
         """Where the client is, if that is known."""
@@ -117,15 +128,17 @@ def candidates(rule: CompiledRule, views: Views, clients: Clients, pending: Iter
         case ClientSubject() as each:
             for element in rule.elements:
                 for client in clients:
-                    variables = _with(views.of(client), element)
+                    variables = _with(views, client, element)
                     in_scope = views.truth(each.where, variables)
                     yield Candidate(Subject((client,), element.name), variables, in_scope, near=True)
         case PairSubject() as pairs:
             yield from _pairs(rule, pairs, views, clients, pending)
         case FleetSubject() as fleet:
             for element in rule.elements:
-                seen = ((client, _with(views.of(client), element)) for client in clients)
-                members = [views.of(client) for client, view in seen if views.truth(fleet.members, view) is True]
+                seen = ((client, _with(views, client, element)) for client in clients)
+                members = [
+                    views.of(client, element) for client, view in seen if views.truth(fleet.members, view) is True
+                ]
                 yield Candidate(
                     Subject((), element.name),
                     {"members": members, "parameters": rule.parameters.own, **element.variables},
@@ -134,8 +147,9 @@ def candidates(rule: CompiledRule, views: Views, clients: Clients, pending: Iter
                 )
 
 
-def _with(view: dict[str, Any], element: CompiledElement) -> dict[str, Any]:
+def _with(views: Views, client: str, element: CompiledElement) -> dict[str, Any]:
     """What one client is seen as, and the element."""
+    view = views.of(client, element)
     return {**view, **element.variables} if element.variables else view
 
 
@@ -161,8 +175,8 @@ def _pairs(
         for each in looked_at:
             a, b = each.clients
             variables: dict[str, Any] = {
-                "a": _member(views, subject, a, places),
-                "b": _member(views, subject, b, places),
+                "a": _member(views, subject, a, places, element),
+                "b": _member(views, subject, b, places, element),
                 "parameters": rule.parameters.own,
                 **element.variables,
             }
@@ -179,7 +193,7 @@ def _role(where: Expression | None, element: CompiledElement, views: Views, clie
     """Of each client, whether it can have the role."""
     if where is None:
         return dict.fromkeys(clients, True)
-    return {client: views.truth(where, _with(views.of(client), element)) for client in clients}
+    return {client: views.truth(where, _with(views, client, element)) for client in clients}
 
 
 def _possible(role: Mapping[str, Truth]) -> list[str]:
@@ -187,8 +201,10 @@ def _possible(role: Mapping[str, Truth]) -> list[str]:
     return [client for client, truth in role.items() if truth is not False]
 
 
-def _member(views: Views, subject: PairSubject, client: str, places: Mapping[str, Place]) -> dict[str, Any]:
-    view = views.of(client)
+def _member(
+    views: Views, subject: PairSubject, client: str, places: Mapping[str, Place], element: CompiledElement
+) -> dict[str, Any]:
+    view = views.of(client, element)
     if client in places and "position" not in view:
         view["position"] = described(subject.position, places[client])
     return view

@@ -116,7 +116,7 @@ class Signals:
         """Seconds since the last sample (that `where` picks); while there was none, since the client is known."""
         latest = NEVER if lane is None else lane.latest
         if lane is not None and signal.where is not None:
-            key = (rule, signal.name, client)
+            key = (rule, signal.place, client)
             picked = self._window(rule, signal, lane, client, now, counters, at_most=1)
             # Kept beyond the buffer: what has left it was still the last one.
             latest = self._picked[key] = picked[0][0].time if picked else self._picked.get(key, NEVER)
@@ -138,7 +138,7 @@ class Signals:
 
         `at_most` so many of them are looked for, from the newest or from the oldest on.
         """
-        key = (rule, signal.name, client)
+        key = (rule, signal.place, client)
         known = self._extracted.get(key, {})
         looked_at: dict[Sample, Value | Unknown | None] = {}
         values: list[tuple[Sample, Value | Unknown]] = []
@@ -178,6 +178,8 @@ class Signals:
         if values is None:
             counters.unknowns += 1
             return UNKNOWN
+        if signal.element is not None:
+            values.update(signal.element.variables)
         return expression.evaluate_or_unknown(values, counters.note)
 
 

@@ -222,6 +222,40 @@ def test_a_rule_with_elements_is_evaluated_once_for_each() -> None:
     assert first["data"]["subjects"] == ["car"]
 
 
+def test_signals_may_read_the_element_and_are_then_computed_for_each() -> None:
+    beyond = {"name": "beyond", "stream": "pose", "value": "msg.x - site.x", "over": "3s", "aggregate": "Max"}
+    there = {"name": "there", "stream": "pose", "where": "msg.x > site.x", "over": "9s", "aggregate": "Count"}
+    since = {"name": "since", "stream": "pose", "where": "msg.x > site.x", "aggregate": "Age"}
+    rule = a_rule(each=SITES, signals=[beyond, there, since, SPEED], when="beyond > 0.0", until="since > 2.0")
+    drive = Drive(a_detector(), rule)
+    places = (0, 130, 140, 600, 0, 0, 0)
+    told = drive.take(*sorted([*(place(n + 0.5, "car", x) for n, x in enumerate(places)), speed(0.6, 5)]), until=7)
+    assert told == ["r car~north started 2", "r car~south started 4", "r car~north Until 6", "r car~south Until 6"]
+    north, south = (event.values for event in drive.events[:2])
+    assert north == {"beyond": 10, "there": 1, "since": 0.5, "speed": 5}
+    assert south == {"beyond": 100, "there": 1, "since": 0.5, "speed": 5}
+
+
+def test_signals_that_read_the_element_in_pairs_and_in_the_fleet() -> None:
+    signals = [{"name": "beyond", "stream": "pose", "value": "msg.x - site.x"}, SPEED]
+    here = [place(0.5, "a", 130), place(0.5, "b", 140), place(0.5, "c", 510), speed(0.6, 7, "a")]
+    scope = {"position": POSITION, "within": 50}
+    rule = pairs(scope=scope, each=SITES, signals=signals, when="a.beyond > 0.0 && b.beyond > 0.0")
+    drive = Drive(a_detector(), rule)
+    assert drive.take(*sorted(here), until=1) == ["p a+b~north started 1"]
+    a = drive.events[0].values["a"]
+    assert a == {"client": "a", "beyond": 10, "speed": 7, "position": {"x": 130, "y": 0, "z": 0}}
+    rule = a_rule(
+        scope={"fleet": {"members": "beyond > 0.0"}},
+        each=SITES,
+        signals=signals,
+        when="members.all(m, m.beyond < 400.0)",
+    )
+    drive = Drive(a_detector(), rule)
+    assert drive.take(*sorted(here), until=1) == ["r ~fleet~north started 1", "r ~fleet~south started 1"]
+    assert [event.values["count"] for event in drive.events] == [3, 1]
+
+
 def test_elements_in_every_scope_and_its_conditions() -> None:
     clients = [{"name": name, "labels": {"site": name[0]}} for name in ("n1", "n2", "s1")]
     each = {"as": "site", "of": [{"name": "n"}, {"name": "s"}]}

@@ -44,6 +44,16 @@ def in_pairs(**fields: Any) -> dict[str, Any]:
         ),
         ({"scope": {"fleet": {"members": "true"}}, "when": "size(member) > 1"}, "spec.when", "did you mean `members`?"),
         ({"each": EACH, "when": "site.z > 1"}, "spec.when", "site has no field z; it has name, x, y"),
+        (
+            {"each": EACH, "signals": [{**SPEED, "value": "msg.v - site.z"}], "when": "true"},
+            "spec.signals[0].value",
+            "site has no field z",
+        ),
+        (
+            {**in_pairs(position={"stream": "pose", "x": "msg.x - site.x", "y": "0.0"}), "each": EACH},
+            "spec.scope.pairs.position.x",
+            "site",
+        ),
         ({"each": {**EACH, "as": "labels"}, "when": "true"}, "spec.each.as", "labels is a name that"),
         ({"each": {**EACH, "as": "for"}, "when": "true"}, "spec.each.as", "for is a word of CEL"),
         ({"each": {**EACH, "as": "speed"}, "signals": [SPEED], "when": "true"}, "spec.each.as", "a signal's name"),

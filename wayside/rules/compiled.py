@@ -27,6 +27,13 @@ class CompiledSignal:
     """What value and where see as `parameters`, by client."""
     rule: str | None = None
     """The rule whose episode starts are the samples; None where they come from a stream."""
+    element: CompiledElement | None = None
+    """The element that it is computed for, where value or where read it."""
+
+    @property
+    def place(self) -> str:
+        """Under this its samples' values are kept: names have no `~`."""
+        return self.name if self.element is None else f"{self.name}~{self.element.name}"
 
 
 def episode_stream(rule: str) -> str:
@@ -103,6 +110,8 @@ class CompiledElement:
     name: str | None = None
     variables: Mapping[str, Any] = field(default_factory=dict)
     """The element's map under its variable's name."""
+    signals: tuple[CompiledSignal, ...] = ()
+    """The signals that are computed for this element: those that read it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +170,7 @@ class CompiledRule:
     name: str
     subject: CompiledSubject
     signals: tuple[CompiledSignal, ...]
+    """All of them. Those that read the element of `each` are computed for each element: see `elements`."""
     plugins: tuple[CompiledPlugin, ...]
     when: Expression
     until: Expression | None
@@ -178,6 +188,12 @@ class CompiledRule:
     parameters: Parameters = NO_PARAMETERS
     models: tuple[CompiledModel, ...] = ()
     """The signals that models compute."""
+
+    @property
+    def common_signals(self) -> tuple[CompiledSignal, ...]:
+        """The signals that are the same for all elements."""
+        own = {signal.name for signal in self.elements[0].signals}
+        return tuple(signal for signal in self.signals if signal.name not in own)
 
     @property
     def streams(self) -> frozenset[str]:

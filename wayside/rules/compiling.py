@@ -39,12 +39,20 @@ from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.models import compile_models
 from wayside.rules.parameters import kinds_of, override_problems, parameters_of
 from wayside.rules.problems import RuleError, RuleProblem
-from wayside.rules.scopes import closing_speed_problem, compile_elements, compile_subject, known_members
+from wayside.rules.scopes import (
+    closing_speed_problem,
+    compile_elements,
+    compile_subject,
+    element_problems,
+    known_members,
+    with_signals,
+)
 from wayside.rules.variables import (
     EPISODE_MEMBERS,
     RESERVED,
     SAMPLE_MEMBERS,
     condition_environment,
+    element_of,
     is_taken,
     naming_environment,
     sample_environment,
@@ -147,6 +155,9 @@ class _RuleCompiler:
         deploys = [
             self._deploy(index, action.name, environment) for index, action in enumerate(self.spec.actions)
         ]  # fmt: skip
+        elements = with_signals(elements, element_of(self.spec), [each for each in signals if each is not None])
+        for path, text in element_problems(elements, models):
+            self.problem(path, text)
         if subject is not None:
             embedded = [each.expression for deploy in deploys if deploy for each in deploy.parameters.embedded]
             subject = self._closing(subject, (when, until, *embedded))
@@ -185,8 +196,8 @@ class _RuleCompiler:
         if signal.stream is None:
             return None  # a model's, or a plugin's
         stream = self.stream((*at, "stream"), signal.stream)
-        value = self.sample((*at, "value"), signal.value, stream, Kind.DYN)
-        where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL)
+        value = self.sample((*at, "value"), signal.value, stream, Kind.DYN, element_of(self.spec))
+        where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL, element_of(self.spec))
         over = None if signal.over is None else signal.over.ns
         if stream is not None and over is not None:
             kept = self.kept_ns(stream)
@@ -249,11 +260,15 @@ class _RuleCompiler:
             self._members(path, expression.paths)
         return expression
 
-    def sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind) -> Expression | None:
-        """An expression over one sample; None where there is none, or it is wrong."""
-        expression = self._expression(path, source, sample_environment(), kind)
+    def sample(
+        self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind, element: str | None = None
+    ) -> Expression | None:
+        """An expression over one sample, and the element's variable; None where there is none, or it is wrong."""
+        expression = self._expression(path, source, sample_environment(element), kind)
         if expression is None:
             return None
+        if element is not None:
+            self._members(path, expression.paths)
         known: Fields = dict.fromkeys(SAMPLE_MEMBERS)
         for variable, members in (("sample", known), ("parameters", dict.fromkeys(self.spec.parameters))):
             for text in unknown_fields(expression.paths, variable, members):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 from wayside.api import EventRule
@@ -14,7 +15,9 @@ from wayside.expressions import Environment, Expression, Kind
 from wayside.rules.compiled import (
     ClientSubject,
     CompiledElement,
+    CompiledModel,
     CompiledPosition,
+    CompiledSignal,
     CompiledSubject,
     FleetSubject,
     PairSubject,
@@ -117,6 +120,36 @@ def compile_elements(compiler: Expressions, each: Each | None) -> tuple[Compiled
     return tuple(
         CompiledElement(element.name, {name: element.to_json()}) for element in sorted(each.of, key=lambda e: e.name)
     )
+
+
+def with_signals(
+    elements: Sequence[CompiledElement], variable: str | None, signals: Sequence[CompiledSignal]
+) -> tuple[CompiledElement, ...]:
+    """The elements, each with the signals that read it."""
+    if variable is None:
+        return tuple(elements)
+    reading = [signal for signal in signals if _reads(signal, variable)]
+    return tuple(
+        replace(element, signals=tuple(replace(signal, element=element) for signal in reading)) for element in elements
+    )
+
+
+def element_problems(
+    elements: Sequence[CompiledElement], models: Sequence[CompiledModel]
+) -> Iterator[tuple[FieldPath, str]]:
+    """Models that would have to be run for each element: they are run once for a client."""
+    own = {signal.name for signal in elements[0].signals}
+    for model in models:
+        for index, given in enumerate(model.source.inputs):
+            names = given.window.signals if given.window is not None else given.signals
+            for name in names or ():
+                if name in own:
+                    path: FieldPath = ("spec", "signals", model.index, "model", "inputs", index)
+                    yield path, f"{name} reads the element of each, and a model is run once for a client: leave it out"
+
+
+def _reads(signal: CompiledSignal, variable: str) -> bool:
+    return any(variable in each.names for each in (signal.value, signal.where) if each is not None)
 
 
 def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:

@@ -24,17 +24,16 @@ EPISODE_MEMBERS: Fields = dict.fromkeys(
 SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 
 
-@cache
-def sample_environment() -> Environment:
-    """For `value`, `where` and positions: one sample.
+@lru_cache(maxsize=256)
+def sample_environment(element: str | None = None) -> Environment:
+    """For `value` and `where` of signals, and positions (without an element): one sample.
 
     msg is the decoded message, key the captured chunks, sample has stamp and received (seconds since the epoch),
     latency (seconds) and size (bytes); parameters are those of the sample's client.
     """
-    return Environment(
-        {"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP},
-        {f"sample.{member}": Kind.DOUBLE for member in SAMPLE_MEMBERS},
-    )
+    fixed = {"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP}
+    members = {f"sample.{member}": Kind.DOUBLE for member in SAMPLE_MEMBERS}
+    return Environment({**fixed, **_element(element)}, members)
 
 
 @cache
