@@ -294,3 +294,20 @@ def test_an_episode_of_an_element_is_restored_and_one_of_an_element_that_is_gone
         "r car~north RuleChanged 0",
         "r car~south RuleChanged 0",
     ]
+
+
+def test_a_signal_over_another_rule_may_pick_the_episodes_of_its_own_element() -> None:
+    passed = a_rule(
+        "passed", each=SITES, signals=[{"name": "x", "stream": "pose", "value": "msg.x"}], when="x > site.x"
+    )
+    starts = {
+        "name": "starts",
+        "rule": "passed",
+        "where": "msg.element == site.name",
+        "over": "9s",
+        "aggregate": "Count",
+    }
+    again = a_rule("again", each=SITES, signals=[starts], when="starts >= 2.0")
+    drive = Drive(a_detector(), passed, again)
+    told = drive.take(*(place(n + 0.5, "car", x) for n, x in enumerate((130, 0, 130, 600))), until=4)
+    assert [each for each in told if each.startswith("again")] == ["again car~north started 3"]

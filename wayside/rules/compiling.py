@@ -212,7 +212,7 @@ class _RuleCompiler:
     def _episode_signal(self, at: FieldPath, signal: Signal, rule: str) -> CompiledSignal:
         """A signal whose samples are the episode starts of another rule."""
         value, where = (
-            self.sample((*at, field), source, None, kind)
+            self.sample((*at, field), source, None, kind, element_of(self.spec))
             for field, source, kind in (("value", signal.value, Kind.DYN), ("where", signal.where, Kind.BOOL))
         )
         for field, expression in (("value", value), ("where", where)):
