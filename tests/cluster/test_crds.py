@@ -23,7 +23,7 @@ from tests.cluster.manifests import (
     changed,
 )
 from tests.cluster.wrong_objects import TIME, UPDATES, WRONG, Changes
-from wayside.api import KINDS
+from wayside.api import KINDS, EventRule
 
 EXAMPLES = [
     file
@@ -49,6 +49,31 @@ def test_a_valid_object_is_stored_as_it_was_written(kind: str, api: Api) -> None
     written = VALID[kind]
     stored = api.create(written)
     assert _covers(stored["spec"], written["spec"]), stored["spec"]
+
+
+SCOPES: dict[str, dict[str, Any]] = {
+    "roles on the Earth": {
+        "pairs": {
+            "position": {"stream": "gnss", "latitude": "msg.lat", "longitude": "msg.lon"},
+            "within": 250.5,
+            "a": {"where": "labels.role == 'tram'"},
+            "b": {"where": "labels.role == 'car'"},
+            "maxPairs": 500,
+        }
+    },
+    "the fleet": {"fleet": {"members": "speed > 0"}},
+    "each client": {"client": {"where": "'pose' in streams"}},
+}
+
+
+@pytest.mark.parametrize("scope", SCOPES)
+def test_every_scope_and_an_elements_own_fields_are_stored_as_they_were_written(scope: str, api: Api) -> None:
+    each = {"as": "site", "of": [{"name": "north", "x": 1.5, "node": "rsu-1", "area": [[0, 0], [1, 1]], "on": True}]}
+    rule = changed(EVENT_RULE, {"spec.scope": SCOPES[scope], "spec.each": each})
+    stored = api.create(rule)
+    for field in ("scope", "each"):
+        assert _covers(stored["spec"][field], rule["spec"][field])
+    EventRule.model_validate(stored)
 
 
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: f"{file.parent.name}/{file.name}")
