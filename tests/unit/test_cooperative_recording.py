@@ -102,7 +102,7 @@ def test_fifteen_vehicles_with_names_that_ros_accepts_and_enough_lidars_for_seve
     assert len(LIDAR_VEHICLES) >= 4
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32), horizon=st.floats(5, 60))
 def test_a_seed_decides_the_whole_drive_and_a_longer_horizon_only_adds_to_it(seed: int, horizon: float) -> None:
     times = np.linspace(0, 5, 51)
@@ -116,7 +116,7 @@ def test_another_seed_gives_another_drive() -> None:
     assert simulate(1).pose("taxi_1", 3) != simulate(2).pose("taxi_1", 3)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32))
 def test_vehicles_move_as_vehicles_can(seed: int) -> None:
     step = 0.05
