@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import pytest
 
 from detector.engine.sample import DecodeError
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder
 from detector.streams.codecs.etsi.times import its_ms, nearest, unix_ns
-from tests.unit.its_messages import PDUS, a_cam, random_message
+from tests.unit.its_messages import PDUS, a_cam, encode, random_message
 
 SECOND = 10**9
 NOW = 1_767_225_600 * SECOND
@@ -80,3 +81,77 @@ def test_a_generation_time_is_the_one_nearest_to_the_receipt(late: int) -> None:
     sent = NOW + 123_000_000
     assert nearest(its_ms(sent) % 65536, sent + late * 1_000_000) == sent
     assert EtsiDecoder("etsi/cam").stamp_near(a_cam(milliseconds=its_ms(sent)), sent + late * 1_000_000) == sent
+
+
+def test_messages_of_another_encoder_are_read() -> None:
+    """Those that the tests of GeoNetworking and CAM/DENM in Java (github.com/alexvoronov/geonetworking) expect."""
+    decoder = EtsiDecoder()
+    read = [decoder.decode(bytes.fromhex(raw)) for raw in PUBLISHED]
+    position = read[0]["cam"]["camParameters"]["basicContainer"]["referencePosition"]
+    assert (position["latitude"], position["longitude"]) == (57e-7, 13e-7)
+    parameters = [message["cam"]["camParameters"] for message in read[:2]]
+    for each in parameters:
+        moving = each["highFrequencyContainer"]["basicVehicleContainerHighFrequency"]
+        assert moving["accelerationControl"] == ["gasPedalEngaged", "accEngaged"]
+        assert len(each["lowFrequencyContainer"]["basicVehicleContainerLowFrequency"]["pathHistory"]) == 2
+    assert parameters[0]["specialVehicleContainer"]["publicTransportContainer"] == {
+        "embarkationStatus": True,
+        "ptActivation": {"ptActivationType": 0.0, "ptActivationData": b"\x0a\xff"},
+    }
+    works = parameters[1]["specialVehicleContainer"]["roadWorksContainerBasic"]
+    assert works["closedLanes"]["drivingLaneStatus"] == [False, True, False, True, False, True]
+    assert read[2]["denm"]["management"]["validityDuration"] == 600.0
+
+
+PUBLISHED = (
+    "01020000000000646006B49D272D693A41BFFFFFFC23B7743E40E11FDFFFFEBFE9ED0737530F5FFFB09000013FFFFFFFFF1CE3FFFFFFFFF1"
+    "CE060010AFF0",
+    "01020000000000646006B49D272D693A41BFFFFFFC23B7743E40E11FDFFFFEBFE9ED0737530F5FFFB09000013FFFFFFFFF1CE3FFFFFFFFF1"
+    "CE1A0AA8",
+    "010100000000010000000000000000000000000000000006B49D201D693A401FFFFFFE11DBBA1F012C0000",
+)
+
+
+@pytest.mark.parametrize(
+    ("raw", "seconds"),
+    [
+        (lambda chance: random_message("denm", chance), lambda read: read["denm"]["management"]["referenceTime"]),
+        (lambda chance: random_message("mapem", chance), lambda read: None),
+    ],
+)
+def test_stamps_of_messages_that_tell_the_whole_time_and_of_those_that_tell_none(raw: Any, seconds: Any) -> None:
+    message, expected = raw(random.Random(3))
+    wanted = seconds(expected)
+    assert EtsiDecoder().stamp_near(message, NOW) == (None if wanted is None else round(wanted * 1000) * 1_000_000)
+
+
+def test_a_spatem_tells_the_minute_of_the_year_and_the_year_is_that_of_the_receipt() -> None:
+    state = {"id": {"id": 7}, "revision": 0, "status": (0, 16), "states": []}
+    state["states"] = [{"signalGroup": 1, "state-time-speed": [{"eventState": "stop-And-Remain"}]}]
+    late = {**state, "moy": 525_599, "timeStamp": 59_500}  # the last minute of 2025
+    raw = encode("spatem", {"spat": {"intersections": [late]}})
+    assert EtsiDecoder("etsi/spatem").stamp_near(raw, NOW + SECOND) == NOW - SECOND // 2
+    raw = encode("spatem", {"spat": {"intersections": [state]}})
+    assert EtsiDecoder("etsi/spatem").stamp_near(raw, NOW) is None
+    light = EtsiDecoder("etsi/spatem").decode(raw)["spat"]["intersections"][0]["states"][0]
+    assert light["state_time_speed"] == [{"eventState": "stop-And-Remain"}]
+
+
+def test_a_regional_extension_is_read_where_its_definition_is_known() -> None:
+    reference = {"lat": 507773210, "long": 61234567}
+    regional = [{"regionId": 3, "regExtValue": ("Position3D-addGrpC", {"altitude": ALTITUDE})}]
+    intersection = {"id": {"id": 7}, "revision": 0, "refPoint": {**reference, "regional": regional}, "laneSet": [LANE]}
+    raw = encode("mapem", {"map": {"msgIssueRevision": 0, "intersections": [intersection]}})
+    place = EtsiDecoder("etsi/mapem").decode(raw)["map"]["intersections"][0]["refPoint"]
+    assert (place["lat"], place["long"]) == (50.777321, 6.1234567)
+    assert place["regional"] == [
+        {"regionId": 3.0, "regExtValue": {"altitude": {"altitudeValue": 12.34, "altitudeConfidence": None}}}
+    ]
+
+
+ALTITUDE = {"altitudeValue": 1234, "altitudeConfidence": "unavailable"}
+LANE = {
+    "laneID": 1,
+    "laneAttributes": {"directionalUse": (2, 2), "sharedWith": (0, 10), "laneType": ("vehicle", (0, 8))},
+    "nodeList": ("nodes", [{"delta": ("node-XY1", {"x": 100, "y": -250})}, {"delta": ("node-XY1", {"x": 0, "y": 0})}]),
+}

@@ -11,6 +11,9 @@ from detector.engine.sample import DecodeError
 _FRAGMENT = 16384
 """A length beyond is sent in pieces of one to four times this many."""
 
+_LONGEST = 8
+"""Bytes of a number without bounds."""
+
 _ELEMENTS_PER_OCTET = 64
 """Some elements take no bits at all. A list of them could be as long as its sender claims: this is enough for any."""
 
@@ -67,11 +70,17 @@ class Bits:
 
     def unsigned(self) -> int:
         """A number without an upper bound, from zero on (11.7)."""
-        return int.from_bytes(self.blob(), "big")
+        return int.from_bytes(self._number(), "big")
 
     def signed(self) -> int:
         """A number without bounds (11.8)."""
-        return int.from_bytes(self.blob(), "big", signed=True)
+        return int.from_bytes(self._number(), "big", signed=True)
+
+    def _number(self) -> bytes:
+        octets = self.blob()
+        if len(octets) > _LONGEST:
+            raise DecodeError(f"a number of {len(octets)} bytes: none has more than {_LONGEST}")
+        return octets
 
     def small(self) -> int:
         """A number that is normally small (11.6)."""

@@ -53,15 +53,17 @@ def message_in(payload: bytes) -> bytes:
     """The message without what is around it. Raises DecodeError where there is none, or none that can be read."""
     if len(payload) > MAXIMUM:
         raise DecodeError(f"{len(payload)} bytes: an ITS packet has at most {MAXIMUM}")
-    if len(payload) < 6:
-        raise DecodeError(f"{len(payload)} bytes: an ITS message has more than 6")
-    if _is_geonetworking(payload):
-        return _from_geonetworking(payload)
-    if _is_btp(payload):
-        return payload[_BTP_LENGTH:]
-    if _is_secured(payload):
-        return message_in(_from_secured(payload))
-    return payload
+    for _ in range(_NESTED):
+        if len(payload) < 6:
+            raise DecodeError(f"{len(payload)} bytes: an ITS message has more than 6")
+        if _is_geonetworking(payload):
+            return _from_geonetworking(payload)
+        if _is_btp(payload):
+            return payload[_BTP_LENGTH:]
+        if not _is_secured(payload):
+            return payload
+        payload = _from_secured(payload)
+    raise DecodeError(f"a message in {_NESTED} envelopes: none needs so many")
 
 
 def _is_geonetworking(packet: bytes) -> bool:
@@ -119,7 +121,7 @@ def _from_secured(data: bytes) -> bytes:
         if not preamble & _DATA_PRESENT:
             raise DecodeError("a signed packet that holds only the hash of its data")
         data = data[4:]
-    raise DecodeError(f"a secured packet in more than {_NESTED} envelopes")
+    raise DecodeError(f"a secured packet in {_NESTED} envelopes: none needs so many")
 
 
 def _octets(data: bytes, start: int) -> bytes:
