@@ -12,12 +12,14 @@ from detector.replay.json_lines import read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
 from detector.replay.mcap_file import read_mcap
 from detector.replay.message import Message, Wanted
+from detector.replay.pcap import MAGICS as PCAP_MAGICS
+from detector.replay.pcap import read_pcap
 from detector.replay.rosbag1 import ROSBAG1_MAGIC, read_rosbag1
 from detector.replay.rosbag2 import SQLITE_MAGIC, read_rosbag2
 
 _Read = Callable[[Path, Wanted], Iterator[Message]]
 
-_KINDS = "rosbag2 folders, ROS 1 bags, .mcap, .db3, and JSON lines"
+_KINDS = "rosbag2 folders, ROS 1 bags, .mcap, .db3, .pcap, .pcapng, and JSON lines"
 
 
 def open_recordings(paths: Sequence[Path], wanted: Wanted = lambda key: True) -> Iterator[Message]:
@@ -48,6 +50,8 @@ def _reader(path: Path) -> _Read:
         if path.suffix != ".bag":
             raise RecordingError(f"{path}: a ROS 1 bag is read if its name ends in .bag: rename it")
         return read_rosbag1
+    if head.startswith(PCAP_MAGICS):
+        return read_pcap
     if head.startswith(SQLITE_MAGIC):
         if path.suffix != ".db3":
             raise RecordingError(f"{path}: an SQLite file is read as a rosbag2 if its name ends in .db3")
