@@ -14,7 +14,7 @@ from detector.models.binding import bind_models
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import plugin_problems
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
-from detector.streams.codecs.etsi import OwnDefinitions, own_definitions, read_module
+from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.fields import message_fields
 from wayside.api import Detector, EventRule
 from wayside.keys import KeyPattern
@@ -74,7 +74,7 @@ def inlets(detector: Detector) -> Inlets:
     for index, stream in enumerate(detector.spec.streams):
         known: Fields | None = None
         try:
-            decoders[stream.name] = codec_for(stream, asn1)
+            decoder = decoders[stream.name] = codec_for(stream, asn1)
         except UnknownTypeError as error:
             problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
         except DefinitionError as error:
@@ -82,7 +82,7 @@ def inlets(detector: Detector) -> Inlets:
                 field = "encoding" if stream.type is None else "type"
                 problems.append(RuleProblem(("spec", "streams", index, field), str(error)))
         else:
-            known = message_fields(stream)
+            known = decoder.fields if isinstance(decoder, EtsiDecoder) else message_fields(stream)
         if known is not None:
             fields[stream.name] = known
         problems += stream_problems(stream, index, known)

@@ -105,7 +105,7 @@ class Losses:
             unread = f"times a sample of stream {name} could not be read"
             yield Loss(unread, count, last, cause="undecodable", stream=name)
         for name, count in counters.unnamed.items():
-            unnamed = f"samples of stream {name} dropped, their keys naming no client"
+            unnamed = f"samples of stream {name} dropped, naming no client by key or message"
             yield Loss(unnamed, count, cause="unnamed", stream=name)
         for name, count in counters.crowded.items():
             crowded = f"samples of stream {name} dropped, too many clients being known"

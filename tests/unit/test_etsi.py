@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 from typing import Any
 
 import pytest
 
+from detector.assembly import DetectorError, inlets
 from detector.engine.sample import DecodeError
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder
+from detector.streams.codecs.etsi.messages import BY_NAME, packaged_definitions
 from detector.streams.codecs.etsi.times import its_ms, nearest, unix_ns
+from tests.unit.driving import a_detector, a_rule
 from tests.unit.its_messages import PDUS, a_cam, encode, random_message
+from wayside.rules import RuleError, compile_rule
 
 SECOND = 10**9
 NOW = 1_767_225_600 * SECOND
@@ -155,3 +161,38 @@ LANE = {
     "laneAttributes": {"directionalUse": (2, 2), "sharedWith": (0, 10), "laneType": ("vehicle", (0, 8))},
     "nodeList": ("nodes", [{"delta": ("node-XY1", {"x": 100, "y": -250})}, {"delta": ("node-XY1", {"x": 0, "y": 0})}]),
 }
+
+
+@pytest.mark.parametrize(
+    ("expression", "problem"),
+    [
+        ("msg.cam.generationDeltaTme", "msg.cam has no field generationDeltaTme; did you mean generationDeltaTime"),
+        ("msg.header.stationID", "msg.header has no field stationID; did you mean stationId"),
+        ("msg.cam.camParameters.specialVehicleContainer.emergency", "did you mean emergencyContainer"),
+        ("msg.denm", "msg has no field denm; it has cam, header"),
+    ],
+)
+def test_a_field_that_the_message_does_not_have_is_told_before_any_has_come(expression: str, problem: str) -> None:
+    detector = a_detector(STREAM)
+    rule = a_rule(signals=[{"name": "x", "stream": "cam", "value": expression}], when="x == 1")
+    with pytest.raises(RuleError, match=problem):
+        compile_rule(rule, detector, inlets(detector).fields)
+
+
+STREAM = {"name": "cam", "key": "its/${client:*}/cam", "encoding": "uper", "type": "etsi/cam"}
+
+
+def test_without_the_extra_the_error_names_the_stream_and_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in BY_NAME["cam"].packaged.values():
+        monkeypatch.setitem(sys.modules, f"pycrate_asn1dir.{package[0]}", None)
+    packaged_definitions.cache_clear()
+    with pytest.raises(
+        DetectorError, match=r"spec.streams\[0\].type: .* CAM are not installed: pip install 'wayside\["
+    ):
+        inlets(a_detector(STREAM))
+
+
+def test_the_packages_of_definitions_are_imported_only_where_a_stream_needs_them() -> None:
+    heavy = "[name for name in sys.modules if name.startswith(('pycrate', 'asn1tools'))]"
+    code = f"import sys, detector.cli, detector.assembly, detector.service; print({heavy})"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -150,6 +150,7 @@ def test_arithmetic_means_what_it_means_in_doubles(steps: list[tuple[str, str]],
         ('timestamp("2026-01-01T10:00:00Z").getHours() / 4', 2.5),
         ('timestamp(60) - timestamp(0) == duration("60s")', True),
         ("string(3) + string(2.5)", "32.5"),
+        ("string(int(4294967295.0)) + string(int(7.9))", "42949672957"),
         ("[[1], [2]][1][0]", 2.0),
     ],
 )

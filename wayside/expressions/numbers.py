@@ -7,8 +7,8 @@
 Integer literals become doubles, and so do the results of functions that count, and of `int(x)`, which cuts off the
 fraction. A literal index stays an integer; any other index is wrapped in `dyn()`, because a list takes an integral
 double as its index at run time, but not when types are checked. Integers stay where only integers work: beside `%`,
-as the argument of `timestamp`, and beyond 2^53, where a double would be another number. Strings, comments and `3u` are
-left alone.
+as the argument of `timestamp` and of `string` (which writes large doubles with an exponent), and beyond 2^53, where a
+double would be another number. Strings, comments and `3u` are left alone.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _stays_integer(line: list[Token], matches: dict[int, int], i: int, last: int
     opening = line[first - 1].text
     if opening == "[":
         return _ends_operand(line, first - 2)
-    return opening == "(" and first > 1 and line[first - 2].text == "timestamp"
+    return opening == "(" and first > 1 and line[first - 2].text in ("timestamp", "string")
 
 
 def _is_lone_literal(line: list[Token], first: int, end: int) -> bool:

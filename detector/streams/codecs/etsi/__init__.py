@@ -11,7 +11,8 @@ from typing import Any
 from detector.engine.sample import DecodeError
 from detector.streams.codecs.etsi.asn1 import DefinitionError
 from detector.streams.codecs.etsi.bits import Bits
-from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, Kind, readers
+from detector.streams.codecs.etsi.members import message_members
+from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, Kind, definitions, reader
 from detector.streams.codecs.etsi.own import OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.etsi.packets import message_in
 
@@ -31,7 +32,12 @@ class EtsiDecoder:
         """
         self._only = None if type_name is None else _kind(type_name)
         kinds = (self._only,) if self._only is not None else [kind for kind in KINDS if _is_defined(kind, own)]
-        self._readers = {kind.number: readers(kind, own) for kind in kinds}
+        found = {kind.number: definitions(kind, own) for kind in kinds}
+        self._readers = {
+            number: {version: reader(each) for version, each in versions.items()} for number, versions in found.items()
+        }
+        self.fields = None if self._only is None else message_members(dict.fromkeys(found[self._only.number].values()))
+        """The fields of the messages, where they are of one kind."""
 
     def decode(self, payload: bytes) -> Any:
         """The message as a map: header, and what its ASN.1 type has beside it. Raises DecodeError."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 from detector.streams.codecs.etsi import times
-from detector.streams.codecs.etsi.asn1 import DefinitionError
+from detector.streams.codecs.etsi.asn1 import DefinitionError, Type
 from detector.streams.codecs.etsi.own import OwnDefinitions
 from detector.streams.codecs.etsi.packaged import packaged_type
 from detector.streams.codecs.etsi.reading import Read, Readers
@@ -83,24 +83,22 @@ BY_NUMBER = {kind.number: kind for kind in KINDS}
 
 
 @cache
-def packaged_readers(kind: Kind) -> Mapping[int, Read]:
-    """What reads the kind's messages by the definitions that come with the extra, by protocol version.
+def packaged_definitions(kind: Kind) -> Mapping[int, Type]:
+    """The kind's type by protocol version, as the extra brings it.
 
     Raises DefinitionError where the extra is not installed.
     """
-    made: dict[tuple[str, str], Read] = {}
-    readers: dict[int, Read] = {}
-    for version, (package, module) in kind.packaged.items():
+    made: dict[tuple[str, str], Type] = {}
+    for package, module in kind.packaged.values():
         if (package, module) not in made:
-            made[package, module] = Readers().reader(packaged_type(package, module, kind.types[0]))
-        readers[version] = made[package, module]
-    return readers
+            made[package, module] = packaged_type(package, module, kind.types[0])
+    return {version: made[place] for version, place in kind.packaged.items()}
 
 
-def readers(kind: Kind, own: OwnDefinitions | None) -> Mapping[int, Read]:
-    """What reads the kind's messages, by protocol version: by the user's definitions where they have the type.
+def definitions(kind: Kind, own: OwnDefinitions | None) -> Mapping[int, Type]:
+    """The kind's type by protocol version: the user's where their definitions have it.
 
-    Those of the first version, which was read otherwise, stay with the definitions that come with the extra. Raises
+    Messages of the first version, which are read otherwise, stay with the definitions that come with the extra. Raises
     DefinitionError where there are none at all.
     """
     found = None if own is None else own.type(kind.types)
@@ -109,9 +107,14 @@ def readers(kind: Kind, own: OwnDefinitions | None) -> Mapping[int, Read]:
             raise DefinitionError(
                 f"no package has the ASN.1 definition of {PREFIX}{kind.name}: name the files with it in spec.asn1"
             )
-        return packaged_readers(kind)
-    read = Readers().reader(found)
-    return {**dict.fromkeys(range(1, 256), read), **({1: packaged_readers(kind)[1]} if 1 in kind.packaged else {})}
+        return packaged_definitions(kind)
+    return {**dict.fromkeys(range(1, 256), found), **({1: packaged_definitions(kind)[1]} if 1 in kind.packaged else {})}
 
 
-__all__ = ["BY_NAME", "BY_NUMBER", "KINDS", "PREFIX", "DefinitionError", "Kind", "Stamp", "packaged_readers", "readers"]
+@lru_cache(maxsize=64)
+def reader(definition: Type) -> Read:
+    """What reads messages of the type."""
+    return Readers().reader(definition)
+
+
+__all__ = ["BY_NAME", "BY_NUMBER", "KINDS", "PREFIX", "DefinitionError", "Kind", "Stamp", "definitions", "reader"]
