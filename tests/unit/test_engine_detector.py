@@ -99,3 +99,33 @@ def test_a_detector_that_cannot_run_changes_nothing() -> None:
     assert drive.engine.detector is before
     assert drive.take(until=5) == []
     assert drive.take(arrival(5.8, "car", {"v": 1}), until=6) == ["r car Until 6"]
+
+
+STAMPED = {"key": "vehicles/${client:*}/speed", "name": "speed", "encoding": "json", "stamp": "msg.t"}
+
+
+def stamped(client: str, seconds: float, size: int = 0) -> Any:
+    return arrival(1, client, {"t": at(seconds) / 1e9, "fill": "x" * size})
+
+
+def of_data(**spec: Any) -> Drive:
+    """Two clients, and a drive that has begun."""
+    drive = Drive(a_detector(STAMPED, clock="Data", **spec))
+    drive.take(stamped("a", 1), stamped("b", 1), stamped("a", 2), stamped("b", 2), until=1)
+    return drive
+
+
+def test_a_changed_client_timeout_decides_when_one_client_alone_is_believed_that_time_jumped() -> None:
+    alone = [stamped("a", seconds) for seconds in (3600, 3601, 3602, 3603)]
+    for timeout, jumps in (("30s", 0), ("2s", 1)):
+        drive = of_data()
+        change(drive, STAMPED, rules=(), clock="Data", clientTimeout=timeout)
+        drive.take(*alone, until=1)
+        assert drive.engine.timeline.jumps == jumps  # type: ignore[union-attr]
+
+
+def test_a_changed_cap_of_the_buffer_holds_for_what_waits_for_its_time() -> None:
+    drive = of_data(lateness="10s", buffer={"bytes": "1Mi"})
+    change(drive, STAMPED, rules=(), clock="Data", lateness="10s", buffer={"bytes": "2Ki"})
+    drive.take(*(stamped("b", 2 + number / 10, size=500) for number in range(8)), until=1)
+    assert drive.engine.timeline.dropped_full > 0  # type: ignore[union-attr]
