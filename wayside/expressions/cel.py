@@ -22,6 +22,7 @@ from cel_expr_python import cel
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
+from wayside.expressions.functions.calls import settle
 from wayside.expressions.handles import begin, end, value_of
 from wayside.expressions.numbers import MAX_EXACT, doubled
 from wayside.expressions.projection import Leaf, missing_path, normalise, project, tree
@@ -198,6 +199,8 @@ class Expression:
             return self._run_holding(values, known=known)
         finally:
             end(before)
+            if before is None:
+                settle()
 
     def _run_holding(self, values: Mapping[str, object], *, known: bool) -> Value:
         try:

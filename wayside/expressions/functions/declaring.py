@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 from cel_expr_python import cel
 
+from wayside.expressions.functions.calls import Arguments, called_by_cel
 from wayside.expressions.handles import value_of
 
 
@@ -109,7 +110,7 @@ class Function:
 def _called(function: Function, signature: Signature) -> Callable[..., object]:
     """The implementation, given the values behind handles; NaN, which is unknown, does not get in."""
 
-    def call(*arguments: object) -> object:
+    def call(arguments: Arguments) -> object:
         values = [value_of(argument) for argument in arguments]
         for parameter, value in zip(signature.parameters, values, strict=True):
             if isinstance(value, float) and math.isnan(value):
@@ -119,7 +120,7 @@ def _called(function: Function, signature: Signature) -> Callable[..., object]:
                 raise ValueError(f"{function.name}: {parameter.name} must be {article}{parameter.takes.value}")
         return signature.implementation(*values)
 
-    return call
+    return called_by_cel(call)
 
 
 def _fits(takes: Takes, value: object) -> bool:
