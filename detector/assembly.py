@@ -14,9 +14,12 @@ from detector.models.binding import bind_models
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import plugin_problems
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
+from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.fields import message_fields
+from detector.streams.codecs.ros import RosTypes, standard, types_with
 from wayside.api import Detector, EventRule
+from wayside.api.detector import MessageDefinition
 from wayside.keys import KeyPattern
 from wayside.rules import (
     CompiledRule,
@@ -45,6 +48,7 @@ class Inlets:
     decoders: Mapping[str, Decoder]
     read_key: KeyReader
     fields: Mapping[str, Fields]
+    types: RosTypes
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,24 +69,27 @@ def inlets(detector: Detector) -> Inlets:
     """Decoders and key readers for the Detector's streams.
 
     Raises:
-        DetectorError: a key that is not in key-format notation, an unknown message type, or a bad expression.
+        DetectorError: a key that is not in key-format notation, a message type that is unknown or badly defined, or a
+            bad expression.
     """
+    types, problems = message_types(detector.spec.messages)
+    defined = {message.name for message in detector.spec.messages}
     decoders: dict[str, Decoder] = {}
     fields: dict[str, Fields] = {}
-    problems: list[RuleProblem] = []
     asn1 = _asn1(detector, problems)
     for index, stream in enumerate(detector.spec.streams):
         known: Fields | None = None
         try:
-            decoder = decoders[stream.name] = codec_for(stream, asn1)
+            decoder = decoders[stream.name] = codec_for(stream, types=types, asn1=asn1)
         except UnknownTypeError as error:
-            problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
+            if stream.type not in defined:  # else it is known what is wrong with its definition
+                problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
         except DefinitionError as error:
             if asn1 is not None or not detector.spec.asn1:  # else what is wrong with the modules is told already
                 field = "encoding" if stream.type is None else "type"
                 problems.append(RuleProblem(("spec", "streams", index, field), str(error)))
         else:
-            known = decoder.fields if isinstance(decoder, EtsiDecoder) else message_fields(stream)
+            known = decoder.fields if isinstance(decoder, EtsiDecoder) else message_fields(stream, types)
         if known is not None:
             fields[stream.name] = known
         problems += stream_problems(stream, index, known)
@@ -105,7 +112,18 @@ def inlets(detector: Detector) -> Inlets:
         client = clients[stream] or captures["client"]
         return (client, captures) if CLIENT_NAME.fullmatch(client) else None
 
-    return Inlets(decoders, read_key, fields)
+    return Inlets(decoders, read_key, fields, types)
+
+
+def message_types(messages: Sequence[MessageDefinition]) -> tuple[RosTypes, list[RuleProblem]]:
+    """The message types that a Detector knows; without its own where there are problems with them."""
+    try:
+        return types_with(tuple(Definition(message.name, message.definition) for message in messages)), []
+    except DefinitionsError as error:
+        places = {message.name: index for index, message in enumerate(messages)}
+        return standard(), [
+            RuleProblem(("spec", "messages", places[name], "definition"), text) for name, text in error.problems
+        ]
 
 
 def _asn1(detector: Detector, problems: list[RuleProblem]) -> OwnDefinitions | None:

@@ -25,6 +25,7 @@ from detector.replay.errors import RecordingError
 from detector.replay.intake_file import is_intake_file, read_intake, recorded_outages
 from detector.replay.latched import recorded_arrivals
 from detector.replay.progress import Progress
+from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
 from detector.replay.routing import Router
 from detector.rules.files import load_rules
@@ -188,10 +189,10 @@ def _replayed(
     loaded = load_rules(detector, rules or ())
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
-    rule_set = loaded.rule_set
-    router = Router(rule_set.detector.spec.streams)
-    arrivals = recorded_arrivals(recordings, router, rule_set.detector)
-    outcome = replay_arrivals(progress.watch(arrivals), rule_set.detector, rule_set.rules, plugins)
+    completed = with_recorded_types(loaded.rule_set.detector, recordings)
+    router = Router(completed.spec.streams)
+    arrivals = recorded_arrivals(recordings, router, completed)
+    outcome = replay_arrivals(progress.watch(arrivals), completed, loaded.rule_set.rules, plugins)
     if not outcome.samples:
         keys = ", ".join(router.unrouted) or "none"
         typer.echo(f"no message belongs to a stream of the Detector; keys in the recording: {keys}", err=True)

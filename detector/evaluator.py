@@ -25,6 +25,7 @@ from detector.plugins.outages import Outages
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
+from detector.streams.codecs.ros import RosTypes
 from wayside.api.detector import Stream
 
 _log = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ class Recorder(Protocol):
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
         """Samples that the engine takes in now."""
 
-    def follow(self, streams: Iterable[Stream]) -> None:
+    def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
         """What comes from now on belongs to these streams."""
 
     def control(self, time: int, document: Mapping[str, Any]) -> None:
@@ -222,7 +223,7 @@ class Evaluator:
             entries = inlets(wanted.detector)
             self._engine.set_detector(wanted.detector, entries.decoders, entries.read_key)
             if self._recorder is not None:
-                self._recorder.follow(wanted.detector.spec.streams)
+                self._recorder.follow(wanted.detector.spec.streams, entries.types)
         self._record(
             self._engine.now,
             {

@@ -62,7 +62,7 @@ class Running:
         self._intake = Intake(time.time_ns)
         self._plugins = ProcessHost()
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
-        self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams)
+        self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams, entries.types)
         self._log = None if output is None else EventLog(output / "events.jsonl")
         self._outlet = LiveOutlet(self._network(detector), self._log, reconciler, state)
         self._state = state
@@ -213,4 +213,8 @@ def _checked(detector: Detector) -> Inlets:
 
 def _subscribed(streams: Iterable[Stream]) -> list[tuple[object, ...]]:
     """What the network has to know of the streams."""
-    return [(stream.name, stream.key, stream.history, stream.recover) for stream in streams if stream.source == ZENOH]
+    return [
+        (stream.name, stream.key, stream.layout, stream.domain, stream.type, stream.history, stream.recover)
+        for stream in streams
+        if stream.source == ZENOH
+    ]

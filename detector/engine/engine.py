@@ -30,7 +30,7 @@ from detector.engine.starts import Starts
 from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Ticks, Timeline, WallTimeline
 from detector.engine.transforms import Transforms, TransformStream
 from wayside.api import Detector
-from wayside.api.detector import Clock, Stream
+from wayside.api.detector import Clock, Encoding, Stream
 from wayside.rules import CompiledRule, compile_stream, in_order
 
 __all__ = ["Engine", "KeyReader"]
@@ -87,7 +87,12 @@ class Engine:
         """
         before = self.detector.spec
         self._configure(detector, decoders, read_key, self._timeline.now)
-        kept = {stream.name for stream in detector.spec.streams if _reads_like(stream, before.stream(stream.name))}
+        defined_alike = (detector.spec.messages, detector.spec.asn1) == (before.messages, before.asn1)
+        kept = {
+            stream.name
+            for stream in detector.spec.streams
+            if _reads_like(stream, before.stream(stream.name)) and (defined_alike or stream.encoding not in _DEFINED)
+        }
         self.buffer.keep(kept)
         if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
             for client in self.clients.tokens.forget():
@@ -337,6 +342,10 @@ def _transform_streams(detector: Detector) -> list[TransformStream]:
 def _latched(detector: Detector) -> frozenset[str]:
     """The streams whose samples hold until they are said anew."""
     return frozenset(stream.name for stream in detector.spec.streams if stream.latched)
+
+
+_DEFINED = (Encoding.CDR, Encoding.UPER)
+"""Encodings that are read by definitions."""
 
 
 def _reads_like(stream: Stream, before: Stream | None) -> bool:

@@ -18,7 +18,7 @@ from mcap.writer import Writer
 
 from detector.engine.sample import Arrival
 from detector.replay.intake_file import CONTROL_TOPIC, LIBRARY, STREAM, Control
-from detector.streams.codecs.ros import definition, known
+from detector.streams.codecs.ros import RosTypes, standard
 from wayside.api.detector import Stream
 
 log = logging.getLogger(__name__)
@@ -35,6 +35,7 @@ class _Streams(NamedTuple):
     """From here on, these are the Detector's streams."""
 
     streams: tuple[Stream, ...]
+    types: RosTypes
 
 
 class _Arrivals(NamedTuple):
@@ -47,11 +48,18 @@ class _Arrivals(NamedTuple):
 class IntakeWriter:
     """Takes what the engine consumes, from one thread at a time, and writes it on another."""
 
-    def __init__(self, path: Path, streams: Iterable[Stream] = (), *, maximum_bytes: int = 256 * 2**20) -> None:
-        """`streams` tell how messages read, for other tools to open the file. Raises OSError."""
+    def __init__(
+        self,
+        path: Path,
+        streams: Iterable[Stream] = (),
+        types: RosTypes | None = None,
+        *,
+        maximum_bytes: int = 256 * 2**20,
+    ) -> None:
+        """`streams` and `types` tell how messages read, for other tools to open the file. Raises OSError."""
         self._path = path
         self._mcap = _Mcap(path)
-        self._queue: list[_Arrivals | Control | _Streams] = [_Streams(tuple(streams))]
+        self._queue: list[_Arrivals | Control | _Streams] = [_Streams(tuple(streams), types or standard())]
         self._bytes = 0
         self._maximum_bytes = maximum_bytes
         self._changed = threading.Condition()
@@ -65,9 +73,9 @@ class IntakeWriter:
         self._thread = threading.Thread(target=self._run, name="intake-writer", daemon=True)
         self._thread.start()
 
-    def follow(self, streams: Iterable[Stream]) -> None:
+    def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
         """The Detector changed: what comes from now on belongs to these streams."""
-        self._append(_Streams(tuple(streams)))
+        self._append(_Streams(tuple(streams), types))
 
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
         """Samples that the engine takes in now. Never waits; with the queue full they are left out and counted."""
@@ -142,7 +150,7 @@ class IntakeWriter:
         if isinstance(item, Control):
             mcap.control(item)
         elif isinstance(item, _Streams):
-            mcap.follow(item.streams)
+            mcap.follow(item.streams, item.types)
         else:
             left_out = [arrival for arrival in item.arrivals if not mcap.arrival(arrival)]
             with self._changed:
@@ -159,8 +167,8 @@ class _Mcap:
         self._writer.start("ros2", LIBRARY)  # the profile that tools for ROS bags ask for
         self._control = self._writer.register_channel(CONTROL_TOPIC, "json", 0)
         self._channels: dict[tuple[str, str], int] = {}
-        self._schemas: dict[str, int] = {}
-        self._streams: dict[str, Stream] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._readings: dict[str, _Reading] = {}
         self._newest = self._control
 
     def __enter__(self) -> _Mcap:
@@ -175,10 +183,10 @@ class _Mcap:
         """From here on, everything so far can be read, whatever happens to the process."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
-    def follow(self, streams: Iterable[Stream]) -> None:
+    def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
         """Messages from now on are of these streams: where a stream reads otherwise than before, in new channels."""
-        old, self._streams = self._streams, {stream.name: stream for stream in streams}
-        same = {name for name, stream in self._streams.items() if _reading(old.get(name)) == _reading(stream)}
+        old, self._readings = self._readings, {stream.name: _reading(stream, types) for stream in streams}
+        same = {name for name, reading in self._readings.items() if old.get(name) == reading}
         self._channels = {place: channel for place, channel in self._channels.items() if place[0] in same}
 
     def control(self, control: Control) -> None:
@@ -200,16 +208,26 @@ class _Mcap:
         self._writer.add_message(channel, log_time=time, data=data, publish_time=time)
 
     def _open_channel(self, stream: str, key: str) -> int:
-        encoding, type_name = _reading(self._streams.get(stream))
+        reading = self._readings.get(stream, _Reading("", None, None))
         schema = 0
-        if type_name is not None and known(type_name):
-            schema = self._schemas.get(type_name) or self._writer.register_schema(
-                type_name, "ros2msg", definition(type_name).encode()
+        if reading.type is not None and reading.definition is not None:
+            place = reading.type, reading.definition
+            schema = self._schemas.get(place) or self._writer.register_schema(
+                reading.type, "ros2msg", reading.definition.encode()
             )
-            self._schemas[type_name] = schema
-        return self._writer.register_channel(key, encoding, schema, {STREAM: stream})
+            self._schemas[place] = schema
+        return self._writer.register_channel(key, reading.encoding, schema, {STREAM: stream})
 
 
-def _reading(stream: Stream | None) -> tuple[str, str | None]:
-    """The encoding and the type of the stream's messages."""
-    return ("", None) if stream is None else (stream.encoding.value, stream.type)
+class _Reading(NamedTuple):
+    """How the messages of a stream read."""
+
+    encoding: str
+    type: str | None
+    definition: str | None
+    """Of a ROS message type, with all that it refers to."""
+
+
+def _reading(stream: Stream, types: RosTypes) -> _Reading:
+    known = stream.type is not None and types.known(stream.type)
+    return _Reading(stream.encoding.value, stream.type, types.definition(stream.type or "") if known else None)

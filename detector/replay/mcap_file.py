@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
+from mcap.summary import Summary
 
 from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Message, Wanted, key_of
+from detector.replay.message import Message, RecordedType, Wanted, key_of
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -21,10 +23,7 @@ def read_mcap(path: Path, wanted: Wanted) -> Iterator[Message]:
     """The file's messages, in the order of their log times. Raises RecordingError if it is cut or damaged."""
     with path.open("rb") as file:
         try:
-            reader = SeekingReader(file, validate_crcs=True, record_size_limit=1 << 30)
-            summary = reader.get_summary()
-            if summary is None:
-                raise McapError("it has no summary")
+            reader, summary = _opened(file)
             topics = {channel.topic for channel in summary.channels.values() if wanted(key_of(channel.topic))}
             if not topics:
                 return
@@ -37,10 +36,34 @@ def read_mcap(path: Path, wanted: Wanted) -> Iterator[Message]:
                     _type(schema.name) if schema is not None and channel.message_encoding == "cdr" else None,
                 )
         except _DAMAGE as error:
-            reason = str(error) or type(error).__name__
-            raise RecordingError(
-                f"{path}: the MCAP file is cut or damaged ({reason}): repair it with `mcap recover {path}`"
-            ) from error
+            raise _damaged(path, error) from error
+
+
+def mcap_types(path: Path) -> list[RecordedType]:
+    """The ROS 2 message types that the file defines. Raises RecordingError if it is cut or damaged."""
+    with path.open("rb") as file:
+        try:
+            _, summary = _opened(file)
+            return [
+                RecordedType(_type(schema.name), schema.data.decode(errors="replace"), schema.encoding == "ros2idl")
+                for schema in summary.schemas.values()
+                if schema.encoding in ("ros2msg", "ros2idl")
+            ]
+        except _DAMAGE as error:
+            raise _damaged(path, error) from error
+
+
+def _opened(file: BinaryIO) -> tuple[SeekingReader, Summary]:
+    reader = SeekingReader(file, validate_crcs=True, record_size_limit=1 << 30)
+    summary = reader.get_summary()
+    if summary is None:
+        raise McapError("it has no summary")
+    return reader, summary
+
+
+def _damaged(path: Path, error: Exception) -> RecordingError:
+    reason = str(error) or type(error).__name__
+    return RecordingError(f"{path}: the MCAP file is cut or damaged ({reason}): repair it with `mcap recover {path}`")
 
 
 def _type(schema: str) -> str:

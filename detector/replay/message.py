@@ -24,6 +24,16 @@ class Message(NamedTuple):
     """The message type, e.g. geometry_msgs/msg/PoseStamped, where the recording tells it."""
 
 
+class RecordedType(NamedTuple):
+    """What a recording says of a message type."""
+
+    name: str
+    text: str
+    """Its definition with all that it refers to; empty where the recording has none."""
+    idl: bool
+    """Whether the text is IDL; else it is as in a .msg file."""
+
+
 def key_of(topic: str) -> str:
     """The key of a ROS topic."""
     return topic.removeprefix("/")

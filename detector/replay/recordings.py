@@ -10,12 +10,12 @@ from pathlib import Path
 from detector.replay.errors import RecordingError
 from detector.replay.json_lines import read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
-from detector.replay.mcap_file import read_mcap
-from detector.replay.message import Message, Wanted
+from detector.replay.mcap_file import mcap_types, read_mcap
+from detector.replay.message import Message, RecordedType, Wanted
 from detector.replay.pcap import MAGICS as PCAP_MAGICS
 from detector.replay.pcap import read_pcap
-from detector.replay.rosbag1 import ROSBAG1_MAGIC, read_rosbag1
-from detector.replay.rosbag2 import SQLITE_MAGIC, read_rosbag2
+from detector.replay.rosbag1 import ROSBAG1_MAGIC, read_rosbag1, rosbag1_types
+from detector.replay.rosbag2 import SQLITE_MAGIC, read_rosbag2, rosbag2_types
 
 _Read = Callable[[Path, Wanted], Iterator[Message]]
 
@@ -30,6 +30,17 @@ def open_recordings(paths: Sequence[Path], wanted: Wanted = lambda key: True) ->
     """
     readers = [(_reader(path), path) for path in paths]
     return heapq.merge(*(read(path, wanted) for read, path in readers), key=attrgetter("time"))
+
+
+def types_of(path: Path) -> list[RecordedType]:
+    """The ROS 2 message types that a recording defines. Raises RecordingError."""
+    kinds: dict[_Read, Callable[[Path], list[RecordedType]]] = {
+        read_mcap: mcap_types,
+        read_rosbag1: rosbag1_types,
+        read_rosbag2: rosbag2_types,
+    }
+    types = kinds.get(_reader(path))
+    return [] if types is None else types(path)
 
 
 def _reader(path: Path) -> _Read:

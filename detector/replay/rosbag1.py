@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Message, Wanted, key_of
+from detector.replay.message import Message, RecordedType, Wanted, key_of
 
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 
@@ -47,11 +47,26 @@ def read_rosbag1(path: Path, wanted: Wanted) -> Iterator[Message]:
                     ) from error
                 yield Message(time, key_of(connection.topic), cdr, "cdr", connection.msgtype)
     except (*DAMAGE, ReaderError, TypesysError) as error:
-        reason = str(error) or type(error).__name__
-        raise RecordingError(
-            f"{path}: the ROS 1 bag cannot be read, it is damaged or was not closed ({reason}): "
-            f"repair it with `rosbag reindex {path}`"
-        ) from error
+        raise _damaged(path, error) from error
+
+
+def rosbag1_types(path: Path) -> list[RecordedType]:
+    """The message types that the bag defines, as ROS 2 would. Raises RecordingError if it is damaged."""
+    try:
+        with Reader(path) as reader:
+            types = _types(reader.connections)
+            names = sorted({connection.msgtype for connection in reader.connections})
+            return [RecordedType(name, types.generate_msgdef(name, ros_version=2)[0], idl=False) for name in names]
+    except (*DAMAGE, ReaderError, TypesysError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> RecordingError:
+    reason = str(error) or type(error).__name__
+    return RecordingError(
+        f"{path}: the ROS 1 bag cannot be read, it is damaged or was not closed ({reason}): "
+        f"repair it with `rosbag reindex {path}`"
+    )
 
 
 def _types(connections: Sequence[Connection]) -> Typestore:

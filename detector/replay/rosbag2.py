@@ -7,13 +7,15 @@ from pathlib import Path
 
 import apsw
 from backports.zstd import ZstdError
-from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
 from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Message, Wanted, key_of
+from detector.replay.message import Message, RecordedType, Wanted, key_of
 
 SQLITE_MAGIC = b"SQLite format 3\0"
+
+_DAMAGE = (*DAMAGE, ReaderError, apsw.Error, ZstdError)
 
 
 def read_rosbag2(path: Path, wanted: Wanted) -> Iterator[Message]:
@@ -27,8 +29,26 @@ def read_rosbag2(path: Path, wanted: Wanted) -> Iterator[Message]:
                 extra = connection.ext
                 encoding = extra.serialization_format if isinstance(extra, ConnectionExtRosbag2) else "cdr"
                 yield Message(time, key_of(connection.topic), bytes(payload), encoding, connection.msgtype)
-    except (*DAMAGE, ReaderError, apsw.Error, ZstdError) as error:
-        reason = str(error) or type(error).__name__
-        raise RecordingError(
-            f"{path}: the rosbag2 cannot be read, it is damaged or of a kind that is not known: {reason}"
-        ) from error
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+
+
+def rosbag2_types(path: Path) -> list[RecordedType]:
+    """The message types that the bag defines; older bags define none. Raises RecordingError if it is damaged."""
+    try:
+        with Reader(path) as reader:
+            return [
+                RecordedType(
+                    connection.msgtype,
+                    connection.msgdef.data,
+                    connection.msgdef.format is MessageDefinitionFormat.IDL,
+                )
+                for connection in reader.connections
+            ]
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> RecordingError:
+    reason = str(error) or type(error).__name__
+    return RecordingError(f"{path}: the rosbag2 cannot be read, it is damaged or of a kind that is not known: {reason}")

@@ -60,7 +60,7 @@ class Router:
         recorded = (stream.name, message.encoding, message.type)
         if recorded in self._fits:
             return
-        if message.encoding != stream.encoding.value:
+        if stream.encoding is not Encoding.RAW and message.encoding != stream.encoding.value:
             raise RecordingError(
                 f"{message.key} is recorded as {message.encoding}, but streams[{stream.name}].encoding is "
                 f"{stream.encoding.value}: correct it, or the stream's key"

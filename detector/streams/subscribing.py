@@ -11,9 +11,9 @@ from typing import Protocol
 import zenoh
 from zenoh import ext
 
+from detector.streams.layouts import expression
 from detector.streams.tally import Cause, Tally
-from wayside.api.detector import Stream
-from wayside.keys import KeyPattern
+from wayside.api.detector import Layout, Stream
 
 
 class Subscription(Protocol):
@@ -40,14 +40,13 @@ class _Watched:
 
 def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tally) -> Subscription:
     """Subscribes to the stream's key; at most `capacity` samples wait. Raises KeyPatternError, zenoh.ZError."""
-    expression = zenoh.KeyExpr.autocanonize(KeyPattern.parse(stream.key).expression)
     channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(capacity)
     if stream.history is None and not stream.recover:
-        return session.declare_subscriber(expression, channel)
+        return session.declare_subscriber(expression(stream), channel)
     history = stream.history
     subscriber = ext.declare_advanced_subscriber(
         session,
-        expression,
+        expression(stream),
         channel,
         history=None
         if history is None
@@ -58,4 +57,9 @@ def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tall
         ),
         recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True) if stream.recover else None,
     )
-    return _Watched(subscriber, lambda count: tally.add(Cause.MISSED, stream.name, count))
+
+    def missed(count: int) -> None:
+        if stream.layout is Layout.PLAIN:  # rmw_zenoh numbers its samples itself: these would be counted twice
+            tally.add(Cause.MISSED, stream.name, count)
+
+    return _Watched(subscriber, missed)

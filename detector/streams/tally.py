@@ -11,6 +11,9 @@ class Cause(StrEnum):
     """Why something did not reach the intake. The texts are those of the log."""
 
     MISSED = "samples of stream {} lost before the detector, as their publishers number them"
+    OVERTAKEN = "samples of stream {} came after later ones, and were counted as lost"
+    MISFIT = "samples of stream {} dropped, their keys not being the stream's"
+    UNNUMBERED = "samples of stream {} taken in without a number, so that losses do not show"
     UNROUTED = "messages of source {} dropped, their keys belonging to none of its streams"
     FAILED = "times source {} failed and was to be started again"
     LEFT_BEHIND = "times source {} did not stop and was left behind"

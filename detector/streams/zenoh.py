@@ -11,15 +11,14 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from itertools import compress, islice
-from operator import itemgetter
-from typing import NoReturn
+from collections.abc import Callable, Iterable
 
 import zenoh
 
 from detector.engine.liveliness import LIVELINESS
 from detector.streams.answering import Answering
+from detector.streams.bursts import Put
+from detector.streams.layouts import Pump, pump_for
 from detector.streams.liveliness import TokenWatch
 from detector.streams.session import Connections, NetworkError, await_session, open_session
 from detector.streams.subscribing import Subscription, subscribe
@@ -31,17 +30,10 @@ log = logging.getLogger(__name__)
 
 __all__ = ["EVENT_ENCODING", "Network", "NetworkError", "Put", "open_session"]
 
-Put = Callable[[Sequence[tuple[str, bytes]]], None]
-"""Takes messages that came together: the key and the payload of each. Thread-safe, and never waits."""
-
 EVENT_ENCODING = "application/cloudevents+json"
 _CHANNEL = 16_384
 """So many samples of a stream wait for its thread while the evaluation holds the interpreter's lock. Once they are full
 Zenoh's own queues fill, and then it is the sender's congestion control that says whether it waits or drops."""
-_BURST = 256
-"""At most so many messages get one receive time: taking that many takes a fraction of a millisecond."""
-
-_PAYLOAD = itemgetter(1)
 
 
 class Network:
@@ -65,8 +57,8 @@ class Network:
         """
         self._on_failure = on_failure
         self._config = config
-        self._streams = [(stream, putter(stream.name)) for stream in streams]
         self._tally = Tally() if tally is None else tally
+        self._streams = [(stream, pump_for(stream, putter(stream.name), self._tally)) for stream in streams]
         self._liveliness = config.liveliness
         self._put_token = putter(LIVELINESS)
         self._tokens: TokenWatch | None = None
@@ -134,10 +126,10 @@ class Network:
 
     def _join(self, session: zenoh.Session) -> None:
         self._connections = Connections(session)
-        for stream, put in self._streams:
+        for stream, pump in self._streams:
             subscription = subscribe(session, stream, _CHANNEL, self._tally)
             name = f"stream {stream.name}"
-            thread = threading.Thread(target=self._receive, args=(subscription, put), name=name, daemon=True)
+            thread = threading.Thread(target=self._receive, args=(subscription, pump), name=name, daemon=True)
             thread.start()
             self._receivers.append(thread)
         if self._liveliness is not None:
@@ -146,10 +138,10 @@ class Network:
         if self._make_answering is not None:
             self._answering = self._make_answering(session)
 
-    def _receive(self, subscription: Subscription, put: Put) -> None:
+    def _receive(self, subscription: Subscription, pump: Pump) -> None:
         """Hands over what comes on a stream, until the session is closed."""
         try:
-            _pump(subscription.handler, put)
+            pump(subscription.handler)
         except Exception as error:  # noqa: BLE001  this thread's edge: without it, the stream would be silent for ever
             if not self._stop.is_set():
                 log.critical("a stream's thread ended, nothing is received on it any more: %s", error)
@@ -193,15 +185,3 @@ class Network:
         except zenoh.ZError as error:
             self.dropped_events += 1
             log.warning("event on %s was not published: %s", key, error)
-
-
-def _pump(samples: zenoh.handlers.Handler[zenoh.Sample], put: Put) -> NoReturn:
-    """Hands over every message, burst by burst; raises ZError once the session is closed and none is left."""
-    receive, try_receive, put_kind = samples.recv, samples.try_recv, zenoh.SampleKind.PUT
-    while True:
-        burst = [receive()]
-        burst.extend(islice(iter(try_receive, None), _BURST - 1))
-        messages = [(str(sample.key_expr), sample.payload.to_bytes()) for sample in burst]
-        if not all(map(_PAYLOAD, messages)):  # a deletion is no message; asking each for its kind would cost more
-            messages = list(compress(messages, [sample.kind == put_kind for sample in burst]))
-        put(messages)

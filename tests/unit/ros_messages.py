@@ -4,17 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from detector.streams.codecs.ros import typestore
+from detector.streams.codecs.ros import standard
 
 
 def make(type_name: str, **fields: Any) -> Any:
     """A message object; the short type name `geometry_msgs/Point` means `geometry_msgs/msg/Point`."""
-    return typestore().types[type_name.replace("/", "/msg/")](**fields)
+    return standard().store.types[type_name.replace("/", "/msg/")](**fields)
 
 
 def cdr(message: Any, *, little_endian: bool = True) -> bytes:
     """The message as ROS 2 puts it on the wire."""
-    return bytes(typestore().serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
+    return bytes(standard().store.serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
 
 
 def header(seconds: int = 5, nanoseconds: int = 7, frame_id: str = "map") -> Any:

@@ -3,36 +3,25 @@
 from contextlib import suppress
 from typing import Any
 
+import cbor2
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from detector.engine.sample import DecodeError
+from detector.engine.sample import Arrival, DecodeError
 from detector.streams.codecs import CdrDecoder, JsonDecoder, UnknownTypeError, codec_for
 from detector.streams.codecs.doubles import EXACT
 from detector.streams.codecs.json_ import MAX_DEPTH
+from tests.unit import hostile
+from tests.unit.driving import Drive, a_detector, a_rule, at
+from tests.unit.hostile import assert_plain
 from tests.unit.ros_messages import cdr, make, odometry, point_cloud, pose_stamped
 from wayside.api.detector import Encoding, Stream
 
 MESSAGES = [pose_stamped(), odometry(), point_cloud()]
 SECOND = 1_000_000_000
-
-
-def assert_plain(value: Any) -> None:
-    """Nothing but what the engine's contract allows."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            assert type(key) is str
-            assert_plain(item)
-    elif isinstance(value, list):
-        for item in value:
-            assert_plain(item)
-    elif type(value) is int:
-        assert abs(value) > EXACT
-    else:
-        assert type(value) in (float, str, bool, bytes, type(None))
 
 
 def decoder(message: Any) -> CdrDecoder:
@@ -142,7 +131,7 @@ def read_or_refuse(codec: CdrDecoder | JsonDecoder, payload: bytes) -> None:
         assert stamp is None or stamp >= 0
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(st.sampled_from(MESSAGES), st.data())
 def test_truncated_cdr_is_refused(message: Any, data: st.DataObject) -> None:
     raw = cdr(message)
@@ -152,13 +141,13 @@ def test_truncated_cdr_is_refused(message: Any, data: st.DataObject) -> None:
     read_or_refuse(decoder(message), cut)
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(st.sampled_from(MESSAGES), st.sampled_from([b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"]), st.binary())
 def test_random_cdr_gives_a_message_or_a_decode_error(message: Any, start: bytes, noise: bytes) -> None:
     read_or_refuse(decoder(message), start + noise)
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(st.sampled_from(MESSAGES), st.booleans(), st.lists(st.tuples(st.integers(0), st.integers(0, 255)), max_size=6))
 def test_mutated_cdr_gives_a_message_or_a_decode_error(
     message: Any, little_endian: bool, changes: list[tuple[int, int]]
@@ -186,7 +175,7 @@ def test_json_reads_back_with_doubles(value: Any) -> None:
     assert_plain(decoded)
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     st.binary() | json_values.map(msgspec.json.encode),
     st.lists(st.tuples(st.integers(0), st.integers(0, 255)), max_size=4),
@@ -228,3 +217,37 @@ def test_an_unknown_type_names_the_stream_the_type_and_what_is_close() -> None:
         UnknownTypeError, match=r"streams\[pose\]\.type.*PoseStampd.*did you mean geometry_msgs/msg/Pose"
     ):
         codec_for(stream)
+
+
+def test_ten_thousand_hostile_payloads_of_cdr_give_a_message_or_a_decode_error() -> None:
+    for number, message in enumerate(MESSAGES):
+        valid = [cdr(message), cdr(message, little_endian=False)]
+        refused = hostile.survive(decoder(message), hostile.payloads(valid, 3500, seed=number))
+        assert 1000 < refused < 3450
+
+
+def test_ten_thousand_hostile_payloads_of_json_give_a_value_or_a_decode_error() -> None:
+    valid = [b'{"header": {"stamp": 1.5, "frame": "map"}, "objects": [{"x": 1.0, "id": 7}, null, true]}', b"[[[1e9]]]"]
+    refused = hostile.survive(JsonDecoder(), hostile.payloads(valid, 10_000, seed=1))
+    assert 3000 < refused < 9900
+
+
+POSES = {"encoding": "cdr", "type": "geometry_msgs/msg/PoseStamped"}
+VALID = {
+    "cdr": cdr(MESSAGES[0]),
+    "json": b'{"x": [1, 2, {"y": "text"}], "z": null}',
+    "cbor": cbor2.dumps({"x": [1, 2, {"y": "text"}], "z": None}),
+}
+
+
+@pytest.mark.parametrize("encoding", VALID)
+def test_a_detector_counts_what_it_cannot_read_and_goes_on(encoding: str) -> None:
+    stream = {"name": "s", "key": "${client:*}", "encoding": encoding, **(POSES if encoding == "cdr" else {})}
+    looked = {"name": "n", "stream": "s", "where": "has(msg.x)", "over": "10s", "aggregate": "Count"}
+    drive = Drive(a_detector(stream), a_rule("r", signals=[looked], when="n >= 0"))
+    hostile_ones = [*hostile.payloads([VALID[encoding]], 500, seed=1)]
+    refused = hostile.survive(codec_for(drive.detector.spec.streams[0]), iter(hostile_ones))
+    samples = [Arrival(at(number / 1000), "s", "car", raw) for number, raw in enumerate(hostile_ones)]
+    assert drive.take(*samples, until=1) == ["r car started 1"]
+    assert drive.engine.counters.undecodable["s"] == refused > 100
+    assert drive.engine.counters.last_undecodable["s"].startswith("car: no ")

@@ -18,6 +18,7 @@ from detector.engine.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control, is_intake_file, read_intake
 from detector.replay.intake_writer import IntakeWriter
+from detector.streams.codecs.ros import standard
 from tests.unit.ros_messages import cdr, pose_stamped
 from wayside.api.detector import Encoding, Stream
 
@@ -91,7 +92,7 @@ def test_a_stream_whose_type_changes_goes_on_in_another_channel(tmp_path: Path) 
     writer = IntakeWriter(path, [POSES])
     first = Arrival(1, "pose", "vehicles/car1/pose", POSE)
     writer.arrivals([first])
-    writer.follow([Stream(name="pose", key="vehicles/${client:*}/pose", encoding=Encoding.JSON)])
+    writer.follow([Stream(name="pose", key="vehicles/${client:*}/pose", encoding=Encoding.JSON)], standard())
     second = Arrival(2, "pose", "vehicles/car1/pose", b"{}")
     writer.arrivals([second])
     writer.close()

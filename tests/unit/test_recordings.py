@@ -16,7 +16,7 @@ from detector.replay.intake_writer import IntakeWriter
 from detector.replay.message import Message
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
-from detector.streams.codecs.ros import definition, typestore
+from detector.streams.codecs.ros import standard
 from tests.unit.ros_messages import cdr, odometry, pose_stamped
 from wayside.api.detector import Encoding, Stream
 
@@ -38,7 +38,9 @@ def write_mcap(path: Path, messages: list[Message], **options: Any) -> Path:
             if place not in channels:
                 schema = 0
                 if message.type is not None:
-                    schema = writer.register_schema(message.type, "ros2msg", definition(message.type).encode())
+                    schema = writer.register_schema(
+                        message.type, "ros2msg", standard().definition(message.type).encode()
+                    )
                 channels[place] = writer.register_channel(f"/{message.key}", message.encoding, schema)
             writer.add_message(channels[place], message.time, message.payload, message.time)
         writer.finish()  # type: ignore[no-untyped-call]
@@ -48,7 +50,7 @@ def write_mcap(path: Path, messages: list[Message], **options: Any) -> Path:
 def write_bag(path: Path, messages: list[Message], storage: StoragePlugin = StoragePlugin.MCAP) -> Path:
     with BagWriter(path, version=9, storage_plugin=storage) as writer:
         connections = {
-            message.key: writer.add_connection(f"/{message.key}", message.type or "", typestore=typestore())
+            message.key: writer.add_connection(f"/{message.key}", message.type or "", typestore=standard().store)
             for message in {message.key: message for message in messages}.values()
         }
         for message in messages:

@@ -106,6 +106,8 @@ def test_names_of_fields_are_camel_case_and_enums_pascal_case() -> None:
         "cdr",
         "json",
         "uper",
+        "cbor",
+        "raw",
         "client",
         "peer",
         "router",

@@ -52,6 +52,30 @@ class Encoding(StrEnum):
     CDR = "cdr"
     JSON = "json"
     UPER = "uper"
+    CBOR = "cbor"
+    RAW = "raw"
+
+
+class Layout(StrEnum):
+    """What the keys of a stream are made of."""
+
+    PLAIN = "Plain"
+    RMW_ZENOH = "RmwZenoh"
+
+
+MessageType = Annotated[str, Field(max_length=255, pattern=r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$")]
+"""A ROS 2 message type, e.g. geometry_msgs/msg/PoseStamped."""
+
+
+class MessageDefinition(Model):
+    """What a ROS 2 message type is made of."""
+
+    name: MessageType = Field(description="The type, e.g. my_package/msg/Track.")
+    definition: str = Field(
+        max_length=65_536,
+        description="As its .msg file holds it. What it refers to has a definition of its own in messages, or follows "
+        "behind a line of = and `MSG: <type>`, as `ros2 bag` records it.",
+    )
 
 
 class History(Model):
@@ -96,6 +120,15 @@ class Stream(Model):
             "!has(self.framePrefix) || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage')",
             "framePrefix is for streams of type tf2_msgs/msg/TFMessage",
         ),
+        (
+            "self.layout != 'RmwZenoh' || self.encoding in ['cdr', 'raw']",
+            "layout RmwZenoh is of ROS 2 messages: encoding must be cdr or raw",
+        ),
+        (
+            "self.layout != 'RmwZenoh' || self.source == 'zenoh'",
+            "layout RmwZenoh is for streams whose source is zenoh: remove one of them",
+        ),
+        ("!has(self.domain) || self.layout == 'RmwZenoh'", "domain is for streams with layout RmwZenoh: remove it"),
     )
 
     name: ObjectName = Field(description="The name by which rules refer to the stream.")
@@ -118,6 +151,17 @@ class Stream(Model):
         description="Over Zenoh: samples lost on the way are asked for again, of Advanced Publishers that number and "
         "remember them; what stays lost is counted.",
     )
+    layout: Layout = Field(
+        default=Layout.PLAIN,
+        description="Plain: samples come on the key itself, also with zenoh-bridge-ros2dds. RmwZenoh: on the keys of "
+        "rmw_zenoh nodes, which put the domain before the topic, and type and type hash after it; key is the topic.",
+    )
+    domain: int | None = Field(
+        default=None,
+        ge=0,
+        le=232,
+        description="The ROS domain that a RmwZenoh stream is taken from. Default: every domain.",
+    )
     client: str | None = Field(
         default=None,
         min_length=1,
@@ -126,7 +170,7 @@ class Stream(Model):
         description="The client that the data belongs to, where the key captures none: a name, or one made from the "
         "message, as its-${msg.header.stationId}, with CEL over msg, and key for what the key captures.",
     )
-    encoding: Encoding = Field(description="cdr (ROS 2 messages), json, or uper (ETSI ITS messages).")
+    encoding: Encoding = Field(description="cdr (ROS 2 messages), json, cbor, uper (ETSI ITS messages), or raw: bytes.")
     type: str | None = Field(
         default=None,
         max_length=255,
@@ -166,8 +210,17 @@ class Stream(Model):
     def _coherent(self) -> Stream:
         if self.encoding is Encoding.CDR and self.type is None:
             raise ValueError("a cdr stream needs its message type: give type, e.g. geometry_msgs/msg/PoseStamped")
-        if self.encoding is Encoding.JSON and self.type is not None:
-            raise ValueError("a json stream has no type: remove it")
+        if self.encoding not in (Encoding.CDR, Encoding.UPER) and self.type is not None:
+            raise ValueError(f"a {self.encoding} stream has no type: remove it")
+        if self.layout is Layout.RMW_ZENOH and self.encoding not in (Encoding.CDR, Encoding.RAW):
+            raise ValueError(
+                f"layout RmwZenoh is of ROS 2 messages: encoding must be cdr or raw, is {self.encoding}; "
+                "correct it, or remove layout"
+            )
+        if self.layout is Layout.RMW_ZENOH and self.source != ZENOH:
+            raise ValueError(f"layout RmwZenoh is for samples from zenoh, not {self.source}: remove one of them")
+        if self.domain is not None and self.layout is not Layout.RMW_ZENOH:
+            raise ValueError("domain is for streams with layout RmwZenoh: remove it")
         if self.type is not None and (self.encoding is Encoding.UPER) != self.type.startswith("etsi/"):
             example = "etsi/cam" if self.encoding is Encoding.UPER else "geometry_msgs/msg/PoseStamped"
             raise ValueError(f"{self.type} is no type of {self.encoding} streams: give one such as {example}")
@@ -275,6 +328,12 @@ class DetectorSpec(Model):
         "other versions than the packages have. Give all modules that they import as well.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
+    messages: list[MessageDefinition] = Field(
+        default_factory=list,
+        max_length=256,
+        description="ROS 2 message types that are not of the common packages, or are other than there.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
     buffer: Buffer = Field(default=Buffer(), description="How much is kept.")
     client_timeout: PositiveDuration = Field(
         default=PositiveDuration("30s"),
@@ -305,6 +364,7 @@ class DetectorSpec(Model):
             ("streams", [s.name for s in self.streams]),
             ("sources", [s.name for s in self.sources]),
             ("clients", [c.name for c in self.clients]),
+            ("messages", [m.name for m in self.messages]),
         ):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:

@@ -3,27 +3,45 @@
 from __future__ import annotations
 
 from detector.engine.sample import Decoder
+from detector.streams.codecs.cbor import CborDecoder
 from detector.streams.codecs.cdr import CdrDecoder
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder, OwnDefinitions
 from detector.streams.codecs.json_ import JsonDecoder
-from detector.streams.codecs.ros import UnknownTypeError
+from detector.streams.codecs.raw import RawDecoder
+from detector.streams.codecs.ros import RosTypes, UnknownTypeError, standard
 from wayside.api.detector import Encoding, Stream
 
 
-def codec_for(stream: Stream, asn1: OwnDefinitions | None = None) -> Decoder:
-    """What reads the stream's payloads; `asn1` are definitions of ETSI ITS messages that the Detector brings.
+def codec_for(stream: Stream, *, types: RosTypes | None = None, asn1: OwnDefinitions | None = None) -> Decoder:
+    """What reads the stream's payloads.
 
-    Raises UnknownTypeError, which names the stream's field and what is close, and DefinitionError where the
-    definitions of ETSI ITS messages are not there.
+    `types` are the ROS 2 message types that are known, by default the standard ones; `asn1` are definitions of ETSI ITS
+    messages that the Detector brings. Raises UnknownTypeError, which names the stream's field and what is close, and
+    DefinitionError where the definitions of ETSI ITS messages are not there.
     """
-    if stream.encoding is Encoding.UPER:
-        return EtsiDecoder(stream.type, asn1)
-    if stream.encoding is Encoding.JSON:
-        return JsonDecoder()
-    try:
-        return CdrDecoder(stream.type or "")
-    except UnknownTypeError as error:
-        raise UnknownTypeError(stream.type or "", f"streams[{stream.name}].type") from error
+    match stream.encoding:
+        case Encoding.JSON:
+            return JsonDecoder()
+        case Encoding.CBOR:
+            return CborDecoder()
+        case Encoding.RAW:
+            return RawDecoder()
+        case Encoding.UPER:
+            return EtsiDecoder(stream.type, asn1)
+        case Encoding.CDR:
+            types = types or standard()
+            if not types.known(stream.type or ""):
+                raise UnknownTypeError(stream.type or "", types, f"streams[{stream.name}].type")
+            return CdrDecoder(stream.type or "", types)
 
 
-__all__ = ["CdrDecoder", "DefinitionError", "EtsiDecoder", "JsonDecoder", "UnknownTypeError", "codec_for"]
+__all__ = [
+    "CborDecoder",
+    "CdrDecoder",
+    "DefinitionError",
+    "EtsiDecoder",
+    "JsonDecoder",
+    "RawDecoder",
+    "UnknownTypeError",
+    "codec_for",
+]

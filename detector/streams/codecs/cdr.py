@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from operator import attrgetter
 from typing import Any
 
@@ -15,7 +15,7 @@ from rosbags.serde import SerdeError
 
 from detector.engine.sample import DecodeError
 from detector.streams.codecs.doubles import EXACT, number
-from detector.streams.codecs.ros import UnknownTypeError, has_header, known, typestore
+from detector.streams.codecs.ros import RosTypes, UnknownTypeError, standard
 
 Convert = Callable[[Any], Any]
 
@@ -28,14 +28,19 @@ _LARGE = 4096
 class CdrDecoder:
     """Reads the messages of one type, little or big endian."""
 
-    def __init__(self, type_name: str) -> None:
-        """`type_name` is a ROS 2 message type, e.g. geometry_msgs/msg/PoseStamped. Raises UnknownTypeError."""
-        if not known(type_name):
-            raise UnknownTypeError(type_name)
+    def __init__(self, type_name: str, types: RosTypes | None = None) -> None:
+        """`type_name` is one of the types, e.g. geometry_msgs/msg/PoseStamped; without `types`, a standard one.
+
+        Raises UnknownTypeError.
+        """
+        types = types or standard()
+        if not types.known(type_name):
+            raise UnknownTypeError(type_name, types)
         self.type_name = type_name
-        self._convert = _converter(type_name)
-        self._read = typestore().deserialize_cdr
-        self._stamped = has_header(type_name)
+        self._convert = _converter(types, type_name)
+        self._read = types.store.deserialize_cdr
+        self._stamp_first = types.stamp_first(type_name)
+        self._has_header = types.has_header(type_name)
 
     def decode(self, payload: bytes) -> Any:
         """The message as a map; arrays of octets (uint8, char, byte) are bytes, all others lists.
@@ -50,37 +55,44 @@ class CdrDecoder:
         return self._convert(message)
 
     def stamp(self, payload: bytes) -> int | None:
-        """header.stamp in nanoseconds, without decoding the rest; None for a type that does not begin with a header.
+        """header.stamp in nanoseconds, without decoding the rest where it comes first; None for a type without header.
 
         Raises DecodeError where the bytes are too short or hold no time since 1970.
         """
-        if not self._stamped:
-            return None
+        if not self._stamp_first:
+            return self._stamp_inside(payload) if self._has_header else None
         unpack = _STAMPS.get(payload[:2])
         if unpack is None or len(payload) < 12:
             raise DecodeError(f"no CDR of {self.type_name} ({len(payload)} bytes): no header")
-        seconds, nanoseconds = unpack(payload, 4)
+        return self._time(*unpack(payload, 4))
+
+    def _stamp_inside(self, payload: bytes) -> int:
+        """header.stamp where other fields come before the header."""
+        stamp = self.decode(payload)["header"]["stamp"]
+        return self._time(int(stamp["sec"]), int(stamp["nanosec"]))
+
+    def _time(self, seconds: int, nanoseconds: int) -> int:
         if seconds < 0 or nanoseconds >= 1_000_000_000:
             raise DecodeError(f"header.stamp of {self.type_name} is no time: {seconds} s, {nanoseconds} ns")
-        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+        return seconds * 1_000_000_000 + nanoseconds
 
 
-@cache
-def _converter(type_name: str) -> Convert:
+@lru_cache(maxsize=4096)
+def _converter(types: RosTypes, type_name: str) -> Convert:
     """Makes a message of the type a map."""
-    definition = typestore().get_msgdef(type_name)
+    definition = types.store.get_msgdef(type_name)
     fields = [
         (name, attribute, desc)
-        for (name, desc), (attribute, _) in zip(typestore().fielddefs[type_name][1], definition.fields, strict=True)
+        for (name, desc), (attribute, _) in zip(types.fields(type_name), definition.fields, strict=True)
         if name != "structure_needs_at_least_one_member"
     ]  # what an empty message holds on the wire
     if not fields:
         return lambda _: {}
     names = [name for name, _, _ in fields]
-    conversions = [(name, convert) for name, _, desc in fields if (convert := _field(desc)) is not None]
+    conversions = [(name, convert) for name, _, desc in fields if (convert := _field(types, desc)) is not None]
     get = attrgetter(*(attribute for _, attribute, _ in fields))
     if len(fields) == 1:
-        one, convert = names[0], _field(fields[0][2]) or (lambda value: value)
+        one, convert = names[0], _field(types, fields[0][2]) or (lambda value: value)
         return lambda message: {one: convert(get(message))}
 
     def convert_message(message: Any) -> dict[str, Any]:
@@ -92,16 +104,16 @@ def _converter(type_name: str) -> Convert:
     return convert_message
 
 
-def _field(desc: FieldDesc) -> Convert | None:
+def _field(types: RosTypes, desc: FieldDesc) -> Convert | None:
     """Makes a field's value plain; None where it already is."""
     kind, detail = desc
     if kind is Nodetype.NAME:
-        return _converter(str(detail))
+        return _converter(types, str(detail))
     if kind is Nodetype.BASE:
         return _SCALARS.get(str(detail[0]), float)
     element: FieldDesc = detail[0]  # type: ignore[assignment]
     if element[0] is Nodetype.NAME:
-        convert = _converter(str(element[1]))
+        convert = _converter(types, str(element[1]))
         return lambda values: [convert(value) for value in values]
     return _ARRAYS.get(str(element[1][0]), _small_integers)
 

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
-from detector.streams.codecs.ros import known, typestore
+from detector.streams.codecs.ros import RosTypes, standard
 from wayside.api.detector import Encoding, Stream
 from wayside.rules import Fields
 
 
-def message_fields(stream: Stream) -> Fields | None:
+def message_fields(stream: Stream, types: RosTypes | None = None) -> Fields | None:
     """The fields of a ROS message type; None for other encodings, whose messages can have any."""
-    if stream.encoding is not Encoding.CDR or stream.type is None or not known(stream.type):
+    types = types or standard()
+    if stream.encoding is not Encoding.CDR or stream.type is None or not types.known(stream.type):
         return None
-    return _fields(stream.type)
+    return _fields(types, stream.type)
 
 
-@cache
-def _fields(type_name: str) -> Fields:
-    return {name: _below(desc) for name, desc in typestore().fielddefs[type_name][1]}
+@lru_cache(maxsize=4096)
+def _fields(types: RosTypes, type_name: str) -> Fields:
+    return {name: _below(types, desc) for name, desc in types.fields(type_name)}
 
 
-def _below(desc: FieldDesc) -> Fields | None:
+def _below(types: RosTypes, desc: FieldDesc) -> Fields | None:
     """The fields below a field; None below numbers, texts and arrays."""
     kind, detail = desc
-    return _fields(str(detail)) if kind is Nodetype.NAME else None
+    return _fields(types, str(detail)) if kind is Nodetype.NAME else None

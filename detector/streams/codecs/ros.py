@@ -1,48 +1,99 @@
-"""The ROS 2 message types that are known, and how their text reads."""
+"""The ROS 2 message types that are known: those of a release, and what is defined beside or in place of them."""
 
 from __future__ import annotations
 
 import difflib
-from functools import cache
+import threading
+from collections.abc import Sequence
+from functools import cache, lru_cache
 
+from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
+from detector.streams.codecs.definitions import Definition, DefinitionsError, check, merged
+
 HEADER = "std_msgs/msg/Header"
+TIME = "builtin_interfaces/msg/Time"
 
-
-@cache
-def typestore() -> Typestore:
-    """All message types of the newest long-term ROS 2 release."""
-    return get_typestore(Stores.ROS2_JAZZY)
+_REGISTERING = threading.Lock()
+"""rosbags makes the classes of new types in a module of one name."""
 
 
 class UnknownTypeError(ValueError):
-    """A ROS 2 message type that the store does not hold; the text offers what may have been meant."""
+    """A ROS 2 message type that is not known; the text offers what may have been meant."""
 
-    def __init__(self, name: str, field: str | None = None) -> None:
+    def __init__(self, name: str, types: RosTypes, field: str | None = None) -> None:
         """`field` is where the name was given."""
-        close = difflib.get_close_matches(name, typestore().fielddefs, n=3)
-        remedy = f"did you mean {' or '.join(close)}?" if close else "only the common ROS 2 messages are known"
+        close = difflib.get_close_matches(name, types.store.fielddefs, n=3, cutoff=0.8)
+        remedy = f"did you mean {' or '.join(close)}? Else give" if close else "give"
         where = f"{field}: " if field else ""
-        super().__init__(f"{where}unknown message type {name!r}: {remedy}")
+        super().__init__(f"{where}unknown message type {name!r}: {remedy} its definition in spec.messages")
 
 
-def known(name: str) -> bool:
-    """Whether the type, e.g. geometry_msgs/msg/PoseStamped, is known."""
-    return name in typestore().fielddefs
+class RosTypes:
+    """Message types by their names, e.g. geometry_msgs/msg/PoseStamped."""
+
+    def __init__(self, store: Typestore) -> None:
+        self.store = store
+        """As rosbags keeps them."""
+
+    def known(self, name: str) -> bool:
+        """Whether the type is known."""
+        return name in self.store.fielddefs
+
+    def fields(self, name: str) -> Sequence[tuple[str, FieldDesc]]:
+        """The fields of a known type, in order."""
+        return self.store.fielddefs[name][1]
+
+    def stamp_first(self, name: str) -> bool:
+        """Whether the message begins with a std_msgs/msg/Header, so that its stamp is always at the same place."""
+        return self._first_is(name, HEADER) and self._first_is(HEADER, TIME)
+
+    def has_header(self, name: str) -> bool:
+        """Whether the message has a field `header` that holds a stamp."""
+        header = dict(self.fields(name)).get("header")
+        return (
+            header is not None
+            and header[1] == HEADER
+            and ("stamp", TIME) in ((field, desc[1]) for field, desc in self.fields(HEADER))
+        )
+
+    def definition(self, name: str) -> str:
+        """The type and all that it refers to as ros2msg text, as recordings carry it. Raises UnknownTypeError."""
+        if not self.known(name):
+            raise UnknownTypeError(name, self)
+        return self.store.generate_msgdef(name, ros_version=2)[0]
+
+    def _first_is(self, name: str, type_name: str) -> bool:
+        fields = self.fields(name)
+        return bool(fields) and fields[0][1][1] == type_name
 
 
 @cache
-def has_header(name: str) -> bool:
-    """Whether the message begins with a std_msgs/msg/Header, so that its stamp is always at the same place."""
-    fields = typestore().fielddefs[name][1]
-    return bool(fields) and fields[0][1][1] == HEADER
+def standard() -> RosTypes:
+    """All message types of the newest long-term ROS 2 release."""
+    return RosTypes(get_typestore(Stores.ROS2_JAZZY))
 
 
-@cache
-def definition(name: str) -> str:
-    """The type and all that it refers to as ros2msg text, as recordings carry it. Raises UnknownTypeError."""
-    if not known(name):
-        raise UnknownTypeError(name)
-    return typestore().generate_msgdef(name, ros_version=2)[0]
+@lru_cache(maxsize=16)
+def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
+    """The standard types, and those of the definitions: where both have one, that of the definitions counts.
+
+    Raises DefinitionsError, with all that is wrong with them.
+    """
+    if not definitions:
+        return standard()
+    given = standard().store
+    new = merged(definitions)
+    check(definitions, new, given.fielddefs)
+    store = Typestore()
+    store.fielddefs.update({name: parts for name, parts in given.fielddefs.items() if name not in new})
+    store.types.update({name: of_type for name, of_type in given.types.items() if name not in new})
+    try:
+        with _REGISTERING:
+            store.register(new)
+    except (TypesysError, SyntaxError, ValueError) as error:
+        raise DefinitionsError([(definitions[0].name, f"the definitions cannot be used: {error}")]) from error
+    return RosTypes(store)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.sample import DecodeError
-from detector.streams.codecs.ros import typestore
+from detector.streams.codecs.ros import standard
 
 IMAGE = "sensor_msgs/msg/Image"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -97,6 +97,6 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
 
 def _message(payload: bytes, kind: str) -> Any:
     try:
-        return typestore().deserialize_cdr(payload, kind)
+        return standard().store.deserialize_cdr(payload, kind)
     except Exception as error:
         raise DecodeError(f"no {kind}: {error}") from error
