@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.geometry import Pose, slerp, unit
@@ -37,6 +37,7 @@ def a_scan(tenths: int, client: str, frame: str = "front", stamp: float | None =
     return arrival(tenths / 10, client, {"t": t, "header": {"frame_id": frame}, "n": tenths}, "scan")
 
 
+@settings(deadline=None)
 @given(sent, st.sampled_from(["a", None]), st.sampled_from(["front", None]), st.integers(0, 5), st.integers(0, 60))
 def test_by_time_client_and_frame_each_query_finds_what_was_sent(
     scans: list[tuple[int, str, str]], client: str | None, frame: str | None, count: int, after: int
@@ -91,6 +92,7 @@ def a_pose(seconds: float, stamp: float, x: float, yaw: float) -> Any:
     return arrival(seconds, "a", value, "pose")
 
 
+@settings(deadline=None)
 @given(st.floats(0, 1), st.floats(-3, 3))
 def test_between_two_samples_the_position_is_on_the_line_and_the_heading_on_the_arc(share: float, yaw: float) -> None:
     queries = queried(a_pose(2.5, 2, 10, yaw), a_pose(2.6, 1, 0, 0), until=3)  # arrived the other way round

@@ -1,0 +1,61 @@
+"""A test of a rule in three lines: what would it have done in this drive?
+
+    from detector.testing import run
+    events = run("rules.yaml", "detector.yaml", "drive.mcap")
+    assert [event.subject for event in events if event.started] == ["car1"]
+
+The engine is the one that runs live. Plugins run in the test's own process, so breakpoints and coverage see them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from detector.engine.events import Event
+from detector.replay.intake_file import is_intake_file, read_intake
+from detector.replay.latched import recorded_arrivals
+from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
+from detector.replay.routing import Router
+from detector.rules.files import load_rules
+
+__all__ = ["Event", "RefusedError", "run"]
+
+Paths = str | Path | Sequence[str | Path]
+"""One file or folder, or several."""
+
+
+class RefusedError(ValueError):
+    """A rule that is not evaluated; the text says why, and where."""
+
+
+def run(rules: Paths, detector: str | Path, recording: Paths) -> list[Event]:
+    """The events of these rules over a recording, in order.
+
+    Args:
+        rules: files or folders with EventRules.
+        detector: the file with the Detector that evaluates them.
+        recording: whatever `detector replay` reads; several are merged by time.
+
+    Raises:
+        RefusedError: a rule has problems, or the Detector does not select it.
+        DocumentError, DetectorError, RecordingError: a file cannot be used.
+    """
+    loaded = load_rules(detector, _paths(rules))
+    if loaded.warnings:
+        raise RefusedError("; ".join(loaded.warnings))
+    recordings = _paths(recording)
+    outcome: Outcome
+    if recordings[0].exists() and is_intake_file(recordings[0]):
+        outcome = replay_intake(read_intake(recordings[0]), loaded.rule_set.detector, loaded.rule_set.rules)
+    else:
+        router = Router(loaded.rule_set.detector.spec.streams)
+        arrivals = recorded_arrivals(recordings, router, loaded.rule_set.detector)
+        outcome = replay_arrivals(arrivals, loaded.rule_set.detector, loaded.rule_set.rules)
+    if outcome.refusals:
+        raise RefusedError("; ".join(map(str, outcome.refusals)))
+    return outcome.events
+
+
+def _paths(given: Paths) -> list[Path]:
+    return [Path(given)] if isinstance(given, str | Path) else [Path(each) for each in given]

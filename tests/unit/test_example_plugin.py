@@ -1,0 +1,70 @@
+"""The example package is installed as a user would, checked, tested with the kit, and run by the commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from detector.testing import RefusedError, run
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "signal-plugin"
+RULES, DETECTOR, DRIVE = (EXAMPLE / name for name in ("rules.yaml", "detector.yaml", "drive.jsonl"))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the package is installed."""
+    target = tmp_path_factory.mktemp("site")
+    source = tmp_path_factory.mktemp("source") / "signal-plugin"
+    subprocess.run(["cp", "-r", EXAMPLE, source], check=True)  # building leaves files behind
+    install = ["pip", "install", "--no-deps", "--no-build-isolation", "--quiet", "--target", str(target), str(source)]
+    subprocess.run([sys.executable, "-m", *install], check=True)
+    return target
+
+
+def test_before_it_is_installed_it_is_missed() -> None:
+    with pytest.raises(RefusedError, match=r"plugin\.name: no plugin stop-and-go is installed here"):
+        run(RULES, DETECTOR, DRIVE)
+
+
+def test_the_rule_is_tested_in_three_lines(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(site)
+    events = run(RULES, DETECTOR, DRIVE)
+    assert [event.subject for event in events if event.started] == ["jammed"]
+    assert events[0].values == {"stops": 3.0}
+
+
+def test_the_readme_says_the_same_three_lines() -> None:
+    readme = (EXAMPLE / "README.md").read_text()
+    code = readme.split("```python\n")[1].split("```")[0]
+    assert len([line for line in code.splitlines() if line]) == 3
+    assert 'run("rules.yaml", "detector.yaml", "drive.jsonl")' in code
+    assert code in (EXAMPLE.parents[1] / "docs" / "plugins.md").read_text()
+
+
+def test_the_commands_find_it_and_give_the_same_events(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = os.pathsep.join([str(site), *filter(None, sys.path)])
+    command = [sys.executable, "-m", "detector.cli"]
+
+    def detector(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*command, *map(str, arguments)],
+            env={**os.environ, "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+
+    assert "nothing wrong" in detector("check", DETECTOR, RULES).stderr
+    detector("replay", DRIVE, "--detector", DETECTOR, "--rules", RULES, "--output", tmp_path)
+    monkeypatch.syspath_prepend(site)
+    events = (tmp_path / "events.jsonl").read_text().splitlines()
+    assert events == [event.to_json() for event in run(RULES, DETECTOR, DRIVE)]
+    assert json.loads(events[0])["subject"] == "jammed"
