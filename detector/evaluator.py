@@ -1,7 +1,8 @@
 """The thread that drives the engine live: it reads the wall clock, empties the intake and runs the ticks that are due.
 
 All that the engine consumes passes here in one order, so this is also where it is recorded: arrivals, and between them
-the controls (start, rules, detector, restore, gap, end). The replay of such a recording makes the same calls again.
+the controls (start, rules, restore, gap, level, paused, ask, end). The replay of such a recording makes the same calls
+again.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from typing import Any, Protocol, TypeVar
 
 from detector.assembly import RuleBook, inlets
 from detector.engine.demands import Demand, to_task
-from detector.engine.engine import Engine
+from detector.engine.engine import Engine, NoAnswerError
+from detector.engine.evaluation import Answer
 from detector.engine.events import Event
 from detector.engine.intake import Intake
 from detector.engine.open_episodes import OpenEpisode
 from detector.engine.sample import Arrival
 from detector.losses import Losses
+from detector.overload import LONG, Overload
 from detector.plugins.outages import Outages
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
@@ -96,6 +99,7 @@ class Evaluator:
         self._stopping = False
         self._ended = False
         self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
+        self._overload = Overload()
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
         self.losses = Losses(engine, intake)
@@ -141,6 +145,17 @@ class Evaluator:
                 self._calls.append((future, work))
             self._wake.notify()
         return future
+
+    def ask(self, rule: str) -> Future[list[Answer]]:
+        """Evaluate a rule with onDemand now; thread-safe. Gives what it says of each subject, or NoAnswerError."""
+        return self.call(lambda: self._ask(rule))
+
+    def pause_rule(self, rule: str, paused: bool) -> Future[None]:
+        """Do not evaluate the rule from now on, or (not `paused`) again; thread-safe.
+
+        Gives NoAnswerError where there is no such rule. A detector that starts anew has no paused rules.
+        """
+        return self.call(lambda: self._pause_rule(rule, paused))
 
     def configure(self, rule_set: RuleSet) -> None:
         """Go on with other rules, or another Detector that can run, from the next look on; thread-safe."""
@@ -201,13 +216,38 @@ class Evaluator:
             events += self._configure(wanted)
         self._hand_over(events)
 
+    def _ask(self, rule: str) -> list[Answer]:
+        events, answers = self._engine.ask(rule)
+        self._record(self._engine.now, {"kind": "ask", "rule": rule})
+        self._hand_over(events)
+        return answers
+
+    def _pause_rule(self, rule: str, paused: bool) -> None:
+        if rule not in self._engine.rules:
+            raise NoAnswerError(f"there is no rule {rule}; there is {', '.join(sorted(self._engine.rules)) or 'none'}")
+        names = self._engine.schedule.paused - {rule} | ({rule} if paused else set())
+        self._record(self._engine.now, {"kind": "paused", "rules": sorted(names)})
+        self._engine.set_paused(names)
+        _log.info("EventRule %s is %s", rule, "paused: its open episodes hold" if paused else "evaluated again")
+
+    def _adapt(self, spent: int) -> None:
+        """Leave out more where the look took too long, and less when it is calm again."""
+        if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
+            level, highest = self._overload.level, self._engine.schedule.highest
+            text = "the evaluation takes too long" if spent > LONG else "the evaluation keeps up"
+            _log.warning("%s: evaluations of low priority are left out at level %d of %d", text, level, highest)
+            self._record(self._engine.now, {"kind": "level", "level": level})
+            self._engine.set_level(level)
+
     def _take(self, arrivals: list[Arrival], now: int) -> list[Event]:
         if self._recorder is not None and arrivals:
             self._recorder.arrivals(arrivals)
         self.status.arrived(arrivals)
+        begin = self._engine.stopwatch()
         events = self._engine.advance(arrivals, now)
         for document in self._outages.news():
             self._record(self._engine.now, document)
+        self._adapt(self._engine.stopwatch() - begin)
         return events
 
     def _gap(self, now: int, why: str) -> list[Event]:

@@ -118,6 +118,10 @@ class Losses:
             yield Loss(crowded, rule.crowded_pairs, cause="crowded_pairs", rule=name)
             kept = f"times a parameter that follows kept its last value in EventRule {name}"
             yield Loss(kept, rule.unfollowed, rule.last_unfollowed, cause="unfollowed", rule=name)
+            slow = f"evaluations of EventRule {name} left out, the machine being too slow"
+            yield Loss(slow, rule.skipped, cause="skipped", rule=name)
+            often = f"episodes of EventRule {name} left out, beyond maxEpisodesPerHour"
+            yield Loss(often, rule.suppressed, cause="suppressed", rule=name)
 
 
 def _line(loss: Loss, count: int) -> str:

@@ -18,6 +18,10 @@ class RuleCounters:
     """What happened in the evaluation of one rule."""
 
     evaluations: int = 0
+    skipped: int = 0
+    """Times at which it was due and left out, the machine being too slow."""
+    suppressed: int = 0
+    """Episodes left out, one of their clients having had maxEpisodesPerHour."""
     started: int = 0
     ended: int = 0
     unknowns: int = 0

@@ -6,14 +6,14 @@ It reads no clock and does no I/O. Live operation, the replay of a recording and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from detector.engine.buffer import Buffer
 from detector.engine.clients import Clients
 from detector.engine.counters import Counters
 from detector.engine.demands import Demand
 from detector.engine.episodes import Reason
-from detector.engine.evaluation import Identity, RuleRun, same_semantics
+from detector.engine.evaluation import Answer, Identity, RuleRun, same_semantics
 from detector.engine.events import Event
 from detector.engine.inflow import Inflow
 from detector.engine.lanes import lane_makers
@@ -24,6 +24,7 @@ from detector.engine.plugins import NoPlugins, PluginHost, PluginSignals
 from detector.engine.positions import Positions
 from detector.engine.queries import BufferQueries
 from detector.engine.sample import Arrival, Decoder, Sample
+from detector.engine.schedule import Only, Schedule
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
 from detector.engine.starts import Starts
@@ -36,6 +37,10 @@ from wayside.rules import CompiledRule, compile_stream, in_order
 __all__ = ["Engine", "KeyReader"]
 
 _SAMPLE = frozenset({"sample"})
+
+
+class NoAnswerError(ValueError):
+    """A rule was asked that cannot answer; the text says why, and what to do."""
 
 
 class Engine:
@@ -63,6 +68,7 @@ class Engine:
         self._runs: dict[str, RuleRun] = {}
         self._rules_version = 0
         self._ticks = Ticks()
+        self.schedule = Schedule(self._ticks)
         self._starts = Starts()
         self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
         self.clients = Clients({}, detector.spec.client_timeout.ns)
@@ -164,7 +170,8 @@ class Engine:
                 self._starts.started(event)
         self._signals.forget(lambda rule, client: rule in kept)
         self._plugin_host.configure(rules, kept)
-        self._ticks.set_periods([rule.every_ns for rule in rules if rule.enabled])
+        self.schedule.set_rules([run.rule for run in self._runs.values()])
+        self._wake_anew(now)
         self._rules_version += 1
         return events
 
@@ -204,6 +211,42 @@ class Engine:
         """All episodes that have not ended."""
         return [episode for run in self._runs.values() for episode in run.episodes()]
 
+    def set_paused(self, names: Collection[str]) -> None:
+        """Do not evaluate these rules until further notice, and all others again; names of no rule mean nothing.
+
+        Open episodes of a paused rule hold, what was pending is forgotten.
+        """
+        for name in self._runs.keys() & names:
+            self._runs[name].forget_pending()
+        self.schedule.paused = frozenset(names & self._runs.keys())
+        self._wake_anew(self.now)
+
+    def set_level(self, level: int) -> None:
+        """Leave out so many evaluations from now on (see load.py); 0: none."""
+        self.schedule.set_level(level)
+
+    def ask(self, name: str) -> tuple[list[Event], list[Answer]]:
+        """Evaluate a rule with `onDemand` now: after the last tick, with what was taken in since up to `now`.
+
+        Returns what started and ended, and what the rule says of each subject.
+
+        Raises:
+            NoAnswerError: there is no such rule, or it is none that is evaluated on demand, disabled or paused.
+        """
+        run = self._runs.get(name)
+        if run is None:
+            raise NoAnswerError(f"there is no rule {name}; there is {', '.join(sorted(self._runs)) or 'none'}")
+        if not run.rule.on_demand:
+            raise NoAnswerError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
+        if not run.rule.enabled or name in self.schedule.paused:
+            raise NoAnswerError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
+        events, answers = run.answer(self.now, self._views(run, self.now), self.clients, self._plugins)
+        for event in events:
+            self._starts.note(event)
+        self._messages.forget()
+        self._transforms.forget()
+        return events, answers
+
     def demands(self) -> dict[str, Demand]:
         """What the open episodes ask for, by the names of the tasks."""
         return {demand.name: demand for run in self._runs.values() for demand in run.demands()}
@@ -216,6 +259,11 @@ class Engine:
     def next_tick(self) -> int:
         """When the next tick is due, with clock Wall; nanoseconds since the epoch."""
         return self._ticks.after(self._timeline.now)
+
+    @property
+    def triggers(self) -> frozenset[str]:
+        """The streams whose samples make rules be evaluated."""
+        return self._ticks.triggers
 
     @property
     def now(self) -> int:
@@ -255,13 +303,57 @@ class Engine:
             match step:
                 case Insert(arrivals, times):
                     self._inflow.insert(arrivals, times)
-                case Tick(time):
-                    events += self._tick(time)
+                case Tick():
+                    events += self._tick(step)
                 case Gap(time, backwards):
                     self._gap(time, backwards)
         return events
 
-    def _tick(self, time: int) -> list[Event]:
+    def _tick(self, tick: Tick) -> list[Event]:
+        time, regular = tick.time, self._ticks.is_regular(tick.time)
+        if regular:  # else it is there for a single sample or subject, and must cost no look at all the others
+            self._keep_house(time)
+        events: list[Event] = []
+        sampled = self._sampled(tick.sampled)
+        for name, run in self._runs.items():
+            if not run.rule.enabled or name in self.schedule.paused:
+                continue
+            happened = self._turn(run, time, sampled, regular)
+            for event in happened:
+                self._starts.note(event)
+            events += happened
+        self._messages.forget()
+        self._transforms.forget()
+        return events
+
+    def _turn(self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool) -> list[Event]:
+        """What happens to a rule at a tick; `regular`: it is one of some rule's periods, or of housekeeping."""
+        rule = run.rule
+        if rule.every_ns is not None:
+            if time % rule.every_ns:
+                return []
+            if self.schedule.is_thinned(rule, time):
+                run.counters.skipped += 1
+                return []
+            return self._evaluated(run, time)
+        events = run.lose(time, self.clients) if regular else []
+        if rule.on_sample is None:
+            return events
+        only, thinned = self.schedule.whom(rule, time, sampled)
+        run.counters.skipped += thinned
+        if only.clients or only.subjects:
+            events += self._evaluated(run, time, only)
+            self._wake(run, time)
+        return events
+
+    def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
+        begin = self.stopwatch()
+        events = run.tick(time, self._views(run, time), self.clients, self._plugins, only)
+        run.counters.timed(time, self.stopwatch() - begin)
+        return events
+
+    def _keep_house(self, time: int) -> None:
+        """Forget old samples and lost clients."""
         self.buffer.expire(time)
         self._starts.buffer.expire(time)
         for client, latest in self.buffer.latest():
@@ -271,28 +363,37 @@ class Engine:
             self._inflow.lose(set(lost))
             self._starts.lose(lost)
             self._signals.forget(lambda rule, client: client in self.clients)
-        events: list[Event] = []
+
+    def _views(self, run: RuleRun, time: int) -> Views:
+        return Views(
+            run.rule,
+            time,
+            self.clients,
+            self.buffer,
+            self._signals,
+            self._positions,
+            self._stale_after,
+            run.counters,
+        )
+
+    def _sampled(self, arrivals: Sequence[Arrival]) -> Mapping[str, frozenset[str]]:
+        """By stream, the known clients of which these samples are."""
+        found: dict[str, set[str]] = {}
+        for arrival in arrivals:
+            client = self._inflow.client_of(arrival)
+            if client is not None and client in self.clients:
+                found.setdefault(arrival.stream, set()).add(client)
+        return {stream: frozenset(clients) for stream, clients in found.items()}
+
+    def _wake(self, run: RuleRun, time: int) -> None:
+        for subject, at in run.wakes(time):
+            self.schedule.wake(run.rule.name, subject, at)
+
+    def _wake_anew(self, time: int) -> None:
+        """Rules or time changed."""
         for run in self._runs.values():
-            if run.due(time):
-                views = Views(
-                    run.rule,
-                    time,
-                    self.clients,
-                    self.buffer,
-                    self._signals,
-                    self._positions,
-                    self._stale_after,
-                    run.counters,
-                )
-                begin = self.stopwatch()
-                happened = [*run.tick(time, views, self.clients, self._plugins)]
-                run.counters.timed(time, self.stopwatch() - begin)
-                for event in happened:
-                    self._starts.note(event)
-                events += happened
-        self._messages.forget()
-        self._transforms.forget()
-        return events
+            if run.rule.on_sample is not None:
+                self._wake(run, time)
 
     def _gap(self, time: int, backwards: bool) -> None:
         if backwards:
@@ -305,6 +406,7 @@ class Engine:
         self.clients.gap(time)
         for run in self._runs.values():
             run.gap(time)
+        self._wake_anew(time)
 
     def _make_timeline(self, start: int) -> Timeline:
         spec = self.detector.spec

@@ -74,6 +74,20 @@ class SubjectState:
         """Whether the state says no more than a fresh one would."""
         return not self.is_open and self.onset is None and self.rests_until <= now
 
+    def wake(self, now: int, timing: Timing) -> int | None:
+        """When one of its times is over, so that something may happen without a sample; nanoseconds, after `now`."""
+        times = []
+        if self.is_open:
+            if self.unknown_since is not None:
+                times.append(self.unknown_since + timing.unknown_timeout)
+        elif self.onset is not None:
+            times.append(self.onset + timing.hold)
+            if self.unknown_since is not None:
+                times.append(self.unknown_since + timing.hold + 1)
+        else:
+            times.append(self.rests_until)
+        return min((time for time in times if time > now), default=None)
+
     def gap(self) -> None:
         """Time went on without us: what was pending is forgotten, an open episode holds."""
         self.onset = None

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
+from detector.engine.budget import Budget
 from detector.engine.clients import Clients
 from detector.engine.counters import RuleCounters
 from detector.engine.demands import Demand
@@ -16,10 +17,12 @@ from detector.engine.events import Event
 from detector.engine.following import followed
 from detector.engine.open_episodes import OpenEpisode
 from detector.engine.plugins import PluginSignals
+from detector.engine.schedule import Only
 from detector.engine.scopes import Candidate, Views, candidates
 from detector.engine.snapshots import snapshot
 from detector.engine.subjects import Subject, fits
-from wayside.expressions import UNKNOWN, Expression, InterpolationError
+from wayside.api.base import JsonValue
+from wayside.expressions import UNKNOWN, Expression, InterpolationError, Unknown
 from wayside.rules import CompiledDeploy, CompiledRule
 
 
@@ -60,6 +63,21 @@ class Sight(NamedTuple):
     onset: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a rule says of one subject when it is asked."""
+
+    subject: str
+    when: bool | None
+    """None: unknown."""
+    values: Mapping[str, JsonValue]
+    """Signals, as in an event; what is unknown is left out."""
+    episode: str | None
+    """The open episode, after this evaluation."""
+    start_time: int | None
+    """When it started; nanoseconds since the epoch."""
+
+
 class RuleRun:
     """A rule and the states of its subjects."""
 
@@ -74,20 +92,52 @@ class RuleRun:
         """Changes whenever the demands do."""
         self._states: dict[Subject, SubjectState] = {}
         self._open: dict[Subject, Episode] = {}
+        self._muted: set[Subject] = set()
+        """Subjects in an episode beyond the budget: it runs its course, and nobody hears of it."""
+        self._budget = Budget()
+        self._answers: list[Answer] | None = None
 
-    def due(self, now: int) -> bool:
-        """Whether the rule is evaluated at this tick."""
-        return self.rule.enabled and now % self.rule.every_ns == 0
-
-    def tick(self, now: int, views: Views, clients: Clients, plugins: PluginSignals) -> Iterator[Event]:
-        """Evaluate the rule for all subjects; yields what started and ended, in order of the subjects."""
-        events = [*self._lost(now, clients)]
-        seen = candidates(self.rule, views, clients, self._in_progress())
-        for candidate in plugins.added(self.rule, seen, self.counters):
+    def tick(
+        self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: Only | None = None
+    ) -> list[Event]:
+        """Evaluate the rule, for all subjects or those given; returns what started and ended, in order of subjects."""
+        events = [] if only is not None else [*self._lost(now, clients)]
+        seen = candidates(self.rule, views, clients, self._in_progress(), only)
+        for candidate in plugins.added(self.rule, seen, self.counters, every_subject=only is None):
             self.counters.evaluations += 1
             events += self._subject(now, candidate)
+        if only is None:
+            self._tidy(now)
+        return sorted(events, key=lambda event: event.subject)
+
+    def lose(self, now: int, clients: Clients) -> list[Event]:
+        """For a rule without a period: end the episodes of clients that are lost, and forget what is over."""
+        events = [*self._lost(now, clients)]
+        self._tidy(now)
+        return sorted(events, key=lambda event: event.subject)
+
+    def answer(
+        self, now: int, views: Views, clients: Clients, plugins: PluginSignals
+    ) -> tuple[list[Event], list[Answer]]:
+        """Evaluate the rule for all subjects, and tell what it says of each, in order of the subjects."""
+        self._answers = []
+        events = self.tick(now, views, clients, plugins)
+        answers, self._answers = self._answers, None
+        return events, sorted(answers, key=lambda answer: answer.subject)
+
+    def forget_pending(self) -> None:
+        """The rule is paused: open episodes hold, what was pending is forgotten."""
+        for state in self._states.values():
+            state.gap()
+
+    def wakes(self, now: int) -> Iterator[tuple[Subject, int | None]]:
+        """When each subject must be looked at; nanoseconds after `now`, None: at no time."""
+        for subject, state in self._states.items():
+            yield subject, state.wake(now, self._timing)
+
+    def _tidy(self, now: int) -> None:
         self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}
-        yield from sorted(events, key=lambda event: event.subject)
+        self._budget.expire(now)
 
     @property
     def open_episodes(self) -> int:
@@ -168,6 +218,7 @@ class RuleRun:
         for subject in sorted(self._open, key=lambda each: each.text):
             yield self._ended(now, self._open.pop(subject), reason, {})
         self._states.clear()
+        self._muted.clear()
 
     def demands(self) -> Iterator[Demand]:
         """What the open episodes ask for."""
@@ -188,7 +239,10 @@ class RuleRun:
             state = self._states[subject]
             if state.is_open:
                 state.end(now, self._timing)
-                yield self._ended(now, self._open.pop(subject), Reason.CLIENT_LOST, {})
+                if subject in self._muted:
+                    self._muted.discard(subject)
+                else:
+                    yield self._ended(now, self._open.pop(subject), Reason.CLIENT_LOST, {})
             else:
                 state.gap()
 
@@ -201,7 +255,14 @@ class RuleRun:
         until = negation(when) if self.rule.until is None else self._truth(self.rule.until, variables)
         match state.step(now, self._timing, Observation(candidate.in_scope, candidate.near, when, until)):
             case Started(onset):
-                yield self._started(now, onset, candidate)
+                limit = self.rule.maximum_per_hour
+                if limit is None or self._budget.takes(candidate.subject.clients, now, limit):
+                    yield self._started(now, onset, candidate)
+                else:
+                    self.counters.suppressed += 1
+                    self._muted.add(candidate.subject)
+            case Ended() if candidate.subject in self._muted:
+                self._muted.discard(candidate.subject)
             case Ended(reason):
                 yield self._ended(now, self._open.pop(candidate.subject), reason, snapshot(self.rule, candidate))
             case None:
@@ -213,6 +274,18 @@ class RuleRun:
                     self._follow(episode, variables)
         if self.witness is not None:
             self.witness(Sight(now, candidate, when, until, state.is_open, state.onset))
+        if self._answers is not None:
+            self._answers.append(self._answer(candidate, when))
+
+    def _answer(self, candidate: Candidate, when: Truth) -> Answer:
+        episode = self._open.get(candidate.subject)
+        return Answer(
+            candidate.subject.text,
+            None if isinstance(when, Unknown) else when,
+            snapshot(self.rule, candidate),
+            None if episode is None else episode.id,
+            None if episode is None else episode.start,
+        )
 
     def _truth(self, expression: Expression, variables: Mapping[str, Any]) -> Truth:
         value = expression.evaluate_or_unknown(variables, self.counters.note)
@@ -247,6 +320,7 @@ class RuleRun:
             classification=self.rule.classification,
             models={model.name: model.runner.sha256 for model in self.rule.models if model.runner is not None},
             element=episode.subject.element,
+            dry_run=self.rule.dry_run,
         )
 
     def _render(self, episode: Episode) -> None:

@@ -36,6 +36,9 @@ class Event:
     element: str | None = None
     """The element of `each` that the rule was evaluated for."""
 
+    dry_run: bool = False
+    """No action of the rule runs."""
+
     @property
     def started(self) -> bool:
         """Whether the episode started; else it ended."""
@@ -65,6 +68,8 @@ class Event:
             data["models"] = dict(self.models)
         if self.classification is not None:
             data["classification"] = dict(self.classification)
+        if self.dry_run:
+            data["dryRun"] = True
         return {
             "specversion": "1.0",
             "id": f"{self.episode}.{'started' if self.started else 'ended'}",

@@ -80,8 +80,13 @@ class PluginSignals:
         self._host = host
         self._queries = queries
 
-    def added(self, rule: CompiledRule, candidates: Iterable[Candidate], counters: RuleCounters) -> Iterator[Candidate]:
-        """The candidates with the values of the rule's plugin signals among their variables."""
+    def added(
+        self, rule: CompiledRule, candidates: Iterable[Candidate], counters: RuleCounters, *, every_subject: bool
+    ) -> Iterator[Candidate]:
+        """The candidates with the values of the rule's plugin signals among their variables.
+
+        `every_subject`: there are no other subjects, so that the state kept for others can go.
+        """
         if not rule.plugins:
             yield from candidates
             return
@@ -91,7 +96,8 @@ class PluginSignals:
             subjects.add(candidate.subject.text)
             values = dict(self._values(rule, candidate, queries, counters))
             yield replace(candidate, variables={**candidate.variables, **values})
-        self._host.keep(rule.name, subjects)
+        if every_subject:
+            self._host.keep(rule.name, subjects)
 
     def _values(
         self, rule: CompiledRule, candidate: Candidate, queries: Queries, counters: RuleCounters

@@ -13,6 +13,7 @@ from detector.engine.episodes import Truth, both
 from detector.engine.models import add_models
 from detector.engine.nearness import Search, near_pairs
 from detector.engine.positions import Place, Positions, described, distance, point
+from detector.engine.schedule import Only
 from detector.engine.signals import Signals
 from detector.engine.subjects import Subject
 from wayside.expressions import UNKNOWN, Expression
@@ -120,21 +121,31 @@ class Views:
         self._counters.crowded_pairs += pairs
 
 
-def candidates(rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Subject]) -> Iterator[Candidate]:
-    """The subjects to look at: all that may start an episode, and those that have one or are about to."""
+def candidates(
+    rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Subject], only: Only | None = None
+) -> Iterator[Candidate]:
+    """The subjects to look at: all that may start an episode, and those that have one or are about to.
+
+    `only`: of these, none but the subjects that it takes.
+    """
     if not isinstance(rule.subject, PairSubject):
-        views.prepare(clients)
+        views.prepare(clients if only is None or isinstance(rule.subject, FleetSubject) else only.present(clients))
     match rule.subject:
         case ClientSubject() as each:
+            looked_at = clients if only is None else only.present(clients)
             for element in rule.elements:
-                for client in clients:
+                for client in looked_at:
+                    if only is not None and not only.takes(Subject((client,), element.name)):
+                        continue
                     variables = _with(views, client, element)
                     in_scope = views.truth(each.where, variables)
                     yield Candidate(Subject((client,), element.name), variables, in_scope, near=True)
         case PairSubject() as pairs:
-            yield from _pairs(rule, pairs, views, clients, pending)
+            yield from _pairs(rule, pairs, views, clients, pending, only)
         case FleetSubject() as fleet:
             for element in rule.elements:
+                if only is not None and not only.takes(Subject((), element.name)):
+                    continue
                 seen = ((client, _with(views, client, element)) for client in clients)
                 members = [
                     views.of(client, element) for client, view in seen if views.truth(fleet.members, view) is True
@@ -154,7 +165,12 @@ def _with(views: Views, client: str, element: CompiledElement) -> dict[str, Any]
 
 
 def _pairs(
-    rule: CompiledRule, subject: PairSubject, views: Views, clients: Clients, pending: Iterable[Subject]
+    rule: CompiledRule,
+    subject: PairSubject,
+    views: Views,
+    clients: Clients,
+    pending: Iterable[Subject],
+    only: Only | None,
 ) -> Iterator[Candidate]:
     places = {client: place for client in clients if (place := views.place(subject, client)) is not None}
     points = {client: point(subject.position, place) for client, place in places.items()}
@@ -171,6 +187,8 @@ def _pairs(
         views.left_out(found.left_out)
         near = {Subject(pair, element.name) for pair in found.pairs}
         looked_at = sorted(near | {one for one in in_progress if one.element == element.name})
+        if only is not None:
+            looked_at = [each for each in looked_at if only.takes(each)]
         views.prepare(dict.fromkeys(client for each in looked_at for client in each.clients))
         for each in looked_at:
             a, b = each.clients

@@ -35,6 +35,8 @@ class Tick:
     """Evaluate the rules that are due at this time."""
 
     time: int
+    sampled: Sequence[Arrival] = ()
+    """The samples of exactly this time whose streams trigger evaluations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,18 +51,37 @@ Step = Insert | Tick | Gap
 
 
 class Ticks:
-    """The whole multiples of the rules' periods."""
+    """When to evaluate beside the samples: at whole multiples of the rules' periods, and when a subject must wake."""
 
     def __init__(self) -> None:
         self._periods: tuple[int, ...] = (HOUSEKEEPING,)
+        self._wakes: list[int] = []
+        """A heap; what is over is dropped when it is met."""
+        self.triggers: frozenset[str] = frozenset()
+        """The streams whose samples are evaluated at their own times."""
 
     def set_periods(self, periods: Collection[int]) -> None:
         """The rules' periods, in nanoseconds."""
         self._periods = tuple(sorted({HOUSEKEEPING, *periods}))
 
+    def set_triggers(self, streams: Collection[str]) -> None:
+        """The streams whose samples are evaluated at their own times."""
+        self.triggers = frozenset(streams)
+
+    def wake_at(self, time: int) -> None:
+        """There is a tick at this time, if it is still to come."""
+        heapq.heappush(self._wakes, time)
+
     def after(self, time: int) -> int:
         """The first tick after a time."""
-        return min(time - time % period + period for period in self._periods)
+        regular = min(time - time % period + period for period in self._periods)
+        while self._wakes and self._wakes[0] <= time:
+            heapq.heappop(self._wakes)
+        return min(regular, self._wakes[0]) if self._wakes else regular
+
+    def is_regular(self, time: int) -> bool:
+        """Whether the tick is there for a period, not just for a sample or a wake."""
+        return any(time % period == 0 for period in self._periods)
 
 
 class WallTimeline:
@@ -81,16 +102,33 @@ class WallTimeline:
         first, count = 0, len(arrivals)
         if count:
             until = max(until, arrivals[-1].received)
-        while (tick := self._ticks.after(self.now)) <= until:
-            last = _first_after(arrivals, tick, first)
+        trigger = self._next_trigger(arrivals, 0)
+        while True:
+            tick = self._ticks.after(self.now)
+            sampled = arrivals[trigger : trigger + 1] if trigger < count and arrivals[trigger].received <= tick else ()
+            if sampled:
+                tick = arrivals[trigger].received
+                last = trigger + 1
+                trigger = self._next_trigger(arrivals, last)
+            elif tick <= until:
+                last = _first_after(arrivals, tick, first)
+            else:
+                break
             if last > first:
                 yield Insert(arrivals[first:last], None)
                 first = last
             self.now = tick
-            yield Tick(tick)
+            yield Tick(tick, sampled)
         if first < count:
             yield Insert(arrivals[first:], None)
         self.now = max(self.now, until)
+
+    def _next_trigger(self, arrivals: Sequence[Arrival], first: int) -> int:
+        """The index of the next arrival, from `first` on, that is evaluated at its own time; else their number."""
+        triggers = self._ticks.triggers
+        if not triggers:
+            return len(arrivals)
+        return next((at for at in range(first, len(arrivals)) if arrivals[at].stream in triggers), len(arrivals))
 
     def gap(self, time: int) -> Iterator[Step]:
         """The shell found that time stood still or jumped: go on from `time` without the ticks between."""
@@ -175,6 +213,9 @@ class DataTimeline:
         self._waiting: list[tuple[int, int, Arrival]] = []
         """A heap by stamp and order of arrival."""
         self._waiting_bytes = 0
+        self._triggers: frozenset[str] = frozenset()
+        self._trigger_stamps: list[int] = []
+        """A heap: of what waits, the stamps of samples that are evaluated at their own times."""
         self._number = 0
         self._some_client: str | None = None
         self._several_clients = False
@@ -227,10 +268,34 @@ class DataTimeline:
                 yield Insert((arrival,), (stamp,))
             else:
                 self._wait(arrival, stamp)
-            while (tick := self._ticks.after(self.now)) <= newest - self._lateness:
-                self.now, self._ticked = tick, True
-                yield from self._release(tick)
-                yield Tick(tick)
+            yield from self._run_up_to(newest - self._lateness)
+
+    def _run_up_to(self, limit: int) -> Iterator[Step]:
+        """The ticks up to there, those for samples included."""
+        while True:
+            tick = self._ticks.after(self.now)
+            trigger = self._next_trigger()
+            if trigger is not None and trigger <= min(tick, limit):
+                tick = trigger
+            elif tick > limit:
+                return
+            self.now, self._ticked = tick, True
+            sampled: list[Arrival] = []
+            for insert in self._release(tick):
+                yield insert
+                pairs = zip(insert.arrivals, insert.times or (), strict=True)
+                sampled += [each for each, time in pairs if time == tick and each.stream in self._ticks.triggers]
+            yield Tick(tick, sampled)
+
+    def _next_trigger(self) -> int | None:
+        """The earliest stamp of what waits that is evaluated at its own time."""
+        if self._triggers is not self._ticks.triggers:  # the rules changed
+            self._triggers = self._ticks.triggers
+            self._trigger_stamps = [stamp for stamp, _, each in self._waiting if each.stream in self._triggers]
+            heapq.heapify(self._trigger_stamps)
+        while self._trigger_stamps and self._trigger_stamps[0] <= self.now:
+            heapq.heappop(self._trigger_stamps)
+        return self._trigger_stamps[0] if self._trigger_stamps else None
 
     def gap(self, time: int) -> Iterator[Step]:
         """Steps and stalls of the wall clock do not touch the time of the data."""
@@ -272,6 +337,8 @@ class DataTimeline:
         self._number += 1
         self._waiting_bytes += len(arrival.payload) + SAMPLE_OVERHEAD
         heapq.heappush(self._waiting, (stamp, self._number, arrival))
+        if arrival.stream in self._triggers:
+            heapq.heappush(self._trigger_stamps, stamp)
 
     def _release(self, until: int | None) -> Iterator[Insert]:
         """What waits with a stamp up to `until` (None: all), in order."""

@@ -6,6 +6,8 @@ events, byte by byte. Any other recording is a series of messages; its replay gi
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +16,7 @@ from typing import Any
 
 from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
 from detector.engine.demands import Demand, from_task, to_task
-from detector.engine.engine import Engine
+from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.events import Event
 from detector.engine.open_episodes import OpenEpisode, from_document
 from detector.engine.plugins import PluginHost
@@ -84,6 +86,16 @@ class Replay:
         for part, time in self._tick_by_tick(arrivals, until):
             self._note(self._engine.advance(part, time))
 
+    @property
+    def engine(self) -> Engine:
+        """The engine that is driven."""
+        return self._engine
+
+    def ask(self, rule: str) -> None:
+        """Somebody asked a rule; with other rules than were recorded, it may not be there to answer."""
+        with contextlib.suppress(NoAnswerError):
+            self._note(self._engine.ask(rule)[0])
+
     def gap(self, time: int) -> None:
         """Time went on without ticks."""
         self._note(self._engine.gap(time))
@@ -118,11 +130,19 @@ class Replay:
             yield from (((arrival,), until) for arrival in arrivals)
             return
         first = 0
-        while (tick := self._engine.next_tick()) <= until:
+        while (tick := self._next(arrivals, first)) <= until:
             last = bisect_right(arrivals, tick, first, key=itemgetter(0))
             yield arrivals[first:last], tick
             first = last
         yield arrivals[first:], until
+
+    def _next(self, arrivals: Sequence[Arrival], first: int) -> int:
+        """When the engine evaluates next: at a tick, or with one of the samples from `first` on."""
+        tick, triggers = self._engine.next_tick(), self._engine.triggers
+        if not triggers:
+            return tick
+        ripe = itertools.takewhile(lambda each: each.received < tick, itertools.islice(arrivals, first, None))
+        return next((each.received for each in ripe if each.stream in triggers), tick)
 
     def _note(self, events: list[Event]) -> None:
         self.outcome.events += events
@@ -222,6 +242,12 @@ def _control(
                 replay.set_rules(_rules(document))
         case "gap":
             replay.gap(record.time)
+        case "level":
+            replay.engine.set_level(int(document["level"]))
+        case "paused":
+            replay.engine.set_paused(frozenset(document["rules"]))
+        case "ask":
+            replay.ask(str(document["rule"]))
         case "cut":
             outcome.cut = True
         case "lost":

@@ -50,3 +50,17 @@ def test_count_sequence_escalation_and_absence() -> None:
         "stopping-lasts car started 22",
         "no-hazard-lights car started 6",
     }, told
+
+
+def test_the_ways_to_evaluate() -> None:
+    rules = [EventRule.model_validate(each) for each in documents("When a rule is evaluated")]
+    drive = Drive(detector(), *rules)
+    samples = [arrival(seconds, "car", {"v": v}, "speed") for seconds, v in ((0.05, 5), (0.25, 40), (0.95, 5))]
+    told = drive.take(*samples, until=1)
+    assert told == [
+        "every-100-ms car started 0.3",
+        "each-sample car started 0.55",
+        "each-sample car Until 0.95",
+        "every-100-ms car Until 1",
+    ]
+    assert [each.when for each in drive.engine.ask("when-asked")[1]] == [False]

@@ -23,6 +23,7 @@ from wayside.api.base import (
 )
 from wayside.api.classification import Classification
 from wayside.api.constants import Constants
+from wayside.api.evaluation import Evaluation
 from wayside.api.model import ModelSource
 from wayside.api.plugin import SignalPlugin
 from wayside.api.scopes import ClientScope, Each, Scope
@@ -57,24 +58,6 @@ WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE, Aggregate.ACTIVE})
 
 WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE, Aggregate.ACTIVE}
 """The aggregates that need `over`."""
-
-
-class Evaluation(Model):
-    """When the rule is evaluated."""
-
-    model_config = validations(
-        ("duration(self.every) >= duration('10ms')", "every: give 10ms or more"),
-    )
-
-    every: Duration = Field(
-        default=Duration("1s"), description="The rule is evaluated at each whole multiple of this; 10ms at the least."
-    )
-
-    @model_validator(mode="after")
-    def _not_too_often(self) -> Evaluation:
-        if self.every.ns < 10_000_000:
-            raise ValueError(f"every: {self.every} is too short: give 10ms or more")
-        return self
 
 
 class Signal(Model):
@@ -195,7 +178,9 @@ class EventRuleSpec(Model):
     enabled: bool = Field(
         default=True, description="false: the rule is loaded and checked, but not evaluated; open episodes end."
     )
-    dry_run: bool = Field(default=False, description="true: events are published, but no action runs.")
+    dry_run: bool = Field(
+        default=False, description="true: events are published, marked with dryRun, but no action runs."
+    )
     scope: Scope = Field(default=Scope(client=ClientScope()), description="Whom the rule is about.")
     each: Each | None = Field(default=None, description="Evaluate the rule once for each of these elements.")
     evaluation: Evaluation = Field(default=Evaluation(), description="When the rule is evaluated.")
@@ -219,6 +204,12 @@ class EventRuleSpec(Model):
     )
     cooldown: Duration = Field(
         default=Duration("0s"), description="After an episode its subject rests this long; no onset falls into it."
+    )
+    max_episodes_per_hour: int | None = Field(
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="So many episodes of a client may start within an hour; further ones are left out, and counted.",
     )
     unknown_timeout: Duration | None = Field(
         default=None,

@@ -174,7 +174,8 @@ class CompiledRule:
     plugins: tuple[CompiledPlugin, ...]
     when: Expression
     until: Expression | None
-    every_ns: int
+    every_ns: int | None
+    """None: it is evaluated with samples or on demand."""
     for_ns: int
     cooldown_ns: int
     unknown_timeout_ns: int
@@ -188,6 +189,12 @@ class CompiledRule:
     parameters: Parameters = NO_PARAMETERS
     models: tuple[CompiledModel, ...] = ()
     """The signals that models compute."""
+    on_sample: str | None = None
+    """The stream with whose samples it is evaluated."""
+    on_demand: bool = False
+    priority: int = 0
+    maximum_per_hour: int | None = None
+    """So many episodes of a client may start within an hour."""
 
     @property
     def common_signals(self) -> tuple[CompiledSignal, ...]:

@@ -149,6 +149,8 @@ class _RuleCompiler:
         signals = [self._signal(index, signal) for index, signal in enumerate(self.spec.signals)]
         models = compile_models(self, [signal for signal in signals if signal is not None])
         plugins = [(each.name, each.plugin) for each in self.spec.signals if each.plugin is not None]
+        if self.spec.evaluation.on_sample is not None:
+            self.stream(("spec", "evaluation", "onSample"), self.spec.evaluation.on_sample)
         environment = condition_environment(self.spec)
         when = self.condition(("spec", "when"), self.spec.when, environment)
         until = self.condition(("spec", "until"), self.spec.until, environment)
@@ -171,7 +173,7 @@ class _RuleCompiler:
             plugins=tuple(CompiledPlugin(name, plugin.name, plugin.parameters) for name, plugin in plugins),
             when=when,
             until=until,
-            every_ns=spec.evaluation.every.ns,
+            every_ns=spec.evaluation.period_ns,
             for_ns=spec.for_.ns,
             cooldown_ns=spec.cooldown.ns,
             unknown_timeout_ns=(spec.unknown_timeout or self.detector.spec.client_timeout).ns,
@@ -183,6 +185,10 @@ class _RuleCompiler:
             elements=elements,
             parameters=self.parameters,
             models=models,
+            on_sample=spec.evaluation.on_sample,
+            on_demand=bool(spec.evaluation.on_demand),
+            priority=spec.evaluation.priority,
+            maximum_per_hour=spec.max_episodes_per_hour,
         )
 
     def _signal(self, index: int, signal: Signal) -> CompiledSignal | None:

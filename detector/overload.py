@@ -1,0 +1,36 @@
+"""When the evaluation falls behind, and when it has caught up: how much is left out, from what a look took. Pure.
+
+A look that took long means that ticks are overdue: the level rises by one at once. It falls by one after each ten
+seconds without such a look. What a level means, `detector/engine/load.py` says.
+"""
+
+from __future__ import annotations
+
+LONG = 250_000_000
+"""Nanoseconds that the evaluation of what had come may take; from 1 s on, ticks are lost."""
+
+CALM = 10 * 10**9
+"""Nanoseconds without a long look after which one level is taken back."""
+
+
+class Overload:
+    """Follows how long the looks at the intake take."""
+
+    def __init__(self) -> None:
+        self.level = 0
+        self._since = 0
+        """When the last long look, or the last step down, was."""
+
+    def observe(self, now: int, spent: int, highest: int) -> bool:
+        """A look ended `now` that took `spent` nanoseconds; returns whether the level changed.
+
+        `highest`: the level beyond which nothing more can be left out.
+        """
+        before = self.level = min(self.level, highest)
+        if spent > LONG:
+            self._since = now
+            self.level = min(self.level + 1, highest)
+        elif self.level and now - self._since >= CALM:
+            self._since = now
+            self.level -= 1
+        return self.level != before
