@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import Any
 
 from tests.reference.aggregates import NOTHING
-from tests.reference.episodes import Break, Episode, Seen, Truth, episodes
+from tests.reference.episodes import Break, Episode, Seen, Truth, episodes, wakes
+from tests.reference.scopes import Look, Subject, both, looks, text
 from tests.reference.signals import Sources, Start, nanoseconds, truth
 from tests.reference.world import SECOND, Sample, World
-
-MEMBER = ("client", "labels", "streams")
 
 
 @dataclass(frozen=True)
@@ -34,7 +30,7 @@ class Rule:
 
     name: str
     spec: dict[str, Any]
-    history: dict[tuple[str, ...], list[Seen | Break]] = field(default_factory=dict)
+    history: dict[Subject, list[Seen | Break]] = field(default_factory=dict)
     looked: dict[str, list[int]] = field(default_factory=dict)
     """The ticks at which a client was looked at since it is known."""
 
@@ -43,13 +39,37 @@ class Rule:
         """Its period."""
         return nanoseconds(self.spec.get("evaluation", {}).get("every", "1s"))
 
-    def episodes(self, subject: tuple[str, ...], client_timeout: int) -> list[Episode]:
+    @property
+    def on_sample(self) -> str | None:
+        """The stream with whose samples it is evaluated."""
+        stream: str | None = self.spec.get("evaluation", {}).get("onSample")
+        return stream
+
+    def episodes(self, subject: Subject, client_timeout: int) -> list[Episode]:
         """All episodes of a subject until now."""
-        times = [nanoseconds(self.spec.get(name, "0s")) for name in ("for", "cooldown")]
+        return episodes(self.history.get(subject, []), *self._times(client_timeout))
+
+    def wakes(self, client_timeout: int) -> set[int]:
+        """When one of the times of any subject is over."""
+        return {time for history in self.history.values() for time in wakes(history, *self._times(client_timeout))}
+
+    def waking(self, now: int, client_timeout: int) -> set[Subject]:
+        """The subjects of which one of the times is over just now."""
+        times = self._times(client_timeout)
+        return {subject for subject, history in self.history.items() if now in wakes(history, *times)}
+
+    def _times(self, client_timeout: int) -> tuple[int, int, int]:
+        hold, cooldown = (nanoseconds(self.spec.get(name, "0s")) for name in ("for", "cooldown"))
         unknown = self.spec.get("unknownTimeout")
-        return episodes(
-            self.history.get(subject, []), *times, client_timeout if unknown is None else nanoseconds(unknown)
-        )
+        return hold, cooldown, client_timeout if unknown is None else nanoseconds(unknown)
+
+
+@dataclass(frozen=True)
+class Whom:
+    """Those that a rule is evaluated for: who belongs to one of the clients, and the subjects that wake."""
+
+    clients: set[str]
+    subjects: set[Subject]
 
 
 class Reference:
@@ -85,10 +105,15 @@ class Reference:
         if self.lateness is not None:
             self.newest = max(self.newest, sample.time)
             self.advance(self.newest - self.lateness)
+        elif sample.stream in self._triggers():
+            self.advance(sample.time)
 
     def _begins(self, stamp: int) -> bool:
         """Time begins with the first stamp; until a tick has run, with an earlier one that `lateness` covers."""
         return not self.ticked and (self.newest < 0 or self.newest - (self.lateness or 0) <= stamp <= self.now)
+
+    def _triggers(self) -> set[str]:
+        return {rule.on_sample for rule in self.rules if rule.on_sample is not None}
 
     def _enter(self, until: int) -> None:
         """Nobody sees a sample before its time."""
@@ -99,12 +124,21 @@ class Reference:
 
     def advance(self, until: int) -> None:
         """Run the ticks up to here."""
-        while (tick := min(self.now - self.now % period + period for period in self._periods())) <= until:
+        while (tick := min(self._next_ticks())) <= until:
             self.now, self.ticked = tick, True
+            triggers = self._triggers()
+            sampled = {(s.stream, s.client) for s in self.waiting if s.time == tick and s.stream in triggers}
             self._enter(tick)
-            self._tick()
+            self._tick(sampled)
         if self.lateness is None:
             self.now = max(self.now, until)
+
+    def _next_ticks(self) -> set[int]:
+        """When it may be the turn of a rule."""
+        regular = {self.now - self.now % period + period for period in self._periods()}
+        samples = {each.time for each in self.waiting if each.stream in self._triggers()}
+        wakes = {time for rule in self.rules if rule.on_sample for time in rule.wakes(self.world.timeout)}
+        return {time for time in regular | samples | wakes if time > self.now}
 
     def gap(self, time: int) -> None:
         """Time goes on from here without the ticks between."""
@@ -116,43 +150,55 @@ class Reference:
                 history.append(Break(time, lost=False))
 
     def _periods(self) -> set[int]:
-        return {SECOND, *(rule.every for rule in self.rules if rule.spec.get("enabled", True))}
+        regular = (rule for rule in self.rules if rule.spec.get("enabled", True) and rule.on_sample is None)
+        return {SECOND, *(rule.every for rule in regular)}
 
-    def _tick(self) -> None:
-        lost = self.world.lose(self.now)
-        self.starts = [_without(each, lost) for each in self.starts]
+    def _tick(self, sampled: set[tuple[str, str]]) -> None:
+        """`sampled` has the streams and clients of the samples of this very time."""
+        regular = any(self.now % period == 0 for period in self._periods())
+        if regular:
+            lost = self.world.lose(self.now)
+            self.starts = [_without(each, lost) for each in self.starts]
+            for rule in self.rules:
+                for client in lost:
+                    rule.looked.pop(client, None)
         for rule in self.rules:
-            for client in lost:
-                rule.looked.pop(client, None)
-        for rule in self.rules:
-            if rule.spec.get("enabled", True) and self.now % rule.every == 0:
-                self._evaluate(rule)
-
-    def _evaluate(self, rule: Rule) -> None:
-        for client in self.world.known:
-            rule.looked.setdefault(client, []).append(self.now)
-        views = {client: self._view(rule, client) for client in sorted(self.world.known)}
-        found = {subject: (seen, values) for subject, seen, values in self._subjects(rule, views)}
-        told: list[Told] = []
-        for subject in {*found, *rule.history}:
-            is_lost = any(client not in self.world.known for client in subject)
-            if subject not in found and not is_lost:
+            if not rule.spec.get("enabled", True):
                 continue
-            timeout = self.world.timeout
+            if rule.on_sample is not None:
+                clients = {client for stream, client in sampled if stream == rule.on_sample}
+                self._evaluate(rule, Whom(clients, rule.waking(self.now, self.world.timeout)), lose=regular)
+            elif self.now % rule.every == 0:
+                self._evaluate(rule, None, lose=True)
+
+    def _evaluate(self, rule: Rule, whom: Whom | None, *, lose: bool) -> None:
+        timeout = self.world.timeout
+        found: dict[Subject, tuple[Seen | Break, dict[str, Any]]] = {}
+        if lose:
+            for subject in rule.history:
+                if any(client not in self.world.known for client in subject[0]):
+                    found[subject] = (Break(self.now, lost=True), {})
+        if whom is None or whom.clients or whom.subjects:
+            for client in self.world.known:
+                rule.looked.setdefault(client, []).append(self.now)
+            for look in looks(rule.spec, self.world, self.now, lambda client: self._view(rule, client)):
+                if whom is None or look.subject in whom.subjects or whom.clients & {*(look.subject[0] or whom.clients)}:
+                    found[look.subject] = (self._seen(rule, look), look.values)
+        told: list[tuple[Told, tuple[str, ...]]] = []
+        for subject, (seen, values) in found.items():
             before = rule.episodes(subject, timeout)
-            seen, values = (Break(self.now, lost=True), {}) if is_lost else found[subject]
             rule.history.setdefault(subject, []).append(seen)
             after = rule.episodes(subject, timeout)
             if len(after) > len(before):
-                told.append(Told(rule.name, "+".join(subject), self.now, after[-1].onset, "", values))
+                told.append((Told(rule.name, text(subject), self.now, after[-1].onset, "", values), subject[0]))
             elif after and before and after[-1].end != before[-1].end:
-                told.append(Told(rule.name, "+".join(subject), self.now, after[-1].onset, after[-1].reason, values))
-        self.told += sorted(told, key=lambda each: each.subject)
-        for each in sorted(told, key=lambda each: each.subject):
-            if not each.reason:
-                clients = tuple(each.subject.split("+"))
-                message = {"subject": each.subject, "subjects": list(clients), "values": each.values}
-                self.starts.append(Start(rule.name, self.now, clients, message))
+                last = after[-1]
+                told.append((Told(rule.name, text(subject), self.now, last.onset, last.reason, values), subject[0]))
+        for event, clients in sorted(told, key=lambda each: each[0].subject):
+            self.told.append(event)
+            if not event.reason:
+                message = {"subject": event.subject, "subjects": list(clients), "values": event.values}
+                self.starts.append(Start(rule.name, self.now, clients or None, message))
 
     def _view(self, rule: Rule, client: str) -> dict[str, Any]:
         sources = Sources(self.world, self.starts, self._open(), self._keep)
@@ -167,7 +213,7 @@ class Reference:
     def _open(self) -> dict[str, list[tuple[str, ...] | None]]:
         return {
             rule.name: [
-                subject
+                subject[0] or None
                 for subject in rule.history
                 if any(each.end is None for each in rule.episodes(subject, self.world.timeout))
             ]
@@ -175,47 +221,10 @@ class Reference:
             if rule.spec.get("enabled", True)
         }
 
-    def _subjects(
-        self, rule: Rule, views: dict[str, dict[str, Any]]
-    ) -> Iterator[tuple[tuple[str, ...], Seen, dict[str, Any]]]:
-        names = [signal["name"] for signal in rule.spec.get("signals", [])]
-        scope = rule.spec.get("scope", {"client": {}})
-        if "client" in scope:
-            for client, view in views.items():
-                in_scope = truth(scope["client"].get("where"), view, MEMBER)
-                yield (client,), self._seen(rule, view, (*MEMBER, *names), in_scope, near=True), _only(view, names)
-            return
-        pairs = scope["pairs"]
-        places = {client: place for client in views if (place := self._place(pairs["position"], client)) is not None}
-        for client, place in places.items():
-            views[client]["position"] = dict(zip("xyz", place, strict=True))
-        for a, b in combinations(views, 2):
-            variables: dict[str, Any] = {"a": views[a], "b": views[b]}
-            near: Truth = None
-            if a in places and b in places:
-                variables["distance"] = math.dist(places[a], places[b])
-                near = variables["distance"] <= pairs["within"]
-            in_scope = truth(pairs.get("where"), variables, ("a", "b", "distance"))
-            seen = self._seen(rule, variables, ("a", "b", "distance"), in_scope, near)
-            values = {role: _only(variables[role], ["client", "position", *names]) for role in ("a", "b")}
-            yield (a, b), seen, {**_only(variables, ["distance"]), **values}
-
-    def _place(self, position: dict[str, str], client: str) -> tuple[float, float, float] | None:
-        mine = self.world.of(client, position["stream"], self.now)
-        if not self.world.fresh(client, position["stream"], self.now):
-            return None
-        message = mine[-1].message
-        axes = [message.get(position[axis].removeprefix("msg.")) for axis in ("x", "y")]
-        if not all(isinstance(axis, float) and abs(axis) <= 1e12 for axis in axes):
-            return None
-        return (axes[0], axes[1], 0.0)
-
-    def _seen(
-        self, rule: Rule, variables: dict[str, Any], names: tuple[str, ...], in_scope: Truth, near: Truth
-    ) -> Seen:
-        when = truth(rule.spec["when"], variables, names)
-        until = truth(rule.spec["until"], variables, names) if "until" in rule.spec else _not(when)
-        return Seen(self.now, _all(in_scope, near, when, _not(until)), in_scope, until)
+    def _seen(self, rule: Rule, look: Look) -> Seen:
+        when = truth(rule.spec["when"], look.variables, look.names)
+        until = truth(rule.spec["until"], look.variables, look.names) if "until" in rule.spec else _not(when)
+        return Seen(self.now, both(look.in_scope, look.near, when, _not(until)), look.in_scope, until)
 
 
 def _in_order(rules: dict[str, dict[str, Any]]) -> list[str]:
@@ -238,13 +247,5 @@ def _without(start: Start, lost: set[str]) -> Start:
     return Start(start.rule, start.time, left, start.message)
 
 
-def _only(view: dict[str, Any], names: list[str]) -> dict[str, Any]:
-    return {name: view[name] for name in names if name in view}
-
-
 def _not(value: Truth) -> Truth:
     return None if value is None else not value
-
-
-def _all(*values: Truth) -> Truth:
-    return False if False in values else None if None in values else True

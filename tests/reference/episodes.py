@@ -68,12 +68,38 @@ def episodes(history: list[Seen | Break], hold: int, cooldown: int, unknown_time
             return found
 
 
+def wakes(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout: int) -> set[int]:
+    """When one of the subject's times is over."""
+    found = episodes(history, hold, cooldown, unknown_timeout)
+    rests_until = 0
+    if found:
+        last = found[-1]
+        if last.end is None:
+            since = [each for each in history if each.time > last.start]
+            unknown = since and isinstance(since[-1], Seen) and since[-1].until is None
+            return {_unknown_since(since, "until") + unknown_timeout} if unknown else set()
+        rests_until = last.end + cooldown
+        history = [each for each in history if each.time > (last.end or 0)]
+    onset = _pending(history, hold, rests_until)
+    if onset is None:
+        return {rests_until}
+    last_seen = history[-1]
+    unknown = isinstance(last_seen, Seen) and last_seen.condition is None
+    return {onset + hold, *([_unknown_since(history, "condition") + hold + 1] if unknown else [])}
+
+
 def _onset(history: list[Seen | Break], hold: int, rests_until: int) -> int | None:
     """When the condition began to hold, if it has done so for long enough at the end of the history."""
-    since: int | None = None
     last = history[-1]
     if not isinstance(last, Seen) or last.condition is not True:
         return None
+    since = _pending(history, hold, rests_until)
+    return since if since is not None and last.time - since >= hold else None
+
+
+def _pending(history: list[Seen | Break], hold: int, rests_until: int) -> int | None:
+    """When the condition began to hold, if it does or has been unknown for no longer than `hold`."""
+    since: int | None = None
     for index, each in enumerate(history):
         if isinstance(each, Break) or each.condition is False:
             since = None
@@ -82,7 +108,7 @@ def _onset(history: list[Seen | Break], hold: int, rests_until: int) -> int | No
                 since = each.time
         elif since is not None and each.time - _unknown_since(history[: index + 1], "condition") > hold:
             since = None
-    return since if since is not None and last.time - since >= hold else None
+    return since
 
 
 def _unknown_since(history: list[Seen | Break], what: Literal["condition", "until"]) -> int:

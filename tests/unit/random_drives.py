@@ -136,26 +136,45 @@ _FORMS = (
 def _conditions(variables: list[str]) -> st.SearchStrategy[str]:
     """The distance is known to be a number, so what is said of strings and booleans would not compile."""
     simple = st.sampled_from(variables).flatmap(
-        lambda name: st.sampled_from(_FORMS[:8] if name == "distance" else _FORMS).map(lambda form: form.format(name))
+        lambda name: st.sampled_from(_FORMS[:8] if name in ("distance", "closingSpeed") else _FORMS).map(
+            lambda form: form.format(name)
+        )
     )
     joined = st.builds(lambda one, by, other: f"({one}) {by} ({other})", simple, st.sampled_from(["&&", "||"]), simple)
     return st.one_of(simple, joined)
 
+
+_POSITION = {"stream": "pose", "x": "msg.x", "y": "msg.y"}
 
 _scopes = st.sampled_from(
     [
         None,
         None,
         {"client": {"where": '"speed" in streams'}},
-        {"pairs": {"position": {"stream": "pose", "x": "msg.x", "y": "msg.y"}, "within": 5}},
+        {"pairs": {"position": _POSITION, "within": 5}},
+        {"pairs": {"position": _POSITION, "within": 10, "where": '"speed" in a.streams || distance < 5'}},
+        {"pairs": {"position": _POSITION, "within": 10, "a": {"where": '"speed" in streams'}}},
         {
             "pairs": {
-                "position": {"stream": "pose", "x": "msg.x", "y": "msg.y"},
-                "within": 10,
-                "where": '"speed" in a.streams || distance < 5',
+                "position": _POSITION,
+                "within": 60,
+                "a": {"where": "client != 'b'"},
+                "b": {"where": '"pose" in streams'},
+                "where": "closingSpeed < 50",
             }
         },
+        {"fleet": {"members": "s > 1"}},
+        {"fleet": {"members": '"speed" in streams'}},
     ]
+)
+
+_OF_A_FLEET = (
+    "size(members) > 1",
+    "size(members) > 0",
+    "size(members) == 0",
+    "members.exists(m, m.s > 2)",
+    "members.all(m, m.s > 1)",
+    "members.exists(m, m.client == 'a')",
 )
 
 
@@ -167,14 +186,33 @@ def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
     if scope is not None:
         spec["scope"] = scope
     if scope is not None and "pairs" in scope:
-        names = [f"{role}.{name}" for name in names for role in "ab"] + ["distance"]
-    spec["when"] = draw(_conditions(names))
+        names = [f"{role}.{name}" for name in names for role in "ab"] + ["distance", "closingSpeed"]
+    conditions = _conditions(names)
+    if scope is not None and "fleet" in scope:
+        conditions = st.sampled_from(_OF_A_FLEET)
+    if draw(st.integers(0, 4)) == 0:
+        spec["each"] = {"as": "site", "of": [{"name": "n", "limit": 1.5}, {"name": "m", "limit": 0}]}
+        alone = conditions
+        conditions = st.builds(
+            lambda one, other: f"({one}) && ({other})",
+            alone,
+            st.sampled_from(["site.limit > 1", "site.name == 'm'", "site.limit >= 0"]),
+        )
+    spec["when"] = draw(conditions)
     if draw(st.booleans()):
-        spec["until"] = draw(_conditions(names))
+        spec["until"] = draw(conditions)
     for field in ("for", "cooldown", "unknownTimeout"):
         if draw(st.booleans()):
             spec[field] = draw(st.sampled_from(DURATIONS))
-    spec["evaluation"] = {"every": draw(st.sampled_from(("500ms", "1s", "1s", "2s")))}
+    if draw(st.integers(0, 3)):
+        spec["evaluation"] = {"every": draw(st.sampled_from(("500ms", "1s", "1s", "2s")))}
+    else:
+        spec["evaluation"] = {"onSample": draw(st.sampled_from(("speed", "speed", "pose")))}
+    if scope is not None or "onSample" in spec["evaluation"]:
+        # Whether a sample that has left the buffer was seen depends on who was looked at meanwhile.
+        for signal in spec["signals"]:
+            if signal.get("aggregate") == "Age":
+                signal.pop("where", None)
     return spec
 
 

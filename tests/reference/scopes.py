@@ -1,0 +1,155 @@
+"""Whom a rule is about, and what its conditions see of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any
+
+from tests.reference.episodes import Truth
+from tests.reference.signals import truth
+from tests.reference.world import SECOND, World
+
+MEMBER = ("client", "labels", "streams")
+
+Subject = tuple[tuple[str, ...], str | None]
+"""Clients, and the element."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """A subject, and what is to be seen of it."""
+
+    subject: Subject
+    variables: dict[str, Any]
+    names: tuple[str, ...]
+    in_scope: Truth
+    near: Truth
+    values: dict[str, Any]
+
+
+def text(subject: Subject) -> str:
+    """As in events."""
+    clients, element = subject
+    return ("+".join(clients) or "~fleet") + ("" if element is None else f"~{element}")
+
+
+def _says(spec: dict[str, Any], word: str) -> bool:
+    """Whether a condition of the rule has the word."""
+    return any(word in str(spec.get(field, "")) for field in ("when", "until", "scope"))
+
+
+def looks(spec: dict[str, Any], world: World, now: int, view: Callable[[str], dict[str, Any]]) -> Iterator[Look]:
+    """All subjects that a rule can be about now."""
+    views = {client: view(client) for client in sorted(world.known)}
+    signals = [signal["name"] for signal in spec.get("signals", [])]
+    each = spec.get("each")
+    for element in [None] if each is None else each["of"]:
+        extra = {} if element is None else {each["as"]: element}
+        name = None if element is None else element["name"]
+        scope = spec.get("scope", {"client": {}})
+        if "client" in scope:
+            yield from _clients(scope["client"], views, signals, extra, name)
+        elif "pairs" in scope:
+            pairs = {**scope["pairs"], "closing": _says(spec, "closingSpeed")}
+            yield from _pairs(pairs, views, signals, extra, name, world, now)
+        else:
+            yield _fleet(scope["fleet"], views, signals, extra, name)
+
+
+def _clients(
+    scope: dict[str, Any],
+    views: dict[str, dict[str, Any]],
+    signals: list[str],
+    extra: dict[str, Any],
+    element: str | None,
+) -> Iterator[Look]:
+    for client, view in views.items():
+        variables = {**view, **extra}
+        in_scope = truth(scope.get("where"), variables, (*MEMBER, *extra))
+        yield Look(((client,), element), variables, (*MEMBER, *signals, *extra), in_scope, True, only(view, signals))
+
+
+def _fleet(
+    scope: dict[str, Any],
+    views: dict[str, dict[str, Any]],
+    signals: list[str],
+    extra: dict[str, Any],
+    element: str | None,
+) -> Look:
+    names = (*MEMBER, *signals, *extra)
+    members = [view for view in views.values() if truth(scope["members"], {**view, **extra}, names) is True]
+    values = {
+        "count": float(len(members)),
+        "members": [only(view, ["client", *signals]) for view in members],
+    }
+    return Look(((), element), {"members": members, **extra}, ("members", *extra), True, True, values)
+
+
+def _pairs(
+    scope: dict[str, Any],
+    views: dict[str, dict[str, Any]],
+    signals: list[str],
+    extra: dict[str, Any],
+    element: str | None,
+    world: World,
+    now: int,
+) -> Iterator[Look]:
+    ordered = "a" in scope or "b" in scope
+    places = {client: _place(scope["position"], client, world, now, now) for client in views}
+    earlier = {client: _place(scope["position"], client, world, now - SECOND, now) for client in views}
+    placed = {
+        client: view if places[client] is None else {**view, "position": dict(zip("xyz", places[client], strict=True))}
+        for client, view in views.items()
+    }
+    names = ("a", "b", "distance", "closingSpeed", *extra)
+    for a, b in permutations(views, 2):
+        if not ordered and a > b:
+            continue
+        variables: dict[str, Any] = {"a": placed[a], "b": placed[b], **extra}
+        near: Truth = None
+        distance, before = _distance(places[a], places[b]), _distance(earlier[a], earlier[b])
+        if distance is not None:
+            variables["distance"] = distance
+            near = distance <= scope["within"]
+            if before is not None and scope["closing"]:
+                variables["closingSpeed"] = before - distance
+        roles = [
+            truth(scope[role]["where"], {**views[client], **extra}, (*MEMBER, *extra))
+            for role, client in (("a", a), ("b", b))
+            if role in scope
+        ]
+        in_scope = both(*roles, truth(scope.get("where"), variables, names))
+        values = {role: only(variables[role], ["client", "position", *signals]) for role in ("a", "b")}
+        values |= only(variables, ["distance", "closingSpeed"])
+        yield Look(((a, b), element), variables, names, in_scope, near, values)
+
+
+def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) -> float | None:
+    return None if one is None or other is None else math.dist(one, other)
+
+
+def _place(position: dict[str, str], client: str, world: World, then: int, now: int) -> tuple[float, ...] | None:
+    """Where the client was; of the past, no more than the buffer has and not from before a gap."""
+    mine = [each for each in world.kept(client, position["stream"], now) if each.time <= then]
+    if then < now:
+        mine = [each for each in mine if world.floor is None or each.time > world.floor]
+    limit = world.stale_after[position["stream"]]
+    if not mine or (limit is not None and then - mine[-1].time > limit):
+        return None
+    axes = [mine[-1].message.get(position[axis].removeprefix("msg.")) for axis in ("x", "y")]
+    if not all(isinstance(axis, float) and abs(axis) <= 1e12 for axis in axes):
+        return None
+    return (axes[0], axes[1], 0.0)
+
+
+def only(view: dict[str, Any], names: list[str]) -> dict[str, Any]:
+    """What is known of these."""
+    return {name: view[name] for name in names if name in view}
+
+
+def both(*values: Truth) -> Truth:
+    """Kleene's and."""
+    return False if False in values else None if None in values else True
