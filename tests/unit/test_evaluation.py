@@ -20,6 +20,7 @@ from detector.evaluator import Evaluator
 from detector.overload import CALM, LONG, Overload
 from detector.replay.intake_file import Control
 from detector.replay.replaying import replay_intake
+from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from tests.unit.driving import (
     POSITION,
@@ -256,7 +257,7 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
         recording.control(engine.now, {"kind": "level", "level": wanted})
         engine.set_level(wanted)
 
-    evaluator.start(RuleSet(detector, tuple(rules)), [])
+    evaluator.start(RuleSet(detector, tuple(rules)), Restored())
     for n in range(40):
         clock[0] += SECOND // 4
         payload = b'{"v": %d}' % (20 if (n // 3) % 2 else 5)
