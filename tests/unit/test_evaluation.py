@@ -238,6 +238,9 @@ class Recording:
     def events(self, events: Sequence[Event]) -> None:
         self.said += events
 
+    def open_episodes(self, episodes: Any) -> None:
+        pass
+
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         pass
 
