@@ -9,7 +9,8 @@ import msgspec
 
 from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
-from detector.status.model import Drops, Explanation, Status, to_json
+from detector.sources.supervision import SourceThread
+from detector.status.model import Drops, Explanation, SourceStatus, Status, to_json
 
 _PATIENCE = 5.0
 """Seconds in which the evaluation should have time for a question."""
@@ -21,9 +22,12 @@ _SILENT = 30.0
 class Answers:
     """Answers requests, on whichever thread they come."""
 
-    def __init__(self, evaluator: Evaluator, outlet: Callable[[], LiveOutlet]) -> None:
-        """`outlet` gives the outlet: the network that it has changes with the Detector."""
+    def __init__(
+        self, evaluator: Evaluator, outlet: Callable[[], LiveOutlet], sources: Callable[[], list[SourceThread]]
+    ) -> None:
+        """`outlet` gives the outlet: the network that it has changes with the Detector, as do the `sources`."""
         self._evaluator = evaluator
+        self._sources = sources
         self._outlet = outlet
         self._answers: Mapping[str, Callable[[Mapping[str, str]], bytes]] = {"status": self._status}
 
@@ -41,7 +45,13 @@ class Answers:
             Drops("event_unpublished", "events not published", outlet.network.dropped_events),
             Drops("event_unwritten", "events missing in events.jsonl", outlet.unwritten),
         ]
-        return msgspec.structs.replace(latest, connected=outlet.network.connected, drops=[*latest.drops, *dropped])
+        sources = [
+            SourceStatus(each.source.name, each.source.plugin, each.state.value, each.messages, each.last_error)
+            for each in self._sources()
+        ]
+        return msgspec.structs.replace(
+            latest, connected=outlet.network.connected, drops=[*latest.drops, *dropped], sources=sources
+        )
 
     def healthy(self) -> tuple[bool, bytes]:
         """Whether the evaluation goes on, for /healthz."""

@@ -76,7 +76,7 @@ class Running:
             on_failure=self._fail,
             outages=self._plugins.outages,
         )
-        self.answers = Answers(self._evaluator, lambda: self._outlet)
+        self.answers = Answers(self._evaluator, lambda: self._outlet, lambda: self._sources.threads)
         self._server = None if metrics_port is None else _server(metrics_port, self.answers)
 
         self._evaluator.losses.watch(self._tally)

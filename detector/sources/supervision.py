@@ -145,9 +145,9 @@ class Sources:
             thread.start()
 
     @property
-    def threads(self) -> Mapping[str, SourceThread]:
-        """The sources by name."""
-        return self._threads
+    def threads(self) -> list[SourceThread]:
+        """The sources that run, or ended by themselves; for any thread."""
+        return list(self._threads.values())
 
     def close(self) -> None:
         """Stop all; returns when they have, or after the timeout."""

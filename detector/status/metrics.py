@@ -14,7 +14,7 @@ from detector.status.model import Histogram, RuleState, RuleStatus, Status, Stre
 _PREFIX = "wayside_detector_"
 
 DETECTOR: tuple[tuple[str, type, str, Callable[[Status], float | None]], ...] = (
-    ("connected", GaugeMetricFamily, "1 while a Zenoh router or peer is connected", lambda s: s.connected),
+    ("connected", GaugeMetricFamily, "1 while a Zenoh router, peer or client is connected", lambda s: s.connected),
     ("start_time_seconds", GaugeMetricFamily, "When the detector started, since the epoch", lambda s: s.started),
     ("status_time_seconds", GaugeMetricFamily, "When these numbers were taken, since the epoch", lambda s: s.taken),
     ("evaluated_time_seconds", GaugeMetricFamily, "Up to here all ticks have run, on the time axis", lambda s: s.now),

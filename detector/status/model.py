@@ -141,6 +141,18 @@ class ClientStatus(msgspec.Struct, frozen=True, rename="camel"):
     """Since something was last received from it."""
 
 
+class SourceStatus(msgspec.Struct, frozen=True, rename="camel"):
+    """A source beside Zenoh."""
+
+    name: str
+    plugin: str
+    state: str
+    """Running, Pausing (it failed and is run again), Finished or Stopped."""
+    messages: int
+    """Delivered since the start, or since it was last changed."""
+    last_error: str = ""
+
+
 class Status(msgspec.Struct, frozen=True, rename="camel"):
     """All that a detector says of itself."""
 
@@ -169,7 +181,8 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     explanation: Explanation | None = None
     """Of the one rule that was asked for, if it was evaluated in the meantime."""
     connected: bool = False
-    """Whether a router or peer is connected."""
+    """Whether a router, a peer or a client is connected."""
+    sources: list[SourceStatus] = []
 
 
 def to_json(value: msgspec.Struct) -> bytes:

@@ -43,6 +43,9 @@ def _parts(status: Status) -> Iterator[RenderableType]:
         )
     if status.explanation is None:
         yield streams
+        for source in status.sources:
+            error = f"; the last error: {source.last_error}" if source.last_error else ""
+            yield f"source {source.name} ({source.plugin}): {source.state}, {source.messages} messages{error}"
     rules = _table("rule", "state", "evaluations", "time", "latency", "unknowns", "errors", "open", "started", "ended")
     for rule in status.rules:
         rules.add_row(

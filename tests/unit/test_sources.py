@@ -1,13 +1,20 @@
 """Sources run supervised: started again when they fail, left behind when they hang, changed while running."""
 
+import asyncio
 import threading
+from collections.abc import AsyncIterator
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 from pydantic import BaseModel, ConfigDict
 
+from detector.actions.deploy import DemandReconciler
+from detector.actions.file_store import FileTaskStore
 from detector.assembly import DetectorError, inlets
+from detector.rules.selection import RuleSet
+from detector.running import Running
 from detector.sources import Feed, Source, registry
 from detector.sources.registry import plugin_problems
 from detector.sources.supervision import Sources, SourceThread, State
@@ -151,15 +158,41 @@ def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals
     first = {"name": "first", "plugin": "lasting"}
     second = {"name": "second", "plugin": "lasting"}
     sources.follow(a_detector_of(first, second))
-    kept, changed = sources.threads["first"], sources.threads["second"]
+    kept, changed = sources.threads
     sources.follow(a_detector_of(first, {**second, "parameters": {"text": "new"}}))
-    assert sources.threads["first"] is kept
+    assert sources.threads[0] is kept
     wait_for(lambda: changed.state is State.STOPPED)
     arrivals.wait_for(lambda seen: [payload for _, _, payload in seen].count(b"new") == 1)
     sources.follow(a_detector())
     assert kept.state is State.STOPPED
     assert not sources.threads
     sources.close()
+
+
+def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, second = ({"name": name, "plugin": "lasting"} for name in ("first", "second"))
+    unknown = {"name": "first", "plugin": "unknown"}
+
+    async def changes() -> AsyncIterator[RuleSet]:
+        for sources in ([first, second], [unknown]):
+            yield RuleSet(a_detector_of(*sources), ())
+
+    def states(running: Running) -> list[tuple[str, str, int]]:
+        return [(each.name, each.state, each.messages) for each in running.answers.status().sources]
+
+    async def live() -> None:
+        reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
+        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, None, None, []) as running:
+            await asyncio.to_thread(wait_for, lambda: states(running) == [("first", "Running", 1)])
+            await running.follow(changes())
+            await asyncio.to_thread(
+                wait_for, lambda: states(running) == [("first", "Running", 1), ("second", "Running", 1)]
+            )
+
+    asyncio.run(live())
+    assert "is not followed, the last good one goes on: spec.sources[0].plugin: no plugin unknown" in caplog.text
 
 
 @pytest.mark.parametrize(
