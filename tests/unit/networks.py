@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -60,6 +62,31 @@ def router(**settings: Any) -> Iterator[zenoh.Session]:
         config.insert_json5(path.replace("__", "/"), json.dumps(value))
     with zenoh.open(config) as session:
         yield session
+
+
+_ROUTER = """
+import sys, threading, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"router"')
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("listen/endpoints", f'["{sys.argv[1]}"]')
+session = zenoh.open(config)
+print("up", flush=True)
+threading.Event().wait()
+"""
+
+
+@contextmanager
+def router_process(endpoint: str) -> Iterator[None]:
+    """A Zenoh router in a process of its own, which is killed at the end."""
+    process = subprocess.Popen([sys.executable, "-c", _ROUTER, endpoint], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        yield
+    finally:
+        process.kill()
+        process.wait()
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 10) -> None:

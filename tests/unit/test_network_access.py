@@ -12,12 +12,13 @@ import zenoh
 from pydantic import ValidationError
 
 from detector.access import AccessError, Login, login, tls_files
+from detector.engine.liveliness import LIVELINESS, Token
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
 from tests.unit.certificates import Authority
-from tests.unit.networks import Arrivals, free_endpoint, router, stream, wait_for
+from tests.unit.networks import Arrivals, free_endpoint, router, router_process, stream, wait_for
 from wayside.api.access import Access
-from wayside.api.zenoh import Zenoh
+from wayside.api.zenoh import Zenoh, ZenohMode
 
 
 @pytest.fixture
@@ -208,22 +209,30 @@ def test_samples_in_shared_memory_arrive(endpoint: str, arrivals: Arrivals) -> N
                 assert (sample.payload.as_shm() is not None) == shares
 
 
-def test_a_lost_router_is_said_and_so_is_its_return(
-    endpoint: str,
-    arrivals: Arrivals,
-    caplog: pytest.LogCaptureFixture,
+def test_a_killed_router_is_said_and_so_is_its_return(
+    endpoint: str, arrivals: Arrivals, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    with network(arrivals, mode="client", connect=[endpoint]) as running:
-        with router(listen__endpoints=[endpoint]) as source:
-            assert flows(source, arrivals)
+    client = Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])
+    with network(arrivals, mode="client", connect=[endpoint], liveliness="alive/${client:*}") as running:
+        with router_process(endpoint):
+            vehicle = open_session(client)
+            token = vehicle.liveliness().declare_token("alive/car1")
+            assert flows(vehicle, arrivals)
+            assert running.connected
+            arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", Token.DECLARED.value) in seen)
         wait_for(lambda: not running.connected)
         wait_for(lambda: "is lost, nobody is connected" in caplog.text)
+        arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", Token.UNSURE.value) in seen)
         arrivals.seen.clear()
-        with router(listen__endpoints=[endpoint]) as source:
-            assert flows(source, arrivals)
+        with router_process(endpoint):
+            arrivals.wait_for(lambda seen: seen == [(LIVELINESS, "alive/car1", Token.DECLARED.value)])
+            arrivals.seen.clear()
+            assert flows(vehicle, arrivals)
             assert running.connected
             wait_for(lambda: "connected again" in caplog.text)
+        token.undeclare()
+        vehicle.close()
 
 
 @pytest.mark.parametrize(
