@@ -70,12 +70,13 @@ def flows(source: zenoh.Session, arrivals: Arrivals, payload: Any = "x", within:
     return True
 
 
-def over_tls(endpoint: str) -> str:
-    return endpoint.replace("tcp/127.0.0.1", "tls/localhost")
+def over_tls(endpoint: str, protocol: str = "tls") -> str:
+    return endpoint.replace("tcp/127.0.0.1", f"{protocol}/localhost")
 
 
-def test_data_flows_over_tls(endpoint: str, arrivals: Arrivals, authority: Authority) -> None:
-    at = over_tls(endpoint)
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_data_flows_encrypted(protocol: str, endpoint: str, arrivals: Arrivals, authority: Authority) -> None:
+    at = over_tls(endpoint, protocol)
     with (
         tls_router(at, authority) as source,
         network(arrivals, mode="client", connect=[at], tls={"ca": str(authority.ca)}),

@@ -34,7 +34,13 @@ class Zenoh(Access):
     """The detector's Zenoh session."""
 
     model_config = validations(
-        *ACCESS_VALIDATIONS, ("!has(self.liveliness) || self.liveliness.contains('${client:')", _NO_CLIENT)
+        *ACCESS_VALIDATIONS,
+        ("!has(self.liveliness) || self.liveliness.contains('${client:')", _NO_CLIENT),
+        (
+            "!self.listen.exists(e, e.startsWith('tls/') || e.startsWith('quic/')) || has(self.tlsSecret) || "
+            "(has(self.tls) && has(self.tls.certificate))",
+            _NO_CERTIFICATE,
+        ),
     )
 
     mode: ZenohMode = Field(
