@@ -124,3 +124,17 @@ def test_messages_that_come_together_follow_each_other_from_their_common_time_on
         ("d", 103),
         ("e", 500),
     ]
+
+
+def test_what_should_not_be_dropped_waits_until_there_is_room_but_not_for_ever() -> None:
+    intake = Intake(Clock(1), maximum_bytes=SAMPLE_OVERHEAD)
+    put = intake.patient_putter("tokens", patience=0.02)
+    put([("k", b"first")])
+    put([("k", b"given up")])
+    assert intake.dropped == 1
+    patient = intake.patient_putter("tokens", patience=10)
+    waiting = threading.Thread(target=patient, args=([("k", b"second")],))
+    waiting.start()
+    assert [arrival.payload for arrival in intake.drain(2)] == [b"first"]
+    waiting.join(5)
+    assert [arrival.payload for arrival in intake.drain(3)] == [b"second"]

@@ -10,6 +10,7 @@ import zenoh
 from detector.actions.deploy import DemandReconciler
 from detector.actions.file_store import FileTaskStore
 from detector.assembly import DetectorError, inlets
+from detector.engine import liveliness
 from detector.engine.liveliness import LIVELINESS, Token
 from detector.engine.sample import Arrival
 from detector.replay.intake_file import read_intake
@@ -80,6 +81,14 @@ def test_what_names_no_client_or_means_nothing_is_counted() -> None:
     assert drive.take(*wrong, until=1) == []
     assert drive.engine.counters.unnamed[LIVELINESS] == 2
     assert drive.engine.counters.samples[LIVELINESS] == 0
+
+
+def test_tokens_beyond_the_bound_are_ignored_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(liveliness, "MAXIMUM_TOKENS", 1)
+    drive = Drive(detector(), HERE)
+    both = [alive(0.1, "car1", Token.DECLARED), alive(0.2, "car2", Token.DECLARED)]
+    assert drive.take(*both, until=1) == ["here car1 started 1"]
+    assert drive.engine.counters.crowded[LIVELINESS] == 1
 
 
 def test_when_the_detector_asks_for_other_tokens_the_timeout_decides_about_the_old_ones() -> None:
