@@ -1,8 +1,9 @@
 """The detector enters networks that are guarded: TLS, certificates on both sides, passwords; and shares memory."""
 
+import asyncio
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,15 @@ import zenoh
 from pydantic import ValidationError
 
 from detector.access import AccessError, Login, login, tls_files
+from detector.actions.deploy import DemandReconciler
+from detector.actions.file_store import FileTaskStore
 from detector.engine.liveliness import LIVELINESS, Token
+from detector.rules.selection import RuleSet
+from detector.running import Running
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
 from tests.unit.certificates import Authority
+from tests.unit.driving import a_detector
 from tests.unit.networks import Arrivals, free_endpoint, router, router_process, stream, wait_for
 from wayside.api.access import Access
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -234,6 +240,37 @@ def test_a_killed_router_is_said_and_so_is_its_return(
             wait_for(lambda: "connected again" in caplog.text)
         token.undeclare()
         vehicle.close()
+
+
+def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: str, tmp_path: Path) -> None:
+    other = free_endpoint()
+
+    def at(where: str) -> RuleSet:
+        return RuleSet(a_detector(buffer={"duration": "1h"}, zenoh={"mode": "client", "connect": [where]}), ())
+
+    async def changes() -> AsyncIterator[RuleSet]:
+        yield at(other)
+
+    async def live() -> None:
+        reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
+        with Running(at(endpoint), "h", reconciler, None, None, []) as running:
+
+            def buffered(client: str) -> bool:
+                with open_session(
+                    Zenoh(mode=ZenohMode.CLIENT, connect=[other if client == "car2" else endpoint])
+                ) as car:
+                    car.put(f"vehicles/{client}/pose", "{}")
+                return client in [each.name for each in running.answers.status().clients]
+
+            await asyncio.to_thread(wait_for, lambda: buffered("car1"))
+            await running.follow(changes())
+            await asyncio.to_thread(wait_for, lambda: buffered("car2"))
+            status = running.answers.status()
+            assert [each.name for each in status.clients] == ["car1", "car2"]
+            assert status.streams[0].clients == 2
+
+    with router(listen__endpoints=[endpoint]), router(listen__endpoints=[other]):
+        asyncio.run(live())
 
 
 @pytest.mark.parametrize(
