@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from paho.mqtt.client import Client
 
 from detector.sources.mqtt import topic_filter
 from detector.sources.supervision import SourceThread, State
@@ -42,14 +43,13 @@ def mqtt(
     assert thread.state is State.STOPPED
 
 
-def publish_until(port: int, topic: str, done: Callable[[], object], tls: str | None = None) -> None:
+def publish_until(client: Client, topic: str, done: Callable[[], object]) -> None:
     """The first messages may be sent before the subscription is there."""
-    with publisher(port, tls) as client:
-        deadline = time.monotonic() + 10
-        while not done():
-            assert time.monotonic() < deadline
-            client.publish(topic, b"{}")
-            time.sleep(0.02)
+    deadline = time.monotonic() + 10
+    while not done():
+        assert time.monotonic() < deadline
+        client.publish(topic, b"{}")
+        time.sleep(0.02)
 
 
 def test_messages_arrive_on_their_keys_also_after_the_broker_was_killed(port: int, arrivals: Arrivals) -> None:
@@ -57,8 +57,8 @@ def test_messages_arrive_on_their_keys_also_after_the_broker_was_killed(port: in
     with mqtt(arrivals, tally, port=port) as thread:
         for client in ("car1", "car2"):  # at first there is no broker yet
             wait_for(lambda: thread.state is State.PAUSING)
-            with broker(port):
-                publish_until(port, f"vehicles/{client}/pose", lambda: client in str(arrivals.seen))  # noqa: B023
+            with broker(port), publisher(port) as sender:
+                publish_until(sender, f"vehicles/{client}/pose", lambda: client in str(arrivals.seen))  # noqa: B023
     assert set(arrivals.seen) == {("pose", "vehicles/car1/pose", b"{}"), ("pose", "vehicles/car2/pose", b"{}")}
     failures = [entry for entry in tally.entries() if entry.cause is Cause.FAILED]
     assert [entry.name for entry in failures] == ["broker"]
@@ -67,9 +67,13 @@ def test_messages_arrive_on_their_keys_also_after_the_broker_was_killed(port: in
 
 def test_what_stands_before_the_key_is_taken_off_and_other_topics_are_dropped(port: int, arrivals: Arrivals) -> None:
     tally = Tally()
-    with broker(port), mqtt(arrivals, tally, port=port, prefix="/site/", key="v/${client:car$*}/pose"):
-        publish_until(port, "/site/v/bike1/pose", tally.entries)
-        publish_until(port, "/site/v/car1/pose", lambda: arrivals.seen)
+    with (
+        broker(port),
+        publisher(port) as client,
+        mqtt(arrivals, tally, port=port, prefix="/site/", key="v/${client:car$*}/pose"),
+    ):
+        publish_until(client, "/site/v/bike1/pose", tally.entries)
+        publish_until(client, "/site/v/car1/pose", lambda: arrivals.seen)
     assert {key for _, key, _ in arrivals.seen} == {"v/car1/pose"}
     assert [(entry.cause, entry.last) for entry in tally.entries()] == [(Cause.UNROUTED, "v/bike1/pose")]
 
@@ -90,11 +94,26 @@ def test_over_tls_with_a_password(
             monkeypatch.setenv("MQTT_PASSWORD", "close sesame")
             wait_for(lambda: "refuses the connection" in thread.last_error)
             monkeypatch.setenv("MQTT_PASSWORD", PASSWORD)
-            publish_until(port, "vehicles/car1/pose", lambda: arrivals.seen, str(authority.ca))
+            with publisher(port, str(authority.ca)) as client:
+                publish_until(client, "vehicles/car1/pose", lambda: arrivals.seen)
         stranger = Authority(tmp_path, "stranger")
         with mqtt(arrivals, Tally(), **{**given, "tls": {"ca": str(stranger.ca)}}) as thread:
             wait_for(lambda: "certificate verify failed" in thread.last_error)
     assert "sesame" not in caplog.text
+
+
+def test_with_a_client_id_the_broker_keeps_messages_while_the_detector_is_away(
+    port: int, arrivals: Arrivals, tmp_path: Path
+) -> None:
+    (tmp_path / "password").write_text(PASSWORD + "\n")
+    credentials = {"username": "detector", "passwordFile": str(tmp_path / "password")}
+    given = {"port": port, "clientId": "detector", "qos": 1, "credentials": credentials}
+    with broker(port, guarded=True), publisher(port) as client:  # this broker keeps nothing for who has no name
+        with mqtt(arrivals, Tally(), **given):
+            publish_until(client, "vehicles/car1/pose", lambda: arrivals.seen)
+        client.publish("vehicles/car1/pose", b"meanwhile", qos=1).wait_for_publish(5)
+        with mqtt(arrivals, Tally(), **given):
+            arrivals.wait_for(lambda seen: seen[-1][2] == b"meanwhile")
 
 
 @pytest.mark.parametrize(
