@@ -47,15 +47,16 @@ class SourceThread:
         tally: Tally,
         *,
         first_pause: float = _FIRST_PAUSE,
+        longest_pause: float = _LONGEST_PAUSE,
     ) -> None:
-        """`first_pause` is in seconds. Raises PluginError, KeyPatternError."""
+        """The pauses are in seconds. Raises PluginError, KeyPatternError."""
         self.source = source
         self.streams = streams
         self.state = State.RUNNING
         self.last_error = ""
         self._make: Make = prepare(source)
         self._tally = tally
-        self._first_pause = first_pause
+        self._first_pause, self._longest_pause = first_pause, longest_pause
         self._feed = Feed(streams, putter, lambda key: tally.add(Cause.UNROUTED, source.name, last=key))
         self._thread = threading.Thread(target=self._run, name=f"source {source.name}", daemon=True)
 
@@ -97,7 +98,7 @@ class SourceThread:
                     pause = self._first_pause
                 self._failed(error, pause)
                 self._feed.wait(pause)
-                pause = min(2 * pause, _LONGEST_PAUSE)
+                pause = min(2 * pause, self._longest_pause)
             else:
                 break
         if self._feed.stopping:

@@ -1,8 +1,8 @@
 """Follows the clients' liveliness tokens, and tells what happens to them as arrivals for the intake.
 
 When our connection to a router ends, Zenoh reports all tokens behind it as gone, a moment before the connection
-itself. So a token that is gone is looked at again shortly after: only if no router left meanwhile is it the client
-that is gone.
+itself. So a token that is gone is looked at again shortly after: only if no router left since the token was declared,
+or that is long ago, is it the client that is gone.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ log = logging.getLogger(__name__)
 _SETTLE = 0.2
 """Seconds between a report that a token is gone and the belief in it."""
 
+_DOUBT = 10.0
+"""Seconds after a router left in which tokens that were declared before are not believed to be dropped."""
+
 _CHANNEL = 16_384
 
 
@@ -39,7 +42,8 @@ class TokenWatch:
         self._put = put
         self._connections = connections
         self._stop = threading.Event()
-        self._held: dict[str, None] = {}
+        self._held: dict[str, int] = {}
+        """The tokens that are there, and how many routers had left when they were declared."""
         expression = zenoh.KeyExpr.autocanonize(KeyPattern.parse(key).expression)
         self._subscriber = session.liveliness().declare_subscriber(
             expression, zenoh.handlers.FifoChannel(_CHANNEL), history=True
@@ -68,9 +72,9 @@ class TokenWatch:
         newest = {str(report.key_expr): report.kind for report in reports}
         for key, kind in newest.items():
             if kind == zenoh.SampleKind.PUT:
-                self._held[key] = None
+                self._held[key] = self._connections.departures
                 self._put([(key, Token.DECLARED.value)])
             elif key in self._held:
-                del self._held[key]
-                unsure = self._stop.is_set() or self._connections.router_left_within(2 * _SETTLE)
+                departed = self._held.pop(key) != self._connections.departures
+                unsure = self._stop.is_set() or (departed and self._connections.router_left_within(_DOUBT))
                 self._put([(key, (Token.UNSURE if unsure else Token.DROPPED).value)])

@@ -62,6 +62,8 @@ class Connections:
         self._others: set[str] = set()
         self._alone = False
         self._router_left: float | None = None
+        self.departures = 0
+        """How often the connection to a router ended."""
         self._closing = False
         self._listener = session.info.declare_transport_events_listener(self._take, history=True)
 
@@ -71,7 +73,7 @@ class Connections:
         return bool(self._others)
 
     def router_left_within(self, seconds: float) -> bool:
-        """Whether the connection to a router ended in the last seconds: what it says is gone may be there still."""
+        """Whether the connection to a router ended in the last seconds."""
         left = self._router_left
         return left is not None and time.monotonic() - left <= seconds
 
@@ -93,6 +95,7 @@ class Connections:
             self._others.discard(other)
             if event.transport.whatami == zenoh.WhatAmI.ROUTER:
                 self._router_left = time.monotonic()
+                self.departures += 1
             if not self._others and not self._closing:
                 self._alone = True
                 log.warning("zenoh: the connection to %s %s is lost, nobody is connected; trying on", role, other)

@@ -33,7 +33,9 @@ def mqtt(
     arrivals: Arrivals, tally: Tally, *, key: str = "vehicles/${client:*}/pose", **parameters: Any
 ) -> Iterator[SourceThread]:
     source = DataSource(name="broker", plugin="mqtt", parameters={"host": "localhost", **parameters})
-    thread = SourceThread(source, (stream(key=key, source="broker"),), arrivals.putter, tally, first_pause=0.1)
+    thread = SourceThread(
+        source, (stream(key=key, source="broker"),), arrivals.putter, tally, first_pause=0.1, longest_pause=0.5
+    )
     thread.start()
     try:
         yield thread
