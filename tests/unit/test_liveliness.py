@@ -15,6 +15,7 @@ from detector.engine.liveliness import LIVELINESS, Token
 from detector.engine.sample import Arrival
 from detector.replay.intake_file import read_intake
 from detector.replay.replaying import replay_intake
+from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.streams.zenoh import Network
@@ -197,7 +198,7 @@ def test_live_and_replay_agree_on_tokens(endpoint: str, tmp_path: Path) -> None:
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path / "tasks", "h"))
-        with Running(RuleSet(watched, (rule,)), "h", reconciler, tmp_path, tmp_path / "intake.mcap", []):
+        with Running(RuleSet(watched, (rule,)), "h", reconciler, tmp_path, tmp_path / "intake.mcap", Restored()):
             for reason in ("ended", None):  # the second time, the detector ends first
                 car1 = await asyncio.to_thread(vehicle, endpoint)
                 token = car1.liveliness().declare_token("alive/car1")

@@ -16,6 +16,7 @@ from detector.access import AccessError, Login, login, tls_files
 from detector.actions.deploy import DemandReconciler
 from detector.actions.file_store import FileTaskStore
 from detector.engine.liveliness import LIVELINESS, Token
+from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.streams.session import NetworkError, open_session
@@ -253,7 +254,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
-        with Running(at(endpoint), "h", reconciler, None, None, []) as running:
+        with Running(at(endpoint), "h", reconciler, None, None, Restored()) as running:
 
             def buffered(client: str) -> bool:
                 with open_session(

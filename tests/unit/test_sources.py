@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from detector.actions.deploy import DemandReconciler
 from detector.actions.file_store import FileTaskStore
 from detector.assembly import DetectorError, inlets
+from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.sources import Feed, Source, registry
@@ -184,7 +185,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
-        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, None, None, []) as running:
+        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, None, None, Restored()) as running:
             await asyncio.to_thread(wait_for, lambda: states(running) == [("first", "Running", 1)])
             await running.follow(changes())
             await asyncio.to_thread(
