@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
+from typing import Any
 
 from detector.sources.base import Feed, Put
 from detector.sources.registry import Make, prepare
@@ -138,7 +139,9 @@ class Sources:
         new = {
             name: SourceThread(source, streams, self._putter, self._tally)
             for name, (source, streams) in wanted.items()
-            if (running := self._threads.get(name)) is None or (running.source, running.streams) != (source, streams)
+            if (running := self._threads.get(name)) is None
+            or running.source != source
+            or _delivered(running.streams) != _delivered(streams)
         }
         self._stop({name: thread for name, thread in self._threads.items() if name not in wanted or name in new})
         for name, thread in new.items():
@@ -161,3 +164,8 @@ class Sources:
         for name, thread in threads.items():
             thread.join(max(0.0, deadline - time.monotonic()))
             del self._threads[name]
+
+
+def _delivered(streams: Iterable[Stream]) -> list[dict[str, Any]]:
+    """What matters of streams to who delivers them; how long samples are kept or believed does not."""
+    return [stream.model_dump(exclude={"buffer", "stale_after", "stamp", "latched"}) for stream in streams]

@@ -105,9 +105,9 @@ def a_thread(plugin: str, arrivals: Arrivals, tally: Tally) -> SourceThread:
     return thread
 
 
-def a_detector_of(*sources: dict[str, Any]) -> Detector:
+def a_detector_of(*sources: dict[str, Any], **stream: Any) -> Detector:
     streams = (
-        a_stream(f"stream{index}", key="vehicles/${client:*}/pose", source=each["name"])
+        a_stream(f"stream{index}", key="vehicles/${client:*}/pose", source=each["name"], **stream)
         for index, each in enumerate(sources)
     )
     return a_detector(*streams, sources=list(sources))
@@ -161,6 +161,8 @@ def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals
     sources.follow(a_detector_of(first, second))
     kept, changed = sources.threads
     sources.follow(a_detector_of(first, {**second, "parameters": {"text": "new"}}))
+    assert sources.threads[0] is kept
+    sources.follow(a_detector_of(first, {**second, "parameters": {"text": "new"}}, buffer={"duration": "1m"}))
     assert sources.threads[0] is kept
     wait_for(lambda: changed.state is State.STOPPED)
     arrivals.wait_for(lambda seen: [payload for _, _, payload in seen].count(b"new") == 1)
