@@ -168,6 +168,37 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         r'spec\.streams\[1\]: Duplicate value: .*"pose"',
     ),
     ("Detector", "an endpoint that is none", {"spec.zenoh.connect": ["zenoh:7447"]}, r"spec\.zenoh\.connect\[0\]: "),
+    (
+        "Detector",
+        "TLS given twice",
+        {"spec.zenoh.tls": {"ca": "ca.crt"}, "spec.zenoh.tlsSecret": "zenoh"},
+        r"spec\.zenoh: .*give tls or tlsSecret, not both",
+    ),
+    (
+        "Detector",
+        "TLS without a certificate",
+        {"spec.zenoh.listen": ["tls/0.0.0.0:7447"]},
+        r"spec\.zenoh: .*needs a certificate: give tls\.certificate",
+    ),
+    (
+        "Detector",
+        "half a certificate",
+        {"spec.zenoh.tls": {"certificate": "tls.crt"}},
+        r"spec\.zenoh\.tls: .*certificate and key belong together",
+    ),
+    (
+        "Detector",
+        "a username without its password",
+        {"spec.zenoh.credentials": {"username": "detector"}},
+        r"spec\.zenoh\.credentials: .*give the password's place once",
+    ),
+    (
+        "Detector",
+        "tokens without their client",
+        {"spec.zenoh.liveliness": "alive/*"},
+        r"spec\.zenoh: .*liveliness captures no client",
+    ),
+    ("Detector", "a source without its plugin", {"spec.sources": [{"name": "a"}]}, r"spec\.sources\[0\]\.plugin: Req"),
     ("Detector", "an unknown clock", {"spec.clock": "Sun"}, r'spec\.clock: Unsupported value: "Sun".*"Wall", "Data"'),
     ("ApplicationTemplate", "no manifests", {"spec.manifests": []}, r"spec\.manifests: .*at least 1 items"),
     (

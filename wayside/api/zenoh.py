@@ -37,8 +37,8 @@ class Zenoh(Access):
         *ACCESS_VALIDATIONS,
         ("!has(self.liveliness) || self.liveliness.contains('${client:')", _NO_CLIENT),
         (
-            "!self.listen.exists(e, e.startsWith('tls/') || e.startsWith('quic/')) || has(self.tlsSecret) || "
-            "(has(self.tls) && has(self.tls.certificate))",
+            "!has(self.listen) || !self.listen.exists(e, e.startsWith('tls/') || e.startsWith('quic/')) || "
+            "has(self.tlsSecret) || (has(self.tls) && has(self.tls.certificate))",
             _NO_CERTIFICATE,
         ),
     )
