@@ -127,6 +127,16 @@ def test_the_users_modules_leave_messages_of_other_kinds_and_of_the_first_versio
     assert decoder.decode(perception())["header"]["messageId"] == 14.0
 
 
+def test_a_message_whose_definition_has_its_time_elsewhere_has_no_stamp() -> None:
+    elsewhere = PERCEPTION.replace("managementContainer SEQUENCE", "timing SEQUENCE")
+    tools = encoder(DICTIONARY, elsewhere)
+    header = {"protocolVersion": 2, "messageId": 14, "stationId": 7}
+    part = {"partId": 1, "partData": tools.encode("Sizes", {"length": 45})}
+    payload = {"timing": {"referenceTime": 1}, "parts": [part]}
+    raw = bytes(tools.encode("CollectivePerceptionMessage", {"header": header, "payload": payload}))
+    assert EtsiDecoder("etsi/cpm", OwnDefinitions((elsewhere, DICTIONARY))).stamp_near(raw, 0) is None
+
+
 TYPES = """
 Types DEFINITIONS AUTOMATIC TAGS ::= BEGIN
 Free ::= INTEGER

@@ -54,7 +54,10 @@ class EtsiDecoder:
         receive time.
         """
         kind, message = self._read(payload)
-        return kind.stamp(message, received)
+        try:
+            return kind.stamp(message, received)
+        except (LookupError, TypeError):  # the user's definitions have its time elsewhere, or not at all
+            return None
 
     def _read(self, payload: bytes) -> tuple[Kind, dict[str, Any]]:
         data = message_in(payload)
