@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from wayside.expressions import UNKNOWN, Environment, EvaluationError, ExpressionError, Kind, Reason
 from wayside.expressions.functions import FUNCTIONS
@@ -94,7 +97,8 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
     [
         ("inside(1, 2, area)", {"area": [[0, 0], [1, 1]]}, Reason.ERROR, "three corners or more, this one has 2"),
         ("inside(1, 2, area)", {"area": [[0, 0], [1, None], [2, 2]]}, Reason.ABSENT, "no value for polygon[1][1]"),
-        ("inside(1, 2, area)", {"area": "here"}, Reason.ERROR, "does not take these types"),
+        ("inside(1, 2, area)", {"area": "here"}, Reason.ERROR, "number, list, was given number, number, text"),
+        ("inside(msg.o, 2, area)", {"area": SQUARE, "msg": {"o": [1]}}, Reason.ERROR, "was given list, map or bytes"),
         ("inside(1, 2, area)", {"area": {"x": 1}}, Reason.ERROR, "polygon must be a list"),
         ("inside(msg.x, 2, area)", {"area": SQUARE, "msg": {}}, Reason.ABSENT, "no key"),
         ("inside(msg.x, 2, area)", {"area": SQUARE, "msg": {"x": float("nan")}}, Reason.ABSENT, "no key"),
@@ -133,6 +137,39 @@ def test_records_of_decoded_messages_are_maps() -> None:
     assert evaluate("yaw(msg.q)", msg={"q": Quaternion(0.0, 0.0, 1.0, 0.0)}) == pytest.approx(np.pi)
     assert evaluate("yaw(0, 0, 1, 0)") == pytest.approx(np.pi)
     assert evaluate("nearest(msg.o, 0, 3)", msg={"o": [Quaternion(4.0, 0.0, 0.0, 0.0)]}) == 5.0
+
+
+def calls() -> list[tuple[str, int]]:
+    """Every way to call every function, with arguments from a list."""
+    ways = [(name, len(way.parameters)) for name, function in FUNCTIONS.items() for way in function.signatures]
+    return [(f"{name}({', '.join(f'args[{i}]' for i in range(count))})", count) for name, count in ways]
+
+
+ARGUMENTS = Environment({"args": Kind.DYN})
+numbers = st.sampled_from([0.0, -0.0, 1e308, -1e308, 5e-324, 2.0**53]) | st.floats() | st.integers(-(2**70), 2**70)
+texts = st.sampled_from(["", "u8", "f64be", "x", "a.b", "\0", "position"]) | st.text(max_size=3)
+places = st.dictionaries(
+    st.sampled_from(["x", "y", "z", "w", "position", "pose", "a"]), numbers | st.none(), max_size=5
+)
+scalars = st.none() | st.booleans() | numbers | texts | st.binary(max_size=9) | places
+anything = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(texts, inner, max_size=3), max_leaves=12
+)
+likely = st.lists(st.tuples(numbers, numbers).map(list) | places, max_size=5) | numbers | anything
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.sampled_from(calls()), st.lists(likely, min_size=5, max_size=5))
+def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str, int], arguments: list[Any]) -> None:
+    source, count = call
+    told: list[str] = []
+    result = ARGUMENTS.compile(source).evaluate_or_unknown(
+        {"args": arguments[:count]}, lambda reason, text: told.append(text)
+    )
+    assert (result is UNKNOWN) == (len(told) == 1)
+    assert not any("Error" in text or "Traceback" in text for text in told), told
+    if result is not UNKNOWN:
+        assert isinstance(result, float | bool | str | list)
 
 
 def test_every_function_is_documented_as_it_is_called_and_nothing_else() -> None:

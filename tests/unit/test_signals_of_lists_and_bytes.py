@@ -9,7 +9,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from detector.engine.sample import Arrival
-from tests.unit.driving import Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, told
+from tests.unit.driving import POSITION, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, told
 
 COMPARED = a_rule(
     signals=[
@@ -34,6 +34,19 @@ def test_two_perception_outputs_of_one_scene_are_compared_in_one_rule() -> None:
     broken = arrival(2.5, "rsu", {"objects": [{"id": 1, "x": None, "y": 3}]}, "lidar")
     assert drive.take(broken, until=3) == []  # unknown: nothing ends
     assert drive.take(arrival(3.5, "rsu", objects((0, 0), (9, 0)), "lidar"), until=4) == ["r rsu Until 4"]
+
+
+def test_what_two_vehicles_see_of_one_scene_is_compared_in_a_pair() -> None:
+    rule = a_rule(
+        scope={"pairs": {"position": POSITION, "within": 100}},
+        signals=[{"name": "seen", "stream": "camera", "value": "msg.objects"}],
+        when="countUnmatched(a.seen, b.seen, 2) + countUnmatched(b.seen, a.seen, 2) > 0",
+    )
+    drive = Drive(a_detector(a_stream("camera"), a_stream("pose")), rule)
+    poses = [arrival(0.1, car, {"x": x, "y": 0}, "pose") for car, x in (("car1", 0), ("car2", 50))]
+    same = [arrival(0.2, car, objects((20, 0), (30, 0)), "camera") for car in ("car1", "car2")]
+    assert drive.take(*poses, *same, until=1) == []
+    assert drive.take(arrival(1.5, "car2", objects((20, 1)), "camera"), until=2) == ["r car1+car2 started 2"]
 
 
 def test_thousands_of_objects_are_beyond_cels_loops_but_not_the_functions() -> None:

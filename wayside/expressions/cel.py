@@ -21,6 +21,7 @@ from cel_expr_python import cel
 
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
+from wayside.expressions.failures import clean, says_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import settle
 from wayside.expressions.handles import begin, end, value_of
@@ -212,10 +213,10 @@ class Expression:
             value = outcome.plain_value()
             failed = isinstance(value, str) and outcome.type() == cel.Type.ERROR
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
-            raise EvaluationError(_clean(str(error))) from None
+            raise EvaluationError(clean(str(error))) from None
         if failed:
-            message = _clean(value)
-            raise EvaluationError(message, absent=message.startswith(_ABSENT) or (known and "null_type" in message))
+            message = clean(value)
+            raise EvaluationError(message, absent=says_absent(message) or (known and "null" in message))
         result = _plain(value)
         if self.result is not Kind.DYN:
             self._check(result)
@@ -276,25 +277,3 @@ def _describe(value: object) -> str:
         return "null"
     names = {bool: "a boolean", float: "a number", int: "a number", str: "a text", list: "a list", dict: "a map"}
     return names.get(type(value), f"a value of type {type(value).__name__}")
-
-
-_BYTES = "use byteCount, checksum, allZero, numberAt or utf8"
-_ABSENT = ("no value for ", "no key ", "no index ")
-_CLEANING: Final = (
-    (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
-    (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
-    (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list"),
-    (
-        re.compile(r"^\w+: No matching overloads found : (.*uint64.*)$"),
-        rf"the operation does not take bytes: \1; {_BYTES}",
-    ),
-    (re.compile(r"^\w+: No matching overloads found : (.*)$"), r"the operation does not take these types: \1"),
-    (re.compile(r"^[A-Z_]+: (.*?)(?: \[[A-Z_]+\])?$", re.DOTALL), r"\1"),
-)
-
-
-def _clean(message: str) -> str:
-    for pattern, replacement in _CLEANING:
-        if pattern.search(message):
-            return pattern.sub(replacement, message)
-    return message

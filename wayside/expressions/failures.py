@@ -1,0 +1,53 @@
+"""Turns what CEL says of an evaluation that failed into words for the rule's author."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from wayside.expressions.functions import FUNCTIONS
+
+_ABSENT = ("no value for ", "no key ", "no index ")
+_OVERLOAD: Final = re.compile(r"^\w+: No matching overloads found : (.*)$")
+_CALL: Final = re.compile(r"^(\w+)\((.*)\)$")
+_CLEANING: Final = (
+    (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
+    (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
+    (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list"),
+    (re.compile(r"^[A-Z_]+: (.*?)(?: \[[A-Z_]+\])?$", re.DOTALL), r"\1"),
+)
+_TYPES: Final = {
+    "double": "number",
+    "string": "text",
+    "bool": "boolean",
+    "int64": "integer beyond 2^53",
+    "uint64": "list, map or bytes",  # a handle
+    "null_type": "null",
+}
+
+
+def clean(message: str) -> str:
+    """The message without CEL's codes, and in the words of the documentation."""
+    overload = _OVERLOAD.search(message)
+    if overload is not None:
+        return _no_overload(overload[1])
+    for pattern, replacement in _CLEANING:
+        if pattern.search(message):
+            return pattern.sub(replacement, message)
+    return message
+
+
+def says_absent(message: str) -> bool:
+    """Whether a clean message says that something is not there."""
+    return message.startswith(_ABSENT)
+
+
+def _no_overload(operation: str) -> str:
+    """Of a function of ours, what it takes and was given; of CEL's operations, those on bytes have a remedy."""
+    call = _CALL.search(operation)
+    if call is not None and (function := FUNCTIONS.get(call[1])) is not None:
+        given = ", ".join(_TYPES.get(kind, kind) for kind in call[2].split(", "))
+        return f"{function.usage()} takes {function.types()}, was given {given}"
+    if "uint64" in operation:
+        return f"the operation does not take bytes: {operation}; use byteCount, checksum, allZero, numberAt or utf8"
+    return f"the operation does not take these types: {operation}"
