@@ -1,16 +1,25 @@
-"""What a running detector answers to those who ask: its status."""
+"""What a running detector answers to those who ask: its status, and what a rule with onDemand says.
+
+Two questions also change something: a rule is paused, or evaluated again.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import TypeVar
 
 import msgspec
 
+from detector.engine.demands import plain
 from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
 from detector.sources.supervision import SourceThread
 from detector.status.model import Drops, Explanation, SourceStatus, Status, to_json
+from wayside.times import format_time
+
+Result = TypeVar("Result")
 
 _PATIENCE = 5.0
 """Seconds in which the evaluation should have time for a question."""
@@ -29,7 +38,12 @@ class Answers:
         self._evaluator = evaluator
         self._sources = sources
         self._outlet = outlet
-        self._answers: Mapping[str, Callable[[Mapping[str, str]], bytes]] = {"status": self._status}
+        self._answers: Mapping[str, Callable[[Mapping[str, str]], bytes]] = {
+            "status": self._status,
+            "evaluate": self._evaluate,
+            "pause": lambda given: self._pause(given, paused=True),
+            "resume": lambda given: self._pause(given, paused=False),
+        }
 
     def answer(self, what: str, given: Mapping[str, str]) -> bytes:
         """The answer as JSON. Raises ValueError where there is none; the text says why."""
@@ -75,6 +89,34 @@ class Answers:
         explanation = self._explanation(rule, given.get("subject"), given.get("wait", "1"))
         return to_json(msgspec.structs.replace(status, rules=rules, explanation=explanation))
 
+    def _evaluate(self, given: Mapping[str, str]) -> bytes:
+        """A list with an entry for each subject; times are RFC 3339."""
+        rule = _rule(given)
+        answers = self._in_time(self._evaluator.ask(rule))
+        return msgspec.json.encode(
+            [
+                {
+                    "subject": answer.subject,
+                    "when": answer.when,
+                    "values": plain(answer.values),
+                    "episode": answer.episode,
+                    "startTime": None if answer.start_time is None else format_time(answer.start_time),
+                }
+                for answer in answers
+            ]
+        )
+
+    def _pause(self, given: Mapping[str, str], *, paused: bool) -> bytes:
+        rule = _rule(given)
+        self._in_time(self._evaluator.pause_rule(rule, paused))
+        return msgspec.json.encode({"rule": rule, "paused": paused})
+
+    def _in_time(self, future: Future[Result]) -> Result:
+        try:
+            return future.result(_PATIENCE)
+        except TimeoutError:
+            raise ValueError(f"the evaluation did not get to it within {_PATIENCE:g} s: it is too slow") from None
+
     def _explanation(self, rule: str, subject: str | None, wait: str) -> Explanation | None:
         """What the rule's next evaluation sees; None where there is none within so many seconds."""
         if not re.fullmatch(r"[0-9]{1,2}(\.[0-9]{1,3})?", wait):
@@ -90,6 +132,13 @@ class Answers:
         finally:
             if watching is not None:
                 watching.cancel()
+
+
+def _rule(given: Mapping[str, str]) -> str:
+    rule = given.get("rule")
+    if not rule:
+        raise ValueError("which rule? Ask with ?rule=NAME")
+    return rule
 
 
 def _listed(status: Status) -> str:

@@ -166,7 +166,8 @@ def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folder
     typer.echo(f"{summary(documents)}: nothing wrong", err=True)
 
 
-app.command()(inquiry.status)
+for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume):
+    app.command()(command)
 
 
 def _replayed(

@@ -1,4 +1,4 @@
-"""The commands that ask a running detector: `detector status`."""
+"""The commands that ask a running detector: `detector status`, `evaluate`, `pause` and `resume`."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ Connect = Annotated[
     list[str] | None, typer.Option(help="Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: those of the file.")
 ]
 Timeout = Annotated[float, typer.Option(help="Seconds to wait for answers.", min=0.1)]
+
+RuleName = Annotated[str, typer.Argument(help="The rule's name.", show_default=False)]
 
 _WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""
@@ -54,6 +56,34 @@ def status(
             typer.echo(json.dumps(json.loads(answer.payload)))
         else:
             console.print(status_view(read_status(answer.payload)), highlight=False, markup=False)
+
+
+def evaluate(
+    rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
+) -> None:
+    """Evaluate a rule with onDemand, and print a line of JSON for each subject."""
+    for answer in inquire("evaluate", {"rule": rule}, detector, name, connect, timeout):
+        for each in json.loads(answer.payload):
+            typer.echo(json.dumps(each))
+
+
+def pause(
+    rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
+) -> None:
+    """Do not evaluate a rule until it is resumed; its open episodes hold."""
+    _told("pause", rule, inquire("pause", {"rule": rule}, detector, name, connect, timeout))
+
+
+def resume(
+    rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
+) -> None:
+    """Evaluate a paused rule again."""
+    _told("resume", rule, inquire("resume", {"rule": rule}, detector, name, connect, timeout))
+
+
+def _told(what: str, rule: str, answers: list[Asked]) -> None:
+    for answer in answers:
+        typer.echo(f"{answer.key.split('/')[2]}: rule {rule} {what}d", err=True)
 
 
 def inquire(

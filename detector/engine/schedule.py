@@ -75,11 +75,15 @@ class Schedule:
         self.level = min(level, self.highest)
         self._thinning = thinning(self.level, self._priorities)
 
+    def thinning(self, rule: CompiledRule) -> int:
+        """Of so many evaluations of the rule, one takes place."""
+        return 1 if rule.on_demand else self._thinning.get(rule.priority, 1)
+
     def is_thinned(self, rule: CompiledRule, now: int) -> bool:
         """Whether the rule, which is due with its period, is left out this time."""
         if rule.every_ns is None:
             return False
-        return now % (rule.every_ns * self._thinning.get(rule.priority, 1)) != 0
+        return now % (rule.every_ns * self.thinning(rule)) != 0
 
     def whom(self, rule: CompiledRule, now: int, sampled: Mapping[str, frozenset[str]]) -> tuple[Only, bool]:
         """Whom a rule with onSample is evaluated for; and whether samples were left out.
@@ -90,7 +94,7 @@ class Schedule:
         thinned = False
         if clients:
             count = self._samples[rule.name] = self._samples.get(rule.name, -1) + 1
-            thinned = count % self._thinning.get(rule.priority, 1) != 0
+            thinned = count % self.thinning(rule) != 0
         wakes = self._wakes.get(rule.name, {})
         due = frozenset(subject for subject, time in wakes.items() if time <= now)
         return Only(frozenset() if thinned else clients, due), thinned

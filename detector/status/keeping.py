@@ -20,6 +20,7 @@ from detector.engine.buffer import NEVER, Lane
 from detector.engine.engine import Engine
 from detector.engine.evaluation import RuleRun
 from detector.engine.sample import Arrival
+from detector.engine.schedule import Schedule
 from detector.losses import Losses
 from detector.status.explaining import Watching
 from detector.status.model import (
@@ -187,7 +188,7 @@ class StatusKeeper:
             if refusal is not None:
                 state, message = RuleState.REFUSED, str(refusal)
             else:
-                state, message = _state(runs[name])
+                state, message = _state(runs[name], self._engine.schedule)
             if run is None:
                 yield RuleStatus(name, state, message)
                 continue
@@ -245,7 +246,11 @@ class StatusKeeper:
                 of_rules.pop(name)
 
 
-def _state(run: RuleRun) -> tuple[RuleState, str]:
+def _state(run: RuleRun, schedule: Schedule) -> tuple[RuleState, str]:
     if not run.rule.enabled:
         return RuleState.DISABLED, "enabled is false"
+    if run.rule.name in schedule.paused:
+        return RuleState.PAUSED, "open episodes hold until it is resumed"
+    if (thinned := schedule.thinning(run.rule)) > 1:
+        return RuleState.DEGRADED, f"the machine is too slow: one of {thinned} evaluations takes place"
     return RuleState.ACCEPTED, "dryRun: events are published, no action runs" if run.rule.dry_run else ""

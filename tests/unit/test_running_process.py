@@ -18,7 +18,7 @@ import pytest
 import zenoh
 from prometheus_client.parser import text_string_to_metric_families
 
-from detector.status.model import Status, read_status
+from detector.status.model import RuleState, Status, read_status
 from detector.streams.asking import NoAnswerError, ask
 from tests.unit.driving import a_detector, a_rule, a_stream
 from wayside.api import Kind
@@ -140,6 +140,31 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
     assert metrics["process_resident_memory_bytes",] > 0
     assert "looked" in process.page("/healthz")
     assert "looked" in process.page("/readyz")
+
+
+def test_a_rule_is_asked_paused_and_resumed_by_commands(process: Process) -> None:
+    process.change(FAST, a_rule("asked", signals=[SPEED], when="v > 10", evaluation={"onDemand": True}))
+    process.send("car1", {"v": 20})
+    process.status_when(lambda s: len(s.rules) == 2 and s.streams[1].samples == 1)
+
+    def command(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "detector.cli", *words, "--detector", "detector.yaml"],
+            cwd=process.folder,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    answer = json.loads(command("evaluate", "asked").stdout)
+    assert (answer["subject"], answer["when"], answer["values"]) == ("car1", True, {"v": 20})
+    refused = command("evaluate", "fast")
+    assert refused.returncode == 2
+    assert "rule fast is not evaluated on demand: write evaluation: {onDemand: true}" in refused.stderr
+    assert command("pause", "fast").stderr == "d: rule fast paused\n"
+    process.status_when(lambda s: {rule.name: rule.state for rule in s.rules}["fast"] is RuleState.PAUSED)
+    assert command("resume", "fast").stderr == "d: rule fast resumed\n"
+    process.status_when(lambda s: {rule.name: rule.state for rule in s.rules}["fast"] is RuleState.ACCEPTED)
 
 
 def test_rules_and_streams_change_without_losing_buffer_or_episodes(process: Process) -> None:
