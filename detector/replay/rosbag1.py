@@ -54,11 +54,18 @@ def rosbag1_types(path: Path) -> list[RecordedType]:
     """The message types that the bag defines, as ROS 2 would. Raises RecordingError if it is damaged."""
     try:
         with Reader(path) as reader:
-            types = _types(reader.connections)
-            names = sorted({connection.msgtype for connection in reader.connections})
-            return [RecordedType(name, types.generate_msgdef(name, ros_version=2)[0], idl=False) for name in names]
-    except (*DAMAGE, ReaderError, TypesysError) as error:
+            by_name = {connection.msgtype: connection for connection in reader.connections}
+            return [RecordedType(name, _as_ros2(by_name[name]), idl=False) for name in sorted(by_name)]
+    except (*DAMAGE, ReaderError) as error:
         raise _damaged(path, error) from error
+
+
+def _as_ros2(connection: Connection) -> str:
+    """The definition of the connection's type for ROS 2; as it is where it cannot be read: nobody may ask for it."""
+    try:
+        return _types([connection]).generate_msgdef(connection.msgtype, ros_version=2)[0]
+    except TypesysError:
+        return connection.msgdef.data
 
 
 def _damaged(path: Path, error: Exception) -> RecordingError:

@@ -9,11 +9,14 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from detector.assembly import inlets
 from detector.replay.errors import RecordingError
+from detector.replay.recorded_types import with_recorded_types
 from detector.replay.recordings import open_recordings
 from detector.sources.supervision import SourceThread, State
 from detector.streams.codecs import CdrDecoder
 from detector.streams.tally import Tally
+from tests.unit.driving import a_detector
 from tests.unit.networks import Arrivals, stream, wait_for
 from wayside.api.detector import Encoding, Stream
 from wayside.api.source import DataSource
@@ -77,6 +80,19 @@ def test_a_type_of_ones_own_comes_with_the_bag(tmp_path: Path, noetic: Typestore
     ros2.register(own)
     read = ros2.deserialize_cdr(message.payload, "own_msgs/msg/Thing")
     assert (read.name, list(read.values), read.left.sec, read.left.nanosec) == ("a", [1, 2], 4, 5)
+    things = {"name": "thing", "key": "thing", "client": "ego", "encoding": "cdr", "type": "own_msgs/msg/Thing"}
+    decoder = inlets(with_recorded_types(a_detector(things), [path])).decoders["thing"]
+    assert decoder.decode(message.payload) == {
+        "name": "a",
+        "values": [1.0, 2.0],
+        "left": {"sec": 4.0, "nanosec": 5.0},
+    }
+
+
+def test_a_bag_of_common_types_leaves_the_detector_as_it_is(bag: Path) -> None:
+    poses = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "cdr", "type": POSE}
+    detector = a_detector(poses)
+    assert with_recorded_types(detector, [bag]) is detector
 
 
 def test_a_type_that_ros_2_defines_otherwise_is_refused_if_it_is_asked_for(bag: Path) -> None:
