@@ -76,8 +76,7 @@ class Engine:
         """Gives nanoseconds of any clock; the shell sets one that runs. What it says is counted and decides nothing."""
         self._floor: int | None = None
         """Windows do not reach back further than the last gap; nanoseconds."""
-        self._plugin_host = plugins or NoPlugins()
-        self._plugins = PluginSignals(self._plugin_host, self.queries)
+        self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
         self._inflow = Inflow(self.buffer, self.clients, self.counters)
         self._configure(detector, decoders, read_key, start)
         self._timeline = self._make_timeline(start)
@@ -169,7 +168,7 @@ class Engine:
             for event in runs[name].open_starts() if name in runs else ():
                 self._starts.started(event)
         self._signals.forget(lambda rule, client: rule in kept)
-        self._plugin_host.configure(rules, kept)
+        self._plugins.configure(rules, kept)
         self.schedule.set_rules([run.rule for run in self._runs.values()])
         self._wake_anew(now)
         self._rules_version += 1
@@ -244,7 +243,7 @@ class Engine:
         for event in events:
             self._starts.note(event)
         self._messages.forget()
-        self._transforms.forget()
+        self._transforms.forget(self.now)
         return events, answers
 
     def demands(self) -> dict[str, Demand]:
@@ -323,7 +322,7 @@ class Engine:
                 self._starts.note(event)
             events += happened
         self._messages.forget()
-        self._transforms.forget()
+        self._transforms.forget(self.now)
         return events
 
     def _turn(self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool) -> list[Event]:
@@ -362,6 +361,7 @@ class Engine:
         if lost:
             self._inflow.lose(set(lost))
             self._starts.lose(lost)
+            self._plugins.lose(lost)
             self._signals.forget(lambda rule, client: client in self.clients)
 
     def _views(self, run: RuleRun, time: int) -> Views:
@@ -401,7 +401,7 @@ class Engine:
             self._starts.buffer.step_back(time)
         self._floor = time
         self._signals.gap(time)
-        self._plugin_host.reset()
+        self._plugins.gap()
         self._positions.gap(time)
         self.clients.gap(time)
         for run in self._runs.values():

@@ -79,6 +79,26 @@ class PluginSignals:
         """`queries` gives the buffer at the tick."""
         self._host = host
         self._queries = queries
+        self._subjects: dict[str, dict[str, tuple[str, ...]]] = {}
+        """By rule and subject its clients, of what may have state."""
+
+    def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
+        """These rules are evaluated from now on; those that are not among `kept` begin anew."""
+        self._subjects = {rule: subjects for rule, subjects in self._subjects.items() if rule in kept}
+        self._host.configure(rules, kept)
+
+    def lose(self, clients: Collection[str]) -> None:
+        """These clients are lost: the state of their subjects goes, also of rules that are evaluated with samples."""
+        for rule, subjects in self._subjects.items():
+            left = {subject: of for subject, of in subjects.items() if not any(client in clients for client in of)}
+            if len(left) < len(subjects):
+                self._subjects[rule] = left
+                self._host.keep(rule, left)
+
+    def gap(self) -> None:
+        """Time jumped: windows begin anew, and so do plugins."""
+        self._subjects.clear()
+        self._host.reset()
 
     def added(
         self, rule: CompiledRule, candidates: Iterable[Candidate], counters: RuleCounters, *, every_subject: bool
@@ -91,12 +111,14 @@ class PluginSignals:
             yield from candidates
             return
         queries = self._queries()
-        subjects: set[str] = set()
+        known = self._subjects.setdefault(rule.name, {})
+        subjects: dict[str, tuple[str, ...]] = {}
         for candidate in candidates:
-            subjects.add(candidate.subject.text)
+            known[candidate.subject.text] = subjects[candidate.subject.text] = candidate.subject.clients
             values = dict(self._values(rule, candidate, queries, counters))
             yield replace(candidate, variables={**candidate.variables, **values})
         if every_subject:
+            self._subjects[rule.name] = subjects
             self._host.keep(rule.name, subjects)
 
     def _values(

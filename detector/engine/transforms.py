@@ -23,6 +23,9 @@ from wayside.expressions import UNKNOWN
 
 _CLIENT = "${client}"
 
+_REMEMBERED = 10_000_000_000
+"""Nanoseconds for which transforms that were read are kept for the next one who asks."""
+
 
 class TransformError(LookupError):
     """A transform that cannot be told; the text says why."""
@@ -63,14 +66,16 @@ class Transforms:
         self._counters = counters
         self._parsed: dict[tuple[str, str], dict[Sample, _Parsed]] = {}
         """By client and stream; no more than what is in the buffer."""
+        self._asked: dict[tuple[str, str], int] = {}
+        """When these were last asked for; nanoseconds."""
         self._trees: dict[str, _Tree] = {}
         """Of this tick."""
 
-    def forget(self) -> None:
-        """The tick is over."""
+    def forget(self, now: int) -> None:
+        """The tick is over. What nobody has asked for lately goes: it may hold samples that the buffer has not."""
         self._trees.clear()
-        for client, stream in [at for at in self._parsed if self._buffer.lane(*at) is None]:
-            del self._parsed[client, stream]
+        for place in [place for place, asked in self._asked.items() if not 0 <= now - asked <= _REMEMBERED]:
+            del self._asked[place], self._parsed[place]
 
     def lookup(self, client: str, target: str, source: str, stamp: int | None, now: int) -> Pose:
         """See Queries.transform; `now` is the tick. Raises TransformError."""
@@ -101,6 +106,7 @@ class Transforms:
             kept[sample] = parsed
             yield parsed
         self._parsed[client, stream.name] = kept
+        self._asked[client, stream.name] = now
 
     def _parse(self, client: str, stream: TransformStream, sample: Sample) -> _Parsed:
         message = self._messages.message(stream.name, sample)

@@ -32,5 +32,6 @@ class PluginDrive(Drive):
 
     def __init__(self, detector: Detector, *rules: EventRule, host: PluginHost) -> None:
         super().__init__(detector)
+        self.host = host
         self.engine = make_engine(detector, inlets(detector), holder="h", start=at(0), plugins=host)
         self.engine.set_rules(compiled(detector, *rules))

@@ -39,6 +39,13 @@ def test_the_rule_is_tested_in_three_lines(site: Path, monkeypatch: pytest.Monke
     assert events[0].values == {"stops": 3.0}
 
 
+def test_a_rule_that_the_detector_does_not_select_is_no_silent_success(tmp_path: Path) -> None:
+    picky = tmp_path / "detector.yaml"
+    picky.write_text(DETECTOR.read_text() + "  rules: {matchLabels: {site: x}}\n")
+    with pytest.raises(RefusedError, match="stop-and-go"):
+        run(RULES, picky, DRIVE)
+
+
 def test_the_readme_says_the_same_three_lines() -> None:
     readme = (EXAMPLE / "README.md").read_text()
     code = readme.split("```python\n")[1].split("```")[0]

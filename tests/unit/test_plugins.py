@@ -102,6 +102,14 @@ def test_each_client_has_state_of_its_own_that_goes_with_it() -> None:
     assert driven.take(arrival(6.5, "a", {"v": 1}), until=7) == ["r a started 7"]
 
 
+def test_a_client_that_was_away_between_two_evaluations_begins_anew() -> None:
+    driven = drive(plugin_rule(when="p.count >= 2", evaluation={"every": "10s"}), clientTimeout="3s")
+    driven.take(arrival(9.5, "a", {"v": 1}), until=10)
+    assert driven.take(arrival(19.5, "a", {"v": 1}), until=20) == []
+    assert driven.take(arrival(22, "a", {"v": 1}), arrival(24.9, "a", {"v": 1}), until=26) == []
+    assert driven.take(arrival(27, "a", {"v": 1}), arrival(29, "a", {"v": 1}), until=30) == ["r a started 30"]
+
+
 def test_the_value_is_in_the_event_and_in_the_actions() -> None:
     driven = drive(plugin_rule())
     driven.take(arrival(0.5, "a", {"v": 1}), until=3)
@@ -122,8 +130,7 @@ def test_of_a_pair_the_plugin_has_one_value_and_the_members_have_none() -> None:
 def test_a_pair_that_is_no_longer_looked_at_loses_its_state() -> None:
     pairs = {"pairs": {"position": POSITION, "within": 10}}
     driven = drive(plugin_rule(when="p.count >= 3 && false", scope=pairs, cooldown="0s"))
-    host: Any = driven.engine._plugin_host
-    instances = host._signals["r", "p"]
+    instances = driven.host._signals["r", "p"]  # type: ignore[attr-defined]
     near = [arrival(0.5, "a", {"x": 0, "y": 0}, "pose"), arrival(0.6, "b", {"x": 0, "y": 0}, "pose")]
     driven.take(*near, arrival(0.7, "a", {"v": 1}), until=2)
     assert len(instances) == 1
