@@ -14,7 +14,7 @@ from wayside.expressions import UNKNOWN, Environment, Kind
 from wayside.rules import CompiledRule, compile_rule
 
 GUIDE = Path(__file__).parents[2].joinpath("docs", "rules.md").read_text()
-STREAMS = ("pose", "speed", "camera-objects", "lidar-objects", "odometry", "scan", "image", "scene")
+STREAMS = ("pose", "speed", "camera-objects", "lidar-objects", "odometry", "scan", "image", "can")
 DETECTOR = a_detector(*({**a_stream(name), "key": f"v/${{client:*}}/{name}/${{sensor:*}}"} for name in STREAMS))
 MINE = ("Signals", "Parameters", "Functions")
 

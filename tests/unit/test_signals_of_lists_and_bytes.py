@@ -87,3 +87,19 @@ def test_an_image_of_a_million_bytes_is_looked_at_without_becoming_a_list() -> N
     assert told(events) == ["r car started 1", "r car Until 2"]
     assert events[0].values == {"dark": True, "frozen": [float(zlib.crc32(dark.tobytes()))], "image": None}
     assert spent < 2.0, "eleven images as lists of doubles, for three signals, would take several times this"
+
+
+def test_a_raw_payload_is_read_by_functions() -> None:
+    detector = a_detector({"name": "can", "key": "v/${client:*}/can", "encoding": "raw"})
+    rule = a_rule(
+        signals=[
+            {"name": "rpm", "stream": "can", "value": 'numberAt(msg, 3, "u16be") / 8', "where": "byteCount(msg) == 5"}
+        ],
+        when="rpm > 4000",
+    )
+    engine = an_engine(detector, rule)
+    frames = [b"\0\1\0" + (8 * 4500).to_bytes(2, "big"), b"\0"]
+    arrivals = [Arrival(at(0.1 * i + 0.1), "can", "v/car/can", frame) for i, frame in enumerate(frames)]
+    events = engine.advance(arrivals, at(1))
+    assert told(events) == ["r car started 1"]
+    assert events[0].values == {"rpm": 4500.0}
