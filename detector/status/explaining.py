@@ -83,6 +83,9 @@ class Watching:
 
     def _unknowns(self, variables: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """By signal, as expressions name it, why it has no value."""
+        for plugin in self._run.rule.plugins:
+            if plugin.name not in variables:
+                yield plugin.name, f"plugin {plugin.plugin} gave no value, or failed: see the rule's last error"
         match self._run.rule.subject:
             case PairSubject():
                 for role in ("a", "b"):
