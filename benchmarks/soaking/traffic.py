@@ -68,6 +68,9 @@ def _telemetry(start_ns: int) -> Iterator[tuple[int, str, bytes]]:
                 "brake": math.sin(after / 5e9 + number) > 0.8,
                 "mode": ("auto", "manual", None)[(after // 20_000_000_000 + number) % 3],
                 "counter": 2**53 + after,
+                "seen": [{"x": 5, "y": 0}, {"x": 0, "y": 9}],
+                # For ten seconds of each minute, one of the two objects is not tracked.
+                "tracked": [{"x": 5.3, "y": 0}, {"x": 0, "y": 99 if after % 60_000_000_000 < 10_000_000_000 else 9}],
             }
             yield after, f"vehicles/{vehicle.name}/telemetry", json.dumps(values).encode()
         step += 1
