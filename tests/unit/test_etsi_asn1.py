@@ -177,6 +177,8 @@ END
         ("Flags", (b"\xa0", 4), ["a", "b"]),
         ("Flags", (b"\x50", 4), ["1", "3"]),
         ("Bits", (b"\xa0", 3), [True, False, True]),
+        ("Bits", (b"", 0), []),
+        ("Bits", (b"\x01" * 120, 960), ([False] * 7 + [True]) * 120),
         ("Many", [True] * 3, [True] * 3),
         ("Many", [True, False] * 100, [True, False] * 100),
         ("Default", {}, {"a": 4.0}),

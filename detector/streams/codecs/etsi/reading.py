@@ -209,8 +209,8 @@ def _enumerated(kind: asn1.Enumerated) -> Read:
 
 def _bit_string(kind: asn1.BitString) -> Read:
     def piece(bits: Bits, count: int) -> list[bool]:
-        value = bits.take(count)
-        return [bool(value >> shift & 1) for shift in range(count - 1, -1, -1)]
+        # Through the digits: shifting a long number for each of its bits would take the square of their number.
+        return [digit == "1" for digit in f"{bits.take(count):0{count}b}"] if count else []
 
     flags = _counted(kind.size, piece, lambda pieces: [flag for piece in pieces for flag in piece])
     if not kind.named:
