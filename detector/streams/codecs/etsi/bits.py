@@ -14,8 +14,8 @@ _FRAGMENT = 16384
 _LONGEST = 8
 """Bytes of a number without bounds."""
 
-_ELEMENTS_PER_OCTET = 64
-"""Some elements take no bits at all. A list of them could be as long as its sender claims: this is enough for any."""
+_ELEMENTS_PER_OCTET = 8
+"""One for each bit. Elements that take no bits at all could otherwise be as many as their sender claims."""
 
 
 class Bits:
