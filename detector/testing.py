@@ -15,6 +15,7 @@ from pathlib import Path
 from detector.engine.events import Event
 from detector.replay.intake_file import is_intake_file, read_intake
 from detector.replay.latched import recorded_arrivals
+from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
 from detector.replay.routing import Router
 from detector.rules.files import load_rules
@@ -49,9 +50,9 @@ def run(rules: Paths, detector: str | Path, recording: Paths) -> list[Event]:
     if recordings[0].exists() and is_intake_file(recordings[0]):
         outcome = replay_intake(read_intake(recordings[0]), loaded.rule_set.detector, loaded.rule_set.rules)
     else:
-        router = Router(loaded.rule_set.detector.spec.streams)
-        arrivals = recorded_arrivals(recordings, router, loaded.rule_set.detector)
-        outcome = replay_arrivals(arrivals, loaded.rule_set.detector, loaded.rule_set.rules)
+        completed = with_recorded_types(loaded.rule_set.detector, recordings)
+        arrivals = recorded_arrivals(recordings, Router(completed.spec.streams), completed)
+        outcome = replay_arrivals(arrivals, completed, loaded.rule_set.rules)
     if outcome.refusals:
         raise RefusedError("; ".join(map(str, outcome.refusals)))
     return outcome.events

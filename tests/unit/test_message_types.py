@@ -30,6 +30,7 @@ from detector.replay.recorded_types import with_recorded_types
 from detector.streams.codecs import CdrDecoder
 from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.ros import types_with
+from detector.testing import run
 from tests.unit import hostile
 from tests.unit.driving import Drive, a_detector, a_rule, at
 from wayside.api import Detector
@@ -306,6 +307,8 @@ def test_a_recording_brings_its_definitions_along(tmp_path: Path, storage: Stora
     assert result.exit_code == 0, result.output
     (event,) = (tmp_path / "out" / "events.jsonl").read_text().splitlines()
     assert '"rule":"crowded"' in event
+    (tested,) = run(tmp_path / "rules.yaml", tmp_path / "detector.yaml", bag)
+    assert tested.to_json() == event
 
 
 def test_the_definition_of_the_recording_counts_before_that_of_the_detector(tmp_path: Path) -> None:
