@@ -13,7 +13,7 @@ from detector.checking import check_documents
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import installed
 from detector.plugins.values import plain
-from tests.unit.driving import POSITION, START, a_detector, a_stream, arrival
+from tests.unit.driving import POSITION, START, a_detector, a_stream, arrival, at
 from tests.unit.plugin_rules import PluginDrive, plugin_rule, plugins
 from wayside.api import EventRule
 from wayside.api.documents import load_documents
@@ -108,6 +108,17 @@ def test_a_client_that_was_away_between_two_evaluations_begins_anew() -> None:
     assert driven.take(arrival(19.5, "a", {"v": 1}), until=20) == []
     assert driven.take(arrival(22, "a", {"v": 1}), arrival(24.9, "a", {"v": 1}), until=26) == []
     assert driven.take(arrival(27, "a", {"v": 1}), arrival(29, "a", {"v": 1}), until=30) == ["r a started 30"]
+
+
+@pytest.mark.parametrize("clock", ["Wall", "Data"])
+def test_with_each_sample_the_plugin_sees_that_sample_and_none_later(clock: str) -> None:
+    rule = plugin_rule(when="p.v >= 5", evaluation={"onSample": "speed"})
+    detector = a_detector(a_stream("speed", stamp="msg.t"), clock=clock, lateness="100ms")
+    driven = PluginDrive(detector, rule, host=LocalHost())
+    samples = [arrival(t, "a", {"v": v, "t": at(t) / 1e9}) for t, v in ((0.3, 1), (0.5, 6), (0.7, 2), (3.0, 7))]
+    other = arrival(4.0, "b", {"v": 0, "t": at(4) / 1e9})
+    assert driven.take(*samples, other, until=4) == ["r a started 0.5", "r a Until 0.7", "r a started 3"]
+    assert [event.values["p"]["count"] for event in driven.events] == [2, 3, 4]
 
 
 def test_the_value_is_in_the_event_and_in_the_actions() -> None:
