@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -255,24 +256,23 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
         engine, intake, recording, now=lambda: clock[0], recorder=recording, on_failure=failures.append
     )
     put = intake.putter("speed")
-
-    def level(wanted: int) -> None:
-        recording.control(engine.now, {"kind": "level", "level": wanted})
-        engine.set_level(wanted)
-
     evaluator.start(RuleSet(detector, tuple(rules)), Restored())
-    for n in range(40):
+    slow = itertools.count(0, SECOND)
+    for n in range(80):
+        engine.stopwatch = partial(next, slow) if 10 < n < 20 else lambda: 0
         clock[0] += SECOND // 4
         payload = b'{"v": %d}' % (20 if (n // 3) % 2 else 5)
         put([(f"vehicles/{client}/speed", payload) for client in ("a", "b")])
         if n in (10, 20):
             evaluator.pause_rule("p", n == 10).result(10)
-        if n in (15, 30):
-            evaluator.call(partial(level, n % 2)).result(10)
         assert [each.subject for each in evaluator.ask("q").result(10)] == ["a", "b"]
     evaluator.stop()
     assert failures == []
     assert {event.rule for event in recording.said} == {"r", "q", "p"}
+    levels = [
+        each.document["level"] for each in recording.records if isinstance(each, Control) and each.kind == "level"
+    ]
+    assert levels == [1, 2, 3, 2]  # three at once while it was slow; one taken back after ten seconds of calm
     assert engine.counters.rule("r").skipped > 0
     assert lines(replay_intake(recording.records, None, None).events) == lines(recording.said)
 
