@@ -28,7 +28,8 @@ from detector.engine.schedule import Only, Schedule
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
 from detector.engine.starts import Starts
-from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Ticks, Timeline, WallTimeline
+from detector.engine.ticks import Ticks
+from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Timeline, WallTimeline
 from detector.engine.transforms import Transforms, TransformStream
 from wayside.api import Detector
 from wayside.api.detector import Clock, Encoding, Stream

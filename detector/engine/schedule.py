@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from detector.engine.clients import Clients
 from detector.engine.load import highest_level, thinning
 from detector.engine.subjects import Subject
-from detector.engine.timeline import Ticks
+from detector.engine.ticks import Ticks
 from wayside.rules import CompiledRule
 
 

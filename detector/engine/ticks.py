@@ -1,0 +1,43 @@
+"""When there is a tick beside those for samples: at the rules' periods, and when a single subject must wake."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection
+
+HOUSEKEEPING = 1_000_000_000
+"""There is a tick at least this often, in nanoseconds, also without rules: old samples are forgotten at ticks."""
+
+
+class Ticks:
+    """When to evaluate beside the samples: at whole multiples of the rules' periods, and when a subject must wake."""
+
+    def __init__(self) -> None:
+        self._periods: tuple[int, ...] = (HOUSEKEEPING,)
+        self._wakes: list[int] = []
+        """A heap; what is over is dropped when it is met."""
+        self.triggers: frozenset[str] = frozenset()
+        """The streams whose samples are evaluated at their own times."""
+
+    def set_periods(self, periods: Collection[int]) -> None:
+        """The rules' periods, in nanoseconds."""
+        self._periods = tuple(sorted({HOUSEKEEPING, *periods}))
+
+    def set_triggers(self, streams: Collection[str]) -> None:
+        """The streams whose samples are evaluated at their own times."""
+        self.triggers = frozenset(streams)
+
+    def wake_at(self, time: int) -> None:
+        """There is a tick at this time, if it is still to come."""
+        heapq.heappush(self._wakes, time)
+
+    def after(self, time: int) -> int:
+        """The first tick after a time."""
+        regular = min(time - time % period + period for period in self._periods)
+        while self._wakes and self._wakes[0] <= time:
+            heapq.heappop(self._wakes)
+        return min(regular, self._wakes[0]) if self._wakes else regular
+
+    def is_regular(self, time: int) -> bool:
+        """Whether the tick is there for a period, not just for a sample or a wake."""
+        return any(time % period == 0 for period in self._periods)
