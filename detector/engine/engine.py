@@ -28,6 +28,7 @@ from detector.engine.schedule import Only, Schedule
 from detector.engine.scopes import Views
 from detector.engine.signals import Signals
 from detector.engine.starts import Starts
+from detector.engine.subjects import Subject
 from detector.engine.ticks import Ticks
 from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Timeline, WallTimeline
 from detector.engine.transforms import Transforms, TransformStream
@@ -157,6 +158,7 @@ class Engine:
             if rule is None or not same_semantics(run, rule):
                 events += run.end_all(now, Reason.RULE_CHANGED)
                 self._starts.forget(name)
+                self.schedule.forget(name)
             else:
                 run.change_actions(rule)
                 runs[name] = run
@@ -218,7 +220,7 @@ class Engine:
         """
         for name in self._runs.keys() & names:
             self._runs[name].forget_pending()
-        self.schedule.paused = frozenset(names & self._runs.keys())
+        self.schedule.paused = frozenset(self._runs.keys() & names)
         self._wake_anew(self.now)
 
     def set_level(self, level: int) -> None:
@@ -343,7 +345,7 @@ class Engine:
         run.counters.skipped += thinned
         if only.clients or only.subjects:
             events += self._evaluated(run, time, only)
-            self._wake(run, time)
+            self._wake(run, time, run.looked_at)
         return events
 
     def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
@@ -386,15 +388,15 @@ class Engine:
                 found.setdefault(arrival.stream, set()).add(client)
         return {stream: frozenset(clients) for stream, clients in found.items()}
 
-    def _wake(self, run: RuleRun, time: int) -> None:
-        for subject, at in run.wakes(time):
+    def _wake(self, run: RuleRun, time: int, subjects: Iterable[Subject]) -> None:
+        for subject, at in run.wakes(time, subjects):
             self.schedule.wake(run.rule.name, subject, at)
 
     def _wake_anew(self, time: int) -> None:
         """Rules or time changed."""
         for run in self._runs.values():
             if run.rule.on_sample is not None:
-                self._wake(run, time)
+                self._wake(run, time, run.subjects)
 
     def _gap(self, time: int, backwards: bool) -> None:
         if backwards:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -96,15 +96,19 @@ class RuleRun:
         """Subjects in an episode beyond the budget: it runs its course, and nobody hears of it."""
         self._budget = Budget()
         self._answers: list[Answer] | None = None
+        self.looked_at: list[Subject] = []
+        """The subjects of the last evaluation."""
 
     def tick(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: Only | None = None
     ) -> list[Event]:
         """Evaluate the rule, for all subjects or those given; returns what started and ended, in order of subjects."""
         events = [] if only is not None else [*self._lost(now, clients)]
+        self.looked_at = []
         seen = candidates(self.rule, views, clients, self._in_progress(), only)
         for candidate in plugins.added(self.rule, seen, self.counters, every_subject=only is None):
             self.counters.evaluations += 1
+            self.looked_at.append(candidate.subject)
             events += self._subject(now, candidate)
         if only is None:
             self._tidy(now)
@@ -130,10 +134,15 @@ class RuleRun:
         for state in self._states.values():
             state.gap()
 
-    def wakes(self, now: int) -> Iterator[tuple[Subject, int | None]]:
-        """When each subject must be looked at; nanoseconds after `now`, None: at no time."""
-        for subject, state in self._states.items():
-            yield subject, state.wake(now, self._timing)
+    @property
+    def subjects(self) -> Iterable[Subject]:
+        """Those with a state of their own."""
+        return self._states
+
+    def wakes(self, now: int, subjects: Iterable[Subject]) -> Iterator[tuple[Subject, int | None]]:
+        """When each of the subjects must be looked at; nanoseconds after `now`, None: at no time."""
+        for subject in subjects:
+            yield subject, self._states[subject].wake(now, self._timing)
 
     def _tidy(self, now: int) -> None:
         self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}

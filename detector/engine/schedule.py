@@ -97,7 +97,13 @@ class Schedule:
             thinned = count % self.thinning(rule) != 0
         wakes = self._wakes.get(rule.name, {})
         due = frozenset(subject for subject, time in wakes.items() if time <= now)
+        for subject in due:  # who is looked at says anew when to wake; who is gone does not
+            del wakes[subject]
         return Only(frozenset() if thinned else clients, due), thinned
+
+    def forget(self, rule: str) -> None:
+        """The rule is gone, or means something else now: none of its subjects wakes."""
+        self._wakes.pop(rule, None)
 
     def wake(self, rule: str, subject: Subject, time: int | None) -> None:
         """Look at the rule's subject at this time (ns), in place of what was said before; None: at no time."""

@@ -89,6 +89,15 @@ def test_a_lost_client_ends_the_episodes_of_a_rule_with_on_sample() -> None:
     assert drive.take(speed(0.3, 20), until=9) == ["r car started 0.3", "r car ClientLost 6"]
 
 
+def test_a_subject_that_was_lost_when_its_time_was_over_is_not_looked_at_with_the_samples_of_others() -> None:
+    drive = Drive(a_detector(clientTimeout="2s"), fast(cooldown="20s", until="speed < 10"))
+    drive.take(speed(0.3, 20, "a"), speed(0.5, 5, "a"), until=20.9)
+    counters = drive.engine.counters.rule("r")
+    before = counters.evaluations
+    drive.take(place(21.0, "a", 0), speed(21.5, 5, "b"), until=22)
+    assert counters.evaluations == before + 1
+
+
 def test_with_on_sample_all_pairs_of_the_samples_client_are_evaluated_and_no_others() -> None:
     scope = {"pairs": {"position": POSITION, "within": 100}}
     rule = a_rule("near", scope=scope, when="distance < 50", evaluation={"onSample": "pose"})
