@@ -346,7 +346,7 @@ class Engine:
         if only.clients or only.subjects:
             events += self._evaluated(run, time, only)
             self._wake(run, time, run.looked_at)
-        return events
+        return sorted(events, key=lambda event: event.subject)
 
     def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
         begin = self.stopwatch()

@@ -89,6 +89,12 @@ def test_a_lost_client_ends_the_episodes_of_a_rule_with_on_sample() -> None:
     assert drive.take(speed(0.3, 20), until=9) == ["r car started 0.3", "r car ClientLost 6"]
 
 
+def test_who_is_lost_and_who_wakes_at_one_tick_are_told_in_order_of_the_subjects() -> None:
+    drive = Drive(a_detector(clientTimeout="4s"), fast(unknownTimeout="2s"))
+    told = drive.take(speed(0.1, 20, "b"), speed(0.2, 20, "a"), arrival(3, "a", {}), until=5)
+    assert told[2:] == ["r a Unknown 5", "r b ClientLost 5"]
+
+
 def test_a_subject_that_was_lost_when_its_time_was_over_is_not_looked_at_with_the_samples_of_others() -> None:
     drive = Drive(a_detector(clientTimeout="2s"), fast(cooldown="20s", until="speed < 10"))
     drive.take(speed(0.3, 20, "a"), speed(0.5, 5, "a"), until=20.9)
