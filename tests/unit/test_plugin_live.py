@@ -15,12 +15,14 @@ from detector.assembly import inlets, make_engine
 from detector.engine.demands import Demand
 from detector.engine.events import Event
 from detector.engine.intake import Intake
+from detector.engine.open_episodes import OpenEpisode
 from detector.evaluator import Evaluator
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.replaying import replay_intake
+from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from tests.unit.driving import a_detector
 from tests.unit.plugin_rules import plugin_rule, plugins
@@ -40,6 +42,9 @@ class Kept:
 
     def events(self, events: Sequence[Event]) -> None:
         self.all += events
+
+    def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
+        pass
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         pass
@@ -70,7 +75,7 @@ def test_killed_and_started_again_the_replay_gives_the_same_events(tmp_path: Pat
             on_failure=failures.append,
             outages=host.outages,
         )
-        evaluator.start(RuleSet(detector, (RULE, OTHER)), [])
+        evaluator.start(RuleSet(detector, (RULE, OTHER)), Restored())
         put = intake.putter("speed")
 
         def feed() -> None:
