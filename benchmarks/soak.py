@@ -276,7 +276,7 @@ def look_at_drops(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
 
 def look_at_streams(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
     buffered = 0.0
-    for stream in ("pose", "points", "telemetry"):
+    for stream in ("pose", "points", "telemetry", "status"):
         verdict.equal(f"samples of {stream}", metrics["stream_samples_total", stream], sent.samples[stream])
         verdict.true(f"{stream} has latencies", metrics["stream_latency_seconds_count", stream] > 0)
         verdict.equal(f"age of {stream}", metrics["stream_age_seconds", stream], FLUSH - 5, 2)
@@ -285,7 +285,7 @@ def look_at_streams(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
         buffered += value if key[0] == "stream_buffered_bytes" else 0
     verdict.equal("the buffer's bytes", metrics["buffer_bytes",], buffered)
     verdict.true("the buffer keeps to its cap", buffered <= metrics["buffer_limit_bytes",])
-    verdict.equal("clients", metrics["clients",], 16)  # fifteen vehicles and the clock
+    verdict.equal("clients", metrics["clients",], 17)  # fifteen vehicles, the expected station, and the clock
     verdict.equal("gaps", metrics["gaps_total",], 0)
 
 

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cbor2
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no package
 
@@ -40,7 +42,7 @@ def traffic(seed: int, start_ns: int, seconds: int, sent: Sent) -> Iterator[tupl
     following, wrong = next(telemetry), next(bad)
     for message in messages(drive, start_ns, seconds):
         while following[0] <= message.after_ns:
-            sent.samples["telemetry"] += 1
+            sent.samples[following[1].rsplit("/", 1)[-1]] += 1
             yield following
             following = next(telemetry)
         while wrong[0] <= message.after_ns:
@@ -73,6 +75,10 @@ def _telemetry(start_ns: int) -> Iterator[tuple[int, str, bytes]]:
                 "tracked": [{"x": 5.3, "y": 0}, {"x": 0, "y": 99 if after % 60_000_000_000 < 10_000_000_000 else 9}],
             }
             yield after, f"vehicles/{vehicle.name}/telemetry", json.dumps(values).encode()
+            if step % 5 == 0:
+                battery = 50 + 45 * math.sin(after / 60e9 + number)
+                status = {"t": (start_ns + after) / 1e9, "battery": battery}
+                yield after, f"vehicles/{vehicle.name}/status", cbor2.dumps(status)
         step += 1
 
 

@@ -251,6 +251,6 @@ def _state(run: RuleRun, schedule: Schedule) -> tuple[RuleState, str]:
         return RuleState.DISABLED, "enabled is false"
     if run.rule.name in schedule.paused:
         return RuleState.PAUSED, "open episodes hold until it is resumed"
-    if (thinned := schedule.thinning(run.rule)) > 1:
+    if not run.rule.on_demand and (thinned := schedule.thinning(run.rule)) > 1:
         return RuleState.DEGRADED, f"the machine is too slow: one of {thinned} evaluations takes place"
     return RuleState.ACCEPTED, "dryRun: events are published, no action runs" if run.rule.dry_run else ""
