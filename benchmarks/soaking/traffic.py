@@ -18,6 +18,9 @@ sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no pa
 from cooperative_recording.messages import messages  # noqa: E402
 from cooperative_recording.vehicles import VEHICLES, simulate  # noqa: E402
 
+START = 1_767_225_600_000_000_000
+"""The first stamp, in nanoseconds since the epoch."""
+
 TELEMETRY_EVERY = 200_000_000
 BAD_EVERY = 60 * 10**9
 """Of each kind of bad sample there is one in so many nanoseconds."""
