@@ -54,6 +54,9 @@ SEED = 3528
 PATIENCE = 120.0
 """Seconds in which the detector must have evaluated the rest."""
 
+SETTLED = 5.0
+"""Seconds after which a task that has ended is nobody's business any more."""
+
 AHEAD = 90.0
 """Seconds of the data's time that the traffic may be ahead of the evaluation."""
 
@@ -138,6 +141,13 @@ class Detector:
             if evaluated < 10**7:  # before the first stamp, the wall's time stands for it
                 wall = time.monotonic() - self._begun
                 self.series.append((wall, evaluated, found["process_resident_memory_bytes",]))
+            self._remove_ended_tasks()
+
+    def _remove_ended_tasks(self) -> None:
+        """What the manager does an hour after their end: without one, the files stay, and the detector knows them."""
+        for file in (self.folder / "out" / "tasks").glob("[!.]*.yaml"):
+            if time.time() - file.stat().st_mtime > SETTLED and "endTime:" in file.read_text():
+                file.unlink()
 
 
 def main() -> None:
