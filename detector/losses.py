@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass
 
 from detector.engine.engine import Engine
@@ -49,11 +49,16 @@ class Losses:
         self._intake = intake
         self._monotonic = monotonic
         self._tallies: list[Tally] = []
+        self._others: list[Callable[[], Iterable[Loss]]] = []
         self._said: dict[str, tuple[int, float]] = {}
 
     def watch(self, tally: Tally) -> None:
         """Say what it counts as well."""
         self._tallies.append(tally)
+
+    def watch_also(self, losses: Callable[[], Iterable[Loss]]) -> None:
+        """Say these as well, whatever counts them."""
+        self._others.append(losses)
 
     def say(self) -> None:
         """Log each kind of loss of which there is more, unless it was said within the last minute."""
@@ -90,6 +95,8 @@ class Losses:
         for tally in self._tallies:
             for entry in tally.entries():
                 yield Loss(entry.text, entry.count, entry.last, cause=entry.cause.name.lower(), stream=entry.name)
+        for losses in self._others:
+            yield from losses()
         if self._intake is not None:
             full = "samples dropped, the intake being full: more come in than are evaluated"
             yield Loss(full, self._intake.dropped, cause="intake_full")

@@ -6,7 +6,7 @@ import asyncio
 import gc
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
@@ -18,6 +18,7 @@ from detector.engine.intake import Intake
 from detector.engine.liveliness import LIVELINESS
 from detector.evaluator import Evaluator
 from detector.event_log import EventLog
+from detector.losses import Loss
 from detector.outlet import LiveOutlet
 from detector.plugins.processes import ProcessHost
 from detector.replay.intake_writer import IntakeWriter
@@ -80,6 +81,8 @@ class Running:
         self._server = None if metrics_port is None else _server(metrics_port, self.answers)
 
         self._evaluator.losses.watch(self._tally)
+        if state is not None:
+            self._evaluator.losses.watch_also(lambda: _of_state(state))
         self._sources = Sources(self._intake.putter, self._tally)
 
     def __enter__(self) -> Running:
@@ -180,6 +183,13 @@ def _server(port: int, answers: Answers) -> StatusServer:
     return StatusServer(
         port, {"/metrics": lambda: (True, metrics.text()), "/healthz": answers.healthy, "/readyz": answers.ready}
     )
+
+
+def _of_state(state: StateFile) -> Iterator[Loss]:
+    """What the state volume did not take or give."""
+    unwritten = "times the state volume could not be written, and was tried again"
+    yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
+    yield Loss("files of the state volume set aside, being unreadable", state.set_aside, cause="state_unreadable")
 
 
 def tune_garbage_collection() -> None:

@@ -30,7 +30,15 @@ _RETRY = 5.0
 def state_file(detector: Detector, holder: str) -> StateFile | None:
     """The Detector's state volume, where it has one. Raises OSError where that cannot be written."""
     state = detector.spec.state
-    return None if state is None else StateFile(Path(state.path), detector.namespace, holder)
+    if state is None:
+        return None
+    try:
+        return StateFile(Path(state.path), detector.namespace, holder)
+    except OSError as error:
+        raise OSError(
+            f"spec.state.path: {state.path} cannot be written ({error.strerror}): give a folder that the detector may "
+            "write to"
+        ) from error
 
 
 class StateFile:
@@ -49,6 +57,7 @@ class StateFile:
         self._thread: threading.Thread | None = None
         self.failures = 0
         """Writes that the disk refused; each was tried again."""
+        self.last_failure = ""
         self.set_aside = 0
         """Files that could not be read."""
 
@@ -127,6 +136,7 @@ class StateFile:
                 self._write(wanted)
             except OSError as error:
                 self.failures += 1
+                self.last_failure = str(error)
                 if not failed:
                     _log.error("the state cannot be written, and is as soon as possible: %s", error)
                 failed = True

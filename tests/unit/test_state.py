@@ -26,7 +26,7 @@ from detector.engine.demands import to_task
 from detector.engine.open_episodes import OpenEpisode, from_document
 from detector.engine.subjects import Subject
 from detector.restoring import what_was_open
-from detector.state import StateFile
+from detector.state import StateFile, state_file
 from detector.streams.zenoh import open_session
 from tests.unit.driving import Drive, a_deploy, a_detector, a_rule, arrival, at
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -305,7 +305,9 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
     assert events_in(tmp_path / "again" / "events.jsonl") == events_in(events)[1:]
 
 
-def test_a_folder_that_cannot_be_made_is_said_at_the_start(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_said_with_its_field(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="file"):
-        StateFile(tmp_path / "file" / "state", "default", "h")
+    detector = a_detector(state={"path": str(tmp_path / "file" / "state")})
+    with pytest.raises(OSError, match=r"spec\.state\.path: .*/file/state cannot be written \(Not a directory\): give"):
+        state_file(detector, "h")
+    assert state_file(a_detector(), "h") is None
