@@ -223,6 +223,8 @@ def scenes(draw: st.DrawFn) -> Scene:
     for name in ("r", "q", "z")[: draw(st.integers(1, 3))]:
         rules[name] = draw(_rule(tuple(rules)))
     messages = draw(st.lists(_message, min_size=10, max_size=40))
+    if draw(st.integers(0, 2)) == 0:  # else there is hardly ever a place of now and of a second ago
+        messages += [Message(time, 0, client, "pose", draw(_places)) for time in range(1, 20, 2) for client in "ab"]
     data = draw(st.booleans())
     gap = None if data or draw(st.integers(0, 3)) else draw(st.tuples(st.integers(5, 15), st.integers(16, 25)))
     return Scene(rules, tuple(messages), data, gap)
