@@ -131,7 +131,7 @@ def read_or_refuse(codec: CdrDecoder | JsonDecoder, payload: bytes) -> None:
         assert stamp is None or stamp >= 0
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(st.sampled_from(MESSAGES), st.data())
 def test_truncated_cdr_is_refused(message: Any, data: st.DataObject) -> None:
     raw = cdr(message)
@@ -141,13 +141,13 @@ def test_truncated_cdr_is_refused(message: Any, data: st.DataObject) -> None:
     read_or_refuse(decoder(message), cut)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(st.sampled_from(MESSAGES), st.sampled_from([b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"]), st.binary())
 def test_random_cdr_gives_a_message_or_a_decode_error(message: Any, start: bytes, noise: bytes) -> None:
     read_or_refuse(decoder(message), start + noise)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(st.sampled_from(MESSAGES), st.booleans(), st.lists(st.tuples(st.integers(0), st.integers(0, 255)), max_size=6))
 def test_mutated_cdr_gives_a_message_or_a_decode_error(
     message: Any, little_endian: bool, changes: list[tuple[int, int]]
@@ -175,7 +175,7 @@ def test_json_reads_back_with_doubles(value: Any) -> None:
     assert_plain(decoded)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.binary() | json_values.map(msgspec.json.encode),
     st.lists(st.tuples(st.integers(0), st.integers(0, 255)), max_size=4),

@@ -51,7 +51,7 @@ def obvious(asked: Search, within: float, maximum: int) -> Near:
     return Near([(a, b) for _, a, b in near[:maximum]], max(0, len(near) - maximum))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.lists(points, max_size=70), st.sampled_from([0.5, 100.0, 250.0, 1e6]), roles)
 def test_the_pairs_within_reach_are_those_that_comparing_all_finds(
     placed: list[Point], within: float, role: tuple[int, int] | None
@@ -62,7 +62,7 @@ def test_the_pairs_within_reach_are_those_that_comparing_all_finds(
     assert found.left_out == 0
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.lists(degrees, max_size=50), st.sampled_from([1.0, 30.0, 5_000.0, 1e6]), roles)
 def test_on_the_earth_neither_the_poles_nor_the_antimeridian_part_a_pair(
     placed: list[Point], within: float, role: tuple[int, int] | None
@@ -71,7 +71,7 @@ def test_on_the_earth_neither_the_poles_nor_the_antimeridian_part_a_pair(
     assert sorted(near_pairs(asked, within, 10_000).pairs) == sorted(obvious(asked, within, 10_000).pairs)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(st.integers(0, 3).map(float) | st.floats(0, 100), st.just(0.0), st.just(0.0)), max_size=60),
     st.integers(1, 300),
