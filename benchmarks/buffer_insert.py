@@ -12,7 +12,7 @@ import statistics
 import time
 
 from detector.engine.engine import Engine
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from wayside.api import Detector
 
 SIZES = (100, 10_000, 1_000_000)

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import msgspec
 
-from detector.engine.demands import plain
+from detector.engine.episodes.demands import plain
 from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
 from detector.sources.supervision import SourceThread

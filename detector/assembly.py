@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from detector.engine.buffering.naming import CLIENT_NAME
 from detector.engine.engine import Engine, KeyReader
-from detector.engine.liveliness import LIVELINESS
-from detector.engine.naming import CLIENT_NAME
-from detector.engine.plugins import PluginHost
-from detector.engine.sample import Decoder
+from detector.engine.samples.liveliness import LIVELINESS
+from detector.engine.samples.sample import Decoder
+from detector.engine.scoping.plugins import PluginHost
 from detector.models.binding import bind_models
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import plugin_problems

@@ -18,7 +18,7 @@ from detector.assembly import DetectorError
 from detector.checking import check_documents, summary
 from detector.cluster.errors import NoClusterError
 from detector.comparison import write_comparison
-from detector.engine.plugins import PluginHost
+from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.errors import RecordingError

@@ -15,13 +15,13 @@ from concurrent.futures import Future
 from typing import Any, Protocol, TypeVar
 
 from detector.assembly import RuleBook, inlets
-from detector.engine.demands import Demand, to_task
 from detector.engine.engine import Engine, NoAnswerError
+from detector.engine.episodes.demands import Demand, to_task
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.evaluation import Answer
-from detector.engine.events import Event
-from detector.engine.intake import Intake
-from detector.engine.open_episodes import OpenEpisode
-from detector.engine.sample import Arrival
+from detector.engine.samples.intake import Intake
+from detector.engine.samples.sample import Arrival
 from detector.losses import Losses
 from detector.overload import LONG, Overload
 from detector.plugins.outages import Outages

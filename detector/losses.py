@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass
 
 from detector.engine.engine import Engine
-from detector.engine.intake import Intake
-from detector.engine.timeline import DataTimeline
+from detector.engine.samples.intake import Intake
+from detector.engine.timing.timeline import DataTimeline
 from detector.streams.tally import Tally
 
 _log = logging.getLogger(__name__)

@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 
 from detector.actions.deploy import DemandReconciler
-from detector.engine.demands import Demand
-from detector.engine.events import Event
-from detector.engine.open_episodes import OpenEpisode
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.event_log import EventLog
 from detector.state import StateFile
 from detector.streams.zenoh import Network, NetworkError

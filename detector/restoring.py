@@ -7,8 +7,8 @@ from contextlib import aclosing
 from dataclasses import dataclass
 
 from detector.actions.stores import Snapshot, TaskStore, live_demands
-from detector.engine.demands import Demand
-from detector.engine.open_episodes import OpenEpisode
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.state import StateFile
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from detector.actions.deploy import DemandReconciler
 from detector.answers import Answers
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
-from detector.engine.intake import Intake
-from detector.engine.liveliness import LIVELINESS
+from detector.engine.samples.intake import Intake
+from detector.engine.samples.liveliness import LIVELINESS
 from detector.evaluator import Evaluator
 from detector.event_log import EventLog
 from detector.losses import Loss

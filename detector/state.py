@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from detector.engine.open_episodes import OpenEpisode, from_document
+from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from wayside.api import Detector
 from wayside.names import encode
 

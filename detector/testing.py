@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from detector.engine.events import Event
+from detector.engine.episodes.events import Event
 from detector.replay.intake_file import is_intake_file, read_intake
 from detector.replay.latched import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types

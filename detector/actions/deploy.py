@@ -29,7 +29,7 @@ from detector.actions.stores import (
     TaskStore,
 )
 from detector.cluster.backoff import Backoff
-from detector.engine.demands import Demand, plain, to_task
+from detector.engine.episodes.demands import Demand, plain, to_task
 
 _log = logging.getLogger(__name__)
 

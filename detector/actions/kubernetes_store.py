@@ -21,7 +21,7 @@ from detector.actions.stores import (
 from detector.cluster.api import Api, JsonObject, Resource
 from detector.cluster.errors import AlreadyExistsError, ApiError, NotFoundError, UnavailableError
 from detector.cluster.reflector import Changed, Deleted, Listed, Reflector, version_of
-from detector.engine.demands import holder_label
+from detector.engine.episodes.demands import holder_label
 from wayside.api import API_VERSION, ApplicationTask
 from wayside.api.applicationtask import HOLDER_LABEL
 from wayside.api.base import JsonValue

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from detector.actions.steps import Step, next_step
 from detector.actions.stores import Snapshot, StoredTask, Update
-from detector.engine.demands import Demand
+from detector.engine.episodes.demands import Demand
 
 _log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from enum import Enum
 from typing import Any
 
 from detector.actions.stores import StoredTask
-from detector.engine.demands import Demand, plain
+from detector.engine.episodes.demands import Demand, plain
 from wayside.times import format_time
 
 

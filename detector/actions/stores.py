@@ -7,7 +7,7 @@ from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from detector.engine.demands import Demand, from_task
+from detector.engine.episodes.demands import Demand, from_task
 from wayside.api import ApplicationTask
 from wayside.api.base import JsonValue
 

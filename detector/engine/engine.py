@@ -8,30 +8,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
-from detector.engine.buffer import Buffer
-from detector.engine.clients import Clients
+from detector.engine.buffering.buffer import Buffer
+from detector.engine.buffering.clients import Clients
+from detector.engine.buffering.inflow import Inflow
+from detector.engine.buffering.lanes import lane_makers
+from detector.engine.buffering.messages import KeyReader, Messages
+from detector.engine.buffering.naming import MessageClients
 from detector.engine.counters import Counters
-from detector.engine.demands import Demand
-from detector.engine.episodes import Reason
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
+from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import Answer, Identity, RuleRun, same_semantics
-from detector.engine.events import Event
-from detector.engine.inflow import Inflow
-from detector.engine.lanes import lane_makers
-from detector.engine.messages import KeyReader, Messages
-from detector.engine.naming import MessageClients
-from detector.engine.open_episodes import OpenEpisode, ended_while_away, episode_of
-from detector.engine.plugins import NoPlugins, PluginHost, PluginSignals
-from detector.engine.positions import Positions
-from detector.engine.queries import BufferQueries
-from detector.engine.sample import Arrival, Decoder, Sample
-from detector.engine.schedule import Only, Schedule
-from detector.engine.scopes import Views
-from detector.engine.signals import Signals
-from detector.engine.starts import Starts
-from detector.engine.subjects import Subject
-from detector.engine.ticks import Ticks
-from detector.engine.timeline import DataTimeline, Gap, Insert, Step, Tick, Timeline, WallTimeline
-from detector.engine.transforms import Transforms, TransformStream
+from detector.engine.queries.queries import BufferQueries
+from detector.engine.queries.transforms import Transforms, TransformStream
+from detector.engine.samples.sample import Arrival, Decoder, Sample
+from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals
+from detector.engine.scoping.positions import Positions
+from detector.engine.scoping.scopes import Views
+from detector.engine.signals.signals import Signals
+from detector.engine.signals.starts import Starts
+from detector.engine.timing.schedule import Only, Schedule
+from detector.engine.timing.ticks import Ticks
+from detector.engine.timing.timeline import DataTimeline, Gap, Insert, Step, Tick, Timeline, WallTimeline
 from wayside.api import Detector
 from wayside.api.detector import Clock, Encoding, Stream
 from wayside.rules import CompiledRule, compile_stream, in_order

@@ -8,19 +8,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from detector.engine.budget import Budget
-from detector.engine.clients import Clients
+from detector.engine.buffering.clients import Clients
 from detector.engine.counters import RuleCounters
-from detector.engine.demands import Demand
-from detector.engine.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
-from detector.engine.events import Event
-from detector.engine.following import followed
-from detector.engine.open_episodes import OpenEpisode
-from detector.engine.plugins import PluginSignals
-from detector.engine.schedule import Only
-from detector.engine.scopes import Candidate, Views, candidates
-from detector.engine.snapshots import snapshot
-from detector.engine.subjects import Subject, fits
+from detector.engine.episodes.budget import Budget
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.following import followed
+from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.subjects import Subject, fits
+from detector.engine.scoping.plugins import PluginSignals
+from detector.engine.scoping.scopes import Candidate, Views, candidates
+from detector.engine.scoping.snapshots import snapshot
+from detector.engine.timing.schedule import Only
 from wayside.api.base import JsonValue
 from wayside.expressions import UNKNOWN, Expression, InterpolationError, Unknown
 from wayside.rules import CompiledDeploy, CompiledRule

@@ -3,10 +3,10 @@
 What a plugin needs is here; everything else in this package is how the detector runs it.
 """
 
-from detector.engine.geometry import Pose
-from detector.engine.poses import PoseError, pose_in
-from detector.engine.queries import DecodedSample, Queries, QueryError
-from detector.engine.transforms import TransformError
+from detector.engine.queries.geometry import Pose
+from detector.engine.queries.poses import PoseError, pose_in
+from detector.engine.queries.queries import DecodedSample, Queries, QueryError
+from detector.engine.queries.transforms import TransformError
 from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
 
 __all__ = [

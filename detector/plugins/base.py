@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Generic, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, Field, ValidationInfo
 
-from detector.engine.queries import Queries
+from detector.engine.queries.queries import Queries
 from wayside.api.base import Model
 from wayside.expressions import Value
 

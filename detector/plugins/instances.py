@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from detector.engine.plugins import PluginCall, PluginFailedError
-from detector.engine.queries import Queries
+from detector.engine.queries.queries import Queries
+from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.base import Plugin, Subject
 from detector.plugins.registry import prepare
 from detector.plugins.values import plain

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from detector.engine.plugins import PluginCall
+from detector.engine.scoping.plugins import PluginCall
 
 KIND = "plugin"
 """Of the controls in an intake file."""

@@ -14,8 +14,8 @@ import sys
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from detector.engine.plugins import PluginCall, PluginFailedError
-from detector.engine.queries import Queries
+from detector.engine.queries.queries import Queries
+from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.wire import ClosedError, Wire
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledPlugin

@@ -10,8 +10,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 
-from detector.engine.plugins import PluginCall, PluginFailedError
-from detector.engine.queries import Queries
+from detector.engine.queries.queries import Queries
+from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.outages import Outages
 from detector.plugins.process import PATIENCE, START_PATIENCE, SignalProcess, StoppedError
 from wayside.expressions import Reason, Value

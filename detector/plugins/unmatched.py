@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from detector.engine.geometry import NO_MOTION, Pose
-from detector.engine.queries import DecodedSample, Queries, frame_of
-from detector.engine.transforms import TransformError
-from detector.engine.tuples import matched
+from detector.engine.queries.geometry import NO_MOTION, Pose
+from detector.engine.queries.queries import DecodedSample, Queries, frame_of
+from detector.engine.queries.transforms import TransformError
+from detector.engine.queries.tuples import matched
 from detector.plugins.assignment import Point, assigned
 from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
 from detector.plugins.tracking import Tracks

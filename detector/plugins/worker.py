@@ -17,10 +17,10 @@ from typing import Any
 
 import msgspec
 
-from detector.engine.geometry import Pose
-from detector.engine.poses import PoseError
-from detector.engine.queries import DecodedSample, QueryError
-from detector.engine.transforms import TransformError
+from detector.engine.queries.geometry import Pose
+from detector.engine.queries.poses import PoseError
+from detector.engine.queries.queries import DecodedSample, QueryError
+from detector.engine.queries.transforms import TransformError
 from detector.plugins.base import Subject
 from detector.plugins.instances import Instances, failure_text
 from detector.plugins.registry import PluginError

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from detector.engine.events import Event
+from detector.engine.episodes.events import Event
 from wayside.times import format_time
 
 

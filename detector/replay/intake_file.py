@@ -17,7 +17,7 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, DataEnd, Header, McapRecord, Message
 from mcap.stream_reader import StreamReader
 
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.plugins.outages import KIND as OUTAGE
 from detector.replay.errors import DAMAGE, RecordingError
 

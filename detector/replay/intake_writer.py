@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 from mcap.writer import Writer
 
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.replay.intake_file import CONTROL_TOPIC, LIBRARY, STREAM, Control
 from detector.streams.codecs.ros import RosTypes, standard
 from wayside.api.detector import Stream

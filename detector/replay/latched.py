@@ -11,9 +11,9 @@ from itertools import chain
 from pathlib import Path
 
 from detector.assembly import inlets
-from detector.engine.lanes import latched_topics
-from detector.engine.latched import Topic
-from detector.engine.sample import Arrival
+from detector.engine.buffering.lanes import latched_topics
+from detector.engine.buffering.latched import Topic
+from detector.engine.samples.sample import Arrival
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from wayside.api import Detector

@@ -13,7 +13,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.replay.errors import RecordingError
 from detector.replay.message import Message, Wanted
 from detector.streams.codecs.etsi.messages import BY_NUMBER, PREFIX

@@ -15,12 +15,12 @@ from operator import itemgetter
 from typing import Any
 
 from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
-from detector.engine.demands import Demand, from_task, to_task
 from detector.engine.engine import Engine, NoAnswerError
-from detector.engine.events import Event
-from detector.engine.open_episodes import OpenEpisode, from_document
-from detector.engine.plugins import PluginHost
-from detector.engine.sample import Arrival
+from detector.engine.episodes.demands import Demand, from_task, to_task
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.open_episodes import OpenEpisode, from_document
+from detector.engine.samples.sample import Arrival
+from detector.engine.scoping.plugins import PluginHost
 from detector.losses import Losses
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.message import Message
 from wayside.api.detector import Encoding, Stream

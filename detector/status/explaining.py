@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from detector.engine.buffer import NEVER
-from detector.engine.demands import plain
+from detector.engine.buffering.buffer import NEVER
 from detector.engine.engine import Engine
+from detector.engine.episodes.demands import plain
 from detector.engine.evaluation import Sight
-from detector.engine.snapshots import snapshot
+from detector.engine.scoping.snapshots import snapshot
 from detector.status.model import Explanation, SubjectStatus
 from wayside.expressions import UNKNOWN
 from wayside.names import parse_subject

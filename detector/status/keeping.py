@@ -16,11 +16,11 @@ from importlib.metadata import version
 from itertools import islice
 
 from detector.assembly import Refusal
-from detector.engine.buffer import NEVER, Lane
+from detector.engine.buffering.buffer import NEVER, Lane
 from detector.engine.engine import Engine
 from detector.engine.evaluation import RuleRun
-from detector.engine.sample import Arrival
-from detector.engine.schedule import Schedule
+from detector.engine.samples.sample import Arrival
+from detector.engine.timing.schedule import Schedule
 from detector.losses import Losses
 from detector.status.explaining import Watching
 from detector.status.model import (

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from detector.engine.liveliness import Token
+from detector.engine.samples.liveliness import Token
 from detector.streams.session import Connections
 from wayside.keys import KeyPattern
 

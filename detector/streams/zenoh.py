@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from detector.engine.liveliness import LIVELINESS
+from detector.engine.samples.liveliness import LIVELINESS
 from detector.streams.answering import Answering
 from detector.streams.bursts import Put
 from detector.streams.layouts import Pump, pump_for

@@ -13,7 +13,7 @@ import pytest
 from detector.actions.deploy import DemandReconciler, DeployCounts
 from detector.actions.kubernetes_store import KubernetesTaskStore
 from detector.actions.stores import TaskExistsError, manifest, restore
-from detector.engine.demands import Demand, to_task
+from detector.engine.episodes.demands import Demand, to_task
 from tests.cluster.api import Api, Object, Objects
 from tests.cluster.background import PATIENCE, Background, background
 from tests.cluster.controlplane import ControlPlane

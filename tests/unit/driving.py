@@ -11,8 +11,8 @@ from typing import Any
 
 from detector.assembly import inlets, make_engine
 from detector.engine.engine import Engine
-from detector.engine.events import Event
-from detector.engine.sample import Arrival
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Arrival
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.rules import CompiledRule, compile_rule
 

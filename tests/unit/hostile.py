@@ -7,7 +7,7 @@ from contextlib import suppress
 from random import Random
 from typing import Any
 
-from detector.engine.sample import DecodeError, Decoder
+from detector.engine.samples.sample import DecodeError, Decoder
 from detector.streams.codecs.doubles import EXACT
 
 _LARGE = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x7f\xff\xff\xff\xff\xff\xff\xff")

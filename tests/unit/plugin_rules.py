@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from detector.assembly import inlets, make_engine
-from detector.engine.plugins import PluginHost
+from detector.engine.scoping.plugins import PluginHost
 from tests.unit.driving import Drive, a_rule, at, compiled
 from wayside.api import Detector, EventRule
 

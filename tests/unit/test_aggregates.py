@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from detector.engine.aggregates import calculated, distinct
+from detector.engine.signals.aggregates import calculated, distinct
 from tests.unit.driving import a_rule
 from wayside.api.eventrule import OF_A_SAMPLE, WINDOWED, Aggregate
 from wayside.expressions import UNKNOWN

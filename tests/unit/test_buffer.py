@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.engine.buffer import Buffer, Lane
-from detector.engine.sample import SAMPLE_OVERHEAD, Sample, Stamped
+from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
 
 
 def a_lane(client: str = "car", stream: str = "s", duration: int = 10**9, maximum_bytes: int | None = None) -> Lane:

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.engine.buffer import Buffer, Lane
-from detector.engine.latched import LatchedLane, by_key
-from detector.engine.sample import SAMPLE_OVERHEAD, Sample, Stamped
-from detector.engine.usage import buffer_usage
+from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.buffering.latched import LatchedLane, by_key
+from detector.engine.buffering.usage import buffer_usage
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
 from detector.replay.latched import recorded_arrivals
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import Router

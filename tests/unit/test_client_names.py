@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from detector.assembly import DetectorError, inlets
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.streams.codecs.etsi.times import its_ms
 from tests.unit.driving import Drive, a_detector, a_rule, at
 from tests.unit.its_messages import a_cam

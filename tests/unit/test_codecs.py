@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from detector.engine.sample import Arrival, DecodeError
+from detector.engine.samples.sample import Arrival, DecodeError
 from detector.streams.codecs import CdrDecoder, JsonDecoder, UnknownTypeError, codec_for
 from detector.streams.codecs.doubles import EXACT
 from detector.streams.codecs.json_ import MAX_DEPTH

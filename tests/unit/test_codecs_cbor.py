@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs import CborDecoder, JsonDecoder, RawDecoder, codec_for
 from detector.streams.codecs.cbor import MAX_DEPTH
 from detector.streams.codecs.doubles import EXACT

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector import cli
-from detector.engine.episodes import Reason
-from detector.engine.events import Event
+from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.events import Event
 from detector.replay.comparing import compare
 from tests.unit import onnx_models
 from tests.unit.driving import START, a_detector, a_rule, at

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.engine.demands import Demand, from_task, holder_label, to_task
+from detector.engine.episodes.demands import Demand, from_task, holder_label, to_task
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import HOLDER_LABEL
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from detector.actions.deploy import DemandReconciler, DeployCounts
 from detector.actions.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.stores import manifest, restore
-from detector.engine.demands import Demand, to_task
+from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.test_demands import DEMAND
 from wayside.api.documents import load_documents
 from wayside.times import format_time

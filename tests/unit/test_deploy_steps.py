@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from detector.actions.ledger import Ledger
 from detector.actions.steps import Step, next_step
 from detector.actions.stores import Snapshot, StoredTask, Update
-from detector.engine.demands import Demand, to_task
+from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.test_demands import DEMAND
 
 DEMANDS = st.builds(

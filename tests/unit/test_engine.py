@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from detector.engine.demands import Demand
+from detector.engine.episodes.demands import Demand
 from tests.unit.driving import POSITION, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at, compiled
 
 SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}

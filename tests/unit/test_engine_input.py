@@ -9,8 +9,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from detector.engine import inflow
-from detector.engine.sample import Arrival
+from detector.engine.buffering import inflow
+from detector.engine.samples.sample import Arrival
 from tests.unit.driving import POSITION, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at, lines
 from tests.unit.ros_messages import cdr, pose_stamped
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from detector.engine.events import Event
-from detector.engine.sample import Arrival
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Arrival
 from tests.unit.driving import SECOND, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled, told
 
 KEPT, STALE, OVER = 4.0, 3.0, 2.0

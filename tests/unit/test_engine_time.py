@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.engine import Engine
-from detector.engine.events import Event
-from detector.engine.sample import Arrival
-from detector.engine.timeline import DataTimeline
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Arrival
+from detector.engine.timing.timeline import DataTimeline
 from tests.unit.driving import (
     POSITION,
     SECOND,

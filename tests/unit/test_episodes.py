@@ -8,7 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.engine.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, both, negation
+from detector.engine.episodes.episodes import (
+    Ended,
+    Observation,
+    Reason,
+    Started,
+    SubjectState,
+    Timing,
+    Truth,
+    both,
+    negation,
+)
 from wayside.expressions import UNKNOWN
 
 TRUTHS: tuple[Truth, ...] = (True, False, UNKNOWN)

@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 
 from detector.assembly import inlets
 from detector.engine.engine import Engine
-from detector.engine.events import Event
-from detector.engine.sample import Arrival
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Arrival
 from tests.reference.detector import Reference, Told
 from tests.reference.world import SECOND, Sample, World
 from tests.unit.driving import START, a_detector, a_rule, a_stream, compiled

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from detector.assembly import DetectorError, inlets
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder
 from detector.streams.codecs.etsi.messages import BY_NAME, packaged_definitions
 from detector.streams.codecs.etsi.times import its_ms, nearest, unix_ns

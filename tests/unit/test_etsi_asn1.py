@@ -12,7 +12,7 @@ import asn1tools
 import pytest
 
 from detector.assembly import DetectorError, inlets
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions
 from detector.streams.codecs.etsi.bits import Bits
 from detector.streams.codecs.etsi.bounds import span_constraints

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.engine.sample import Arrival, DecodeError
+from detector.engine.samples.sample import Arrival, DecodeError
 from detector.streams.codecs.etsi import EtsiDecoder
 from detector.streams.codecs.etsi.packets import message_in
 from tests.unit.driving import Drive, a_detector, a_rule, at

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import EtsiDecoder
 from detector.streams.codecs.etsi.packets import message_in
 from tests.unit.its_messages import a_cam

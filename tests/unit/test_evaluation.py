@@ -11,12 +11,12 @@ import pytest
 from pydantic import ValidationError
 
 from detector.assembly import inlets, make_engine
-from detector.engine.demands import Demand
 from detector.engine.engine import NoAnswerError
-from detector.engine.events import Event
-from detector.engine.intake import Intake
-from detector.engine.load import highest_level, thinning
-from detector.engine.sample import Arrival
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.events import Event
+from detector.engine.samples.intake import Intake
+from detector.engine.samples.sample import Arrival
+from detector.engine.timing.load import highest_level, thinning
 from detector.evaluator import Evaluator
 from detector.overload import CALM, LONG, Overload
 from detector.replay.intake_file import Control

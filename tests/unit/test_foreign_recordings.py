@@ -11,7 +11,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
 from detector.assembly import inlets
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.latched import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types

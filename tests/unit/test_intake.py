@@ -6,8 +6,8 @@ import itertools
 import threading
 import time
 
-from detector.engine.intake import Intake
-from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
+from detector.engine.samples.intake import Intake
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
 
 
 class Clock:

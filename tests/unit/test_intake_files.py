@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control, is_intake_file, read_intake
 from detector.replay.intake_writer import IntakeWriter
@@ -130,7 +130,7 @@ def test_a_killed_writer_leaves_what_it_took_in_up_to_the_last_second(tmp_path: 
     program = f"""
 import sys, time
 from pathlib import Path
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.replay.intake_writer import IntakeWriter
 writer = IntakeWriter(Path({str(path)!r}))
 number = 0

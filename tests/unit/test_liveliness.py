@@ -10,9 +10,9 @@ import zenoh
 from detector.actions.deploy import DemandReconciler
 from detector.actions.file_store import FileTaskStore
 from detector.assembly import DetectorError, inlets
-from detector.engine import liveliness
-from detector.engine.liveliness import LIVELINESS, Token
-from detector.engine.sample import Arrival
+from detector.engine.samples import liveliness
+from detector.engine.samples.liveliness import LIVELINESS, Token
+from detector.engine.samples.sample import Arrival
 from detector.replay.intake_file import read_intake
 from detector.replay.replaying import replay_intake
 from detector.restoring import Restored

@@ -6,7 +6,7 @@ from itertools import count
 
 import pytest
 
-from detector.engine.intake import Intake
+from detector.engine.samples.intake import Intake
 from detector.losses import Losses
 from tests.unit.driving import POSITION, Drive, a_detector, a_rule, arrival
 

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from detector.assembly import RuleBook, inlets, make_engine
 from detector.checking import check_documents
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from tests.unit import onnx_models
 from tests.unit.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 from wayside.api import Detector, EventRule

@@ -9,8 +9,8 @@ from itertools import permutations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.engine.nearness import Near, Search, near_pairs
-from detector.engine.positions import Point, distance, point
+from detector.engine.scoping.nearness import Near, Search, near_pairs
+from detector.engine.scoping.positions import Point, distance, point
 from wayside.rules import CompiledPosition
 
 FLAT = CompiledPosition("pose", {})

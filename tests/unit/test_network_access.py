@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from detector.access import AccessError, Login, login, tls_files
 from detector.actions.deploy import DemandReconciler
 from detector.actions.file_store import FileTaskStore
-from detector.engine.liveliness import LIVELINESS, Token
+from detector.engine.samples.liveliness import LIVELINESS, Token
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from detector.assembly import inlets, make_engine
-from detector.engine.demands import Demand
-from detector.engine.events import Event
-from detector.engine.intake import Intake
-from detector.engine.open_episodes import OpenEpisode
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.samples.intake import Intake
 from detector.evaluator import Evaluator
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost

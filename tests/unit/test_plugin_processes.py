@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from detector.engine.events import Event
-from detector.engine.sample import Arrival
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Arrival
 from detector.plugins.instances import LocalHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost

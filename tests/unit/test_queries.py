@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.engine.geometry import Pose, slerp, unit
-from detector.engine.poses import PoseError, pose_in
-from detector.engine.queries import BufferQueries
-from detector.engine.tuples import matched, nearest
+from detector.engine.queries.geometry import Pose, slerp, unit
+from detector.engine.queries.poses import PoseError, pose_in
+from detector.engine.queries.queries import BufferQueries
+from detector.engine.queries.tuples import matched, nearest
 from tests.unit.driving import Drive, a_detector, a_stream, arrival, at
 
 STAMPED = {"stamp": "msg.t"}

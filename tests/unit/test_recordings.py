@@ -10,7 +10,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.message import Message

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from detector.engine.intake import Intake
+from detector.engine.samples.intake import Intake
 from detector.evaluator import Evaluator
 from detector.replay.intake_file import Control
 from detector.replay.replaying import replay_arrivals, replay_intake

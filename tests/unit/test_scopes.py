@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from detector.engine.demands import from_task, to_task
+from detector.engine.episodes.demands import from_task, to_task
 from tests.unit.driving import POSITION, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at
 
 SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}

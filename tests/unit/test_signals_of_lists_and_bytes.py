@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from tests.unit.driving import POSITION, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, told
 
 COMPARED = a_rule(

@@ -22,9 +22,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.actions.file_store import FileTaskStore
-from detector.engine.demands import to_task
-from detector.engine.open_episodes import OpenEpisode, from_document
-from detector.engine.subjects import Subject
+from detector.engine.episodes.demands import to_task
+from detector.engine.episodes.open_episodes import OpenEpisode, from_document
+from detector.engine.episodes.subjects import Subject
 from detector.restoring import what_was_open
 from detector.state import StateFile, state_file
 from detector.streams.zenoh import open_session

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from detector.assembly import Refusal
-from detector.engine.intake import Intake
-from detector.engine.sample import Arrival
+from detector.engine.samples.intake import Intake
+from detector.engine.samples.sample import Arrival
 from detector.evaluator import Evaluator
 from detector.inquiry import inquire
 from detector.losses import Losses

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from detector.engine.geometry import Pose
-from detector.engine.sample import Arrival
-from detector.engine.transforms import TransformError
+from detector.engine.queries.geometry import Pose
+from detector.engine.queries.transforms import TransformError
+from detector.engine.samples.sample import Arrival
 from tests.unit.driving import START, Drive, a_detector, at
 from tests.unit.ros_messages import cdr, header, make
 from wayside.api import Detector

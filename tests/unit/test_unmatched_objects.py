@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.engine.sample import Arrival
+from detector.engine.samples.sample import Arrival
 from detector.plugins.assignment import assigned
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import PluginError, prepare

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from detector.engine.sample import Decoder
+from detector.engine.samples.sample import Decoder
 from detector.streams.codecs.cbor import CborDecoder
 from detector.streams.codecs.cdr import CdrDecoder
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder, OwnDefinitions

@@ -14,7 +14,7 @@ from typing import Any
 
 import cbor2
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.doubles import number
 
 MAX_DEPTH = 64

@@ -13,7 +13,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.serde import SerdeError
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.doubles import EXACT, number
 from detector.streams.codecs.ros import RosTypes, UnknownTypeError, standard
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.doubles import number
 
 MAX_DEPTH = 64

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi.asn1 import DefinitionError
 from detector.streams.codecs.etsi.bits import Bits
 from detector.streams.codecs.etsi.members import message_members

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 
 _FRAGMENT = 16384
 """A length beyond is sent in pieces of one to four times this many."""

@@ -9,7 +9,7 @@ Headers as in ETSI EN 302 636-4-1 (GeoNetworking), EN 302 636-5-1 (BTP) and IEEE
 
 from __future__ import annotations
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 
 MAXIMUM = 65535
 """Bytes; no packet of an ITS station is longer."""

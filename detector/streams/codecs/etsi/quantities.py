@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.doubles import number
 from detector.streams.codecs.etsi.asn1 import Integer
 from detector.streams.codecs.etsi.times import unix_ns

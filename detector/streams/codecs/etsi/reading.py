@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from detector.engine.sample import DecodeError
+from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import asn1
 from detector.streams.codecs.etsi.bits import Bits
 from detector.streams.codecs.etsi.quantities import UNAVAILABLE, quantity

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from detector.engine.buffer import Buffer
-from detector.engine.clients import is_fresh
+from detector.engine.buffering.buffer import Buffer
+from detector.engine.buffering.clients import is_fresh
+from detector.engine.buffering.messages import Messages
 from detector.engine.counters import RuleCounters
-from detector.engine.messages import Messages
-from detector.engine.sample import Sample
+from detector.engine.samples.sample import Sample
 from wayside import geodesy
 from wayside.expressions import UNKNOWN, Expression, Unknown, Value
 from wayside.rules import CompiledPosition

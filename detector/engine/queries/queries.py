@@ -15,14 +15,14 @@ from itertools import islice
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
 
-from detector.engine.buffer import Buffer, Lane
-from detector.engine.clients import Clients, fresh_streams
-from detector.engine.geometry import Pose
-from detector.engine.messages import Messages
-from detector.engine.poses import pose_in
-from detector.engine.sample import Sample
-from detector.engine.transforms import Transforms
-from detector.engine.tuples import matched, nearest
+from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.buffering.clients import Clients, fresh_streams
+from detector.engine.buffering.messages import Messages
+from detector.engine.queries.geometry import Pose
+from detector.engine.queries.poses import pose_in
+from detector.engine.queries.transforms import Transforms
+from detector.engine.queries.tuples import matched, nearest
+from detector.engine.samples.sample import Sample
 from wayside.expressions import UNKNOWN
 
 _STAMP = attrgetter("stamp")
@@ -90,7 +90,7 @@ class Queries(Protocol):
     def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
         """Samples of several streams that belong together, oldest first; `slop` is in nanoseconds.
 
-        The first stream is the reference; how they are found stands in engine/tuples.py.
+        The first stream is the reference; how they are found stands in engine/queries/tuples.py.
         """
 
     def transform(self, client: str, target: str, source: str, stamp: int | None = None) -> Pose:

@@ -13,12 +13,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from detector.engine.buffer import Buffer
+from detector.engine.buffering.buffer import Buffer
+from detector.engine.buffering.messages import Messages
 from detector.engine.counters import Counters
-from detector.engine.geometry import NO_MOTION, Pose
-from detector.engine.messages import Messages
-from detector.engine.poses import PoseError, pose_in
-from detector.engine.sample import Sample
+from detector.engine.queries.geometry import NO_MOTION, Pose
+from detector.engine.queries.poses import PoseError, pose_in
+from detector.engine.samples.sample import Sample
 from wayside.expressions import UNKNOWN
 
 _CLIENT = "${client}"

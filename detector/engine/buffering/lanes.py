@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from detector.engine.buffer import Lane
-from detector.engine.latched import LatchedLane, Topic, by_key, by_key_and_frames
-from detector.engine.sample import Decoder
+from detector.engine.buffering.buffer import Lane
+from detector.engine.buffering.latched import LatchedLane, Topic, by_key, by_key_and_frames
+from detector.engine.samples.sample import Decoder
 from wayside.api import Detector
 from wayside.api.detector import Stream
 

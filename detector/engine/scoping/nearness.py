@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from detector.engine.positions import Point
+from detector.engine.scoping.positions import Point
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

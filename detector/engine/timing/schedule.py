@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from detector.engine.clients import Clients
-from detector.engine.load import highest_level, thinning
-from detector.engine.subjects import Subject
-from detector.engine.ticks import Ticks
+from detector.engine.buffering.clients import Clients
+from detector.engine.episodes.subjects import Subject
+from detector.engine.timing.load import highest_level, thinning
+from detector.engine.timing.ticks import Ticks
 from wayside.rules import CompiledRule
 
 

@@ -10,7 +10,7 @@ import heapq
 from collections import deque
 from collections.abc import Collection, Iterator
 
-from detector.engine.sample import SAMPLE_OVERHEAD, Sample
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample
 
 NEVER = -(2**63)
 """Before all times: nothing has come yet."""

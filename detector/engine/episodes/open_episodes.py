@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from detector.engine.demands import Demand, plain
-from detector.engine.episodes import Reason
-from detector.engine.events import Event
-from detector.engine.subjects import Subject
+from detector.engine.episodes.demands import Demand, plain
+from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.subjects import Subject
 from wayside.api.base import JsonValue
 from wayside.names import parse_subject
 from wayside.times import format_time, parse_time

@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 from detector.engine.counters import RuleCounters
-from detector.engine.queries import Queries
-from detector.engine.scopes import Candidate
+from detector.engine.queries.queries import Queries
+from detector.engine.scoping.scopes import Candidate
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledRule
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from operator import itemgetter
 
-from detector.engine.buffer import Buffer, Lane
-from detector.engine.clients import Clients
+from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.buffering.clients import Clients
+from detector.engine.buffering.lanes import LaneMaker
+from detector.engine.buffering.messages import KeyReader
+from detector.engine.buffering.naming import MessageClients
 from detector.engine.counters import Counters
-from detector.engine.lanes import LaneMaker
-from detector.engine.liveliness import LIVELINESS, Token
-from detector.engine.messages import KeyReader
-from detector.engine.naming import MessageClients
-from detector.engine.sample import SAMPLE_OVERHEAD, Arrival, Stamped
+from detector.engine.samples.liveliness import LIVELINESS, Token
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Stamped
 from wayside.api import Detector
 
 MAXIMUM_CLIENTS = 100_000

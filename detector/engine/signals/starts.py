@@ -11,10 +11,10 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from detector.engine.buffer import Buffer, Lane
-from detector.engine.demands import plain
-from detector.engine.events import Event
-from detector.engine.sample import Sample, Stamped
+from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.episodes.demands import plain
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Sample, Stamped
 from wayside.rules import CompiledRule, episode_stream
 
 MAXIMUM_BYTES = 64 * 2**20

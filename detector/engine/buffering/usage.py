@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from detector.engine.buffer import Buffer
+from detector.engine.buffering.buffer import Buffer
 
 
 @dataclass(slots=True)

@@ -6,16 +6,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from detector.engine.buffer import Buffer
-from detector.engine.clients import Clients, fresh_streams
+from detector.engine.buffering.buffer import Buffer
+from detector.engine.buffering.clients import Clients, fresh_streams
 from detector.engine.counters import RuleCounters
-from detector.engine.episodes import Truth, both
-from detector.engine.models import add_models
-from detector.engine.nearness import Search, near_pairs
-from detector.engine.positions import Place, Positions, described, distance, point
-from detector.engine.schedule import Only
-from detector.engine.signals import Signals
-from detector.engine.subjects import Subject
+from detector.engine.episodes.episodes import Truth, both
+from detector.engine.episodes.subjects import Subject
+from detector.engine.scoping.nearness import Search, near_pairs
+from detector.engine.scoping.positions import Place, Positions, described, distance, point
+from detector.engine.signals.models import add_models
+from detector.engine.signals.signals import Signals
+from detector.engine.timing.schedule import Only
 from wayside.expressions import UNKNOWN, Expression
 from wayside.rules import ClientSubject, CompiledElement, CompiledRule, CompiledSignal, FleetSubject, PairSubject
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final, cast
 
-from detector.engine.aggregates import Timed, calculated, distinct, is_number
-from detector.engine.buffer import NEVER, Buffer, Lane
-from detector.engine.clients import Clients, is_fresh
+from detector.engine.buffering.buffer import NEVER, Buffer, Lane
+from detector.engine.buffering.clients import Clients, is_fresh
+from detector.engine.buffering.messages import Messages
 from detector.engine.counters import RuleCounters
-from detector.engine.messages import Messages
-from detector.engine.sample import Sample
-from detector.engine.starts import Starts
+from detector.engine.samples.sample import Sample
+from detector.engine.signals.aggregates import Timed, calculated, distinct, is_number
+from detector.engine.signals.starts import Starts
 from wayside.api.eventrule import Aggregate
 from wayside.expressions import UNKNOWN, Expression, Reason, Unknown, Value
 from wayside.rules import CompiledSignal

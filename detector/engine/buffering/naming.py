@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 
 from detector.engine.counters import Counters
-from detector.engine.sample import DecodeError, Decoder
+from detector.engine.samples.sample import DecodeError, Decoder
 from wayside.expressions import CompiledTemplate, InterpolationError
 from wayside.rules import CompiledStream
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from detector.engine.counters import Counters
-from detector.engine.sample import DecodeError, Decoder, NearDecoder, Sample
+from detector.engine.samples.sample import DecodeError, Decoder, NearDecoder, Sample
 from wayside.expressions import UNKNOWN, EvaluationError
 from wayside.rules import CompiledStream
 

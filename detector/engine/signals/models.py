@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from detector.engine.counters import RuleCounters
-from detector.engine.sample import DecodeError
-from detector.engine.signals import Signals
+from detector.engine.samples.sample import DecodeError
+from detector.engine.signals.signals import Signals
 from wayside.api.model import ModelInput
 from wayside.expressions import Reason, Unknown
 from wayside.rules import CompiledModel, CompiledRule

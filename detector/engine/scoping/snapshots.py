@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from detector.engine.scopes import Candidate
+from detector.engine.scoping.scopes import Candidate
 from wayside.rules import CompiledRule, FleetSubject, PairSubject
 
 _MEMBERS = 100

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from detector.engine.buffer import NEVER, Buffer
-from detector.engine.liveliness import Tokens
+from detector.engine.buffering.buffer import NEVER, Buffer
+from detector.engine.samples.liveliness import Tokens
 
 
 @dataclass(slots=True)

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from detector.engine.demands import plain
-from detector.engine.episodes import Reason
+from detector.engine.episodes.demands import plain
+from detector.engine.episodes.episodes import Reason
 from wayside.api.base import JsonValue
 from wayside.times import format_time
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Hashable
 
-from detector.engine.buffer import NEVER, Lane
-from detector.engine.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample, Stamped
+from detector.engine.buffering.buffer import NEVER, Lane
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample, Stamped
 
 Topic = Callable[[str, bytes], Hashable]
 """What a sample with that key and payload speaks of: a newer one about the same takes its place."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from detector.engine.geometry import IDENTITY, Pose, unit
+from detector.engine.queries.geometry import IDENTITY, Pose, unit
 
 
 class PoseError(ValueError):

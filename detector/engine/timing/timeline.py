@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
-from detector.engine.liveliness import LIVELINESS
-from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
-from detector.engine.ticks import Ticks
+from detector.engine.samples.liveliness import LIVELINESS
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
+from detector.engine.timing.ticks import Ticks
 
 _RECEIVED = itemgetter(0)
 

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Sequence
 from itertools import islice
 
-from detector.engine.sample import SAMPLE_OVERHEAD, Arrival
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
 
 _PAUSE = 0.01
 """Seconds between two looks whether there is room."""

@@ -1,0 +1,1 @@
+"""Whom a rule is evaluated for, and what its expressions see of each subject."""
