@@ -58,11 +58,7 @@ def look_at_drops(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
         (cause, "", stream): count for (cause, stream), count in sent.dropped.items()
     }
     # Faster than its own speed, a machine may be too slow; `look_at_rules` accounts for what is left out then.
-    explained = {
-        key: value
-        for key, value in found.items()
-        if key[0] in ("skipped", "suppressed") or (key[0] == "error" and key[1] in TIMED)
-    }
+    explained = {key: value for key, value in found.items() if key[0] in ("skipped", "suppressed")}
     wanted |= explained
     for key in sorted({*found, *wanted}):
         cause, rule, stream = key
@@ -109,8 +105,7 @@ def look_at_rules(verdict: Verdict, metrics: Metrics, folder: Path, seconds: int
         verdict.equal(f"episodes ended of {name}", metrics["rule_episodes_ended_total", name], ended[name])
         open_now = metrics["rule_episodes_open", name]
         verdict.equal(f"episodes open of {name}", open_now, started[name] - ended[name])
-        if name not in TIMED:
-            verdict.equal(f"errors of {name}", metrics["rule_errors_total", name], 0)
+        verdict.equal(f"errors of {name}", metrics["rule_errors_total", name], 0)
         evaluation = spec.get("evaluation", {})
         if enabled and set(evaluation) <= {"every"}:
             every = seconds_of(evaluation.get("every", "1s"))
@@ -128,12 +123,9 @@ def look_at_rules(verdict: Verdict, metrics: Metrics, folder: Path, seconds: int
             verdict.true(f"{name} suppressed episodes", suppressed > 0 or seconds < 1800)
         if evaluation.get("onDemand"):
             verdict.equal(f"answers of {name}", asked, seconds // 60)
-        quiet = {"that-is-disabled", *TIMED, *QUIET}
+        quiet = {"that-is-disabled", *QUIET}
         verdict.true(f"{name} has episodes", started[name] > 0 or name in quiet or seconds < 600)
 
-
-TIMED = ("with-a-plugin",)
-"""Rules whose plugin has a time limit of the wall, which a busy machine may not keep: then it is an error, and said."""
 
 QUIET: tuple[str, ...] = ()
 """Rules of which no episode is expected."""

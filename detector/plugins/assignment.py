@@ -11,6 +11,11 @@ Point = tuple[float, float]
 """Metres."""
 
 
+def warm_up() -> None:
+    """Load what `assigned` needs: it takes a second or two."""
+    import scipy.optimize  # noqa: F401, PLC0415  not at the top: checking a rule needs none of it
+
+
 def assigned(first: Sequence[Point], second: Sequence[Point], gate: float) -> dict[int, int]:
     """From indices of the one to indices of the other, each used at most once, at most `gate` metres apart.
 
@@ -18,8 +23,7 @@ def assigned(first: Sequence[Point], second: Sequence[Point], gate: float) -> di
     """
     if not first or not second:
         return {}
-    # Not at the top: it takes half a second to import.
-    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415  see warm_up
 
     distances = np.array([[math.dist(a, b) for b in second] for a in first])
     within = distances <= gate

@@ -60,6 +60,13 @@ class Plugin(ABC, Generic[P]):
         self.parameters = parameters
         self.subject = subject
 
+    @classmethod
+    def warm_up(cls) -> None:
+        """Called once where the plugin runs, before it is asked for anything: what takes long to load belongs here.
+
+        A value must be there within half a second, and that includes what is imported for it.
+        """
+
     @abstractmethod
     def value(self, queries: Queries, clients: tuple[str, ...]) -> Value:
         """The signal at this evaluation: a boolean, number, text, list or map of these; None where it is unknown.

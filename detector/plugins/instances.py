@@ -18,8 +18,9 @@ class Instances:
     """The objects of one signal."""
 
     def __init__(self, plugin: str, parameters: Mapping[str, Any]) -> None:
-        """Raises PluginError."""
+        """Raises PluginError, and whatever the plugin's `warm_up` raises."""
         self._plugin, self._parameters = prepare(plugin, parameters)
+        self._plugin.warm_up()
         self._objects: dict[str, Plugin[Any]] = {}
 
     def value(self, subject: Subject, clients: tuple[str, ...], queries: Queries) -> Value:

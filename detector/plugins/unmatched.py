@@ -17,6 +17,7 @@ from detector.engine.queries.geometry import NO_MOTION, Pose
 from detector.engine.queries.queries import DecodedSample, Queries, frame_of
 from detector.engine.queries.transforms import TransformError
 from detector.engine.queries.tuples import matched
+from detector.plugins import assignment
 from detector.plugins.assignment import Point, assigned
 from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
 from detector.plugins.tracking import Tracks
@@ -93,6 +94,11 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
         self._tracks = Tracks(parameters.within, parameters.speed, round(parameters.gap * 1e9))
         self._last: int | None = None
         """The stamp of the objects that were compared last."""
+
+    @classmethod
+    def warm_up(cls) -> None:
+        """Matching needs scipy."""
+        assignment.warm_up()
 
     def value(self, queries: Queries, clients: tuple[str, ...]) -> Value:
         """None until two samples could be compared, and where one of the streams is stale."""

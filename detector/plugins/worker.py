@@ -109,6 +109,9 @@ def serve(wire: Wire) -> None:
     except PluginError as error:
         wire.send("refused", str(error))
         return
+    except Exception as error:  # noqa: BLE001  a plugin's warm_up may raise whatever it likes
+        wire.send("refused", failure_text(error))
+        return
     wire.send("ready")
     while True:
         what, *content = wire.receive()

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import closing
 from typing import Any
@@ -148,3 +151,15 @@ def test_a_rule_that_goes_takes_its_process_along(host: ProcessHost) -> None:
     drive.engine.set_rules([])
     with pytest.raises(ProcessLookupError):
         os.kill(process.pid, 0)
+
+
+def test_what_the_shipped_plugin_takes_long_to_load_is_there_before_it_is_asked() -> None:
+    """A value must be there within half a second; loading scipy takes longer than that."""
+    program = """
+        import sys
+        from detector.plugins.instances import Instances
+        assert "scipy.optimize" not in sys.modules
+        Instances("unmatched-objects", {"objects": {"stream": "tracks"}})
+        assert "scipy.optimize" in sys.modules
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(program)], check=True)

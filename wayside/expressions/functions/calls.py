@@ -73,11 +73,14 @@ def settle() -> None:
     noted = _noted
     if not noted.arguments:
         return
+    # Asking each for its references as well: what was not lost after all must never be freed under somebody's feet.
     if _arguments_are_lost:
         for arguments in noted.arguments:
-            _drop_reference(arguments)
+            if sys.getrefcount(arguments) > _KEPT:
+                _drop_reference(arguments)
     for result in noted.results:
-        _drop_reference(result)
+        if sys.getrefcount(result) > _KEPT:
+            _drop_reference(result)
     noted.arguments.clear()
     noted.results.clear()
 
