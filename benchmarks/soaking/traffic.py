@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cbor2
+from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
+
+DENM = DENM_PDU_Descriptions.DENM
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no package
@@ -22,6 +25,12 @@ START = 1_767_225_600_000_000_000
 """The first stamp, in nanoseconds since the epoch."""
 
 TELEMETRY_EVERY = 200_000_000
+WARNED = 25
+"""A vehicle warns once in so many of its telemetry messages."""
+
+ITS_EPOCH = 1_072_915_200_000 - 5_000
+"""2004-01-01 in milliseconds since the Unix epoch, and the leap seconds since, which ITS time counts."""
+
 BAD_EVERY = 60 * 10**9
 """Of each kind of bad sample there is one in so many nanoseconds."""
 
@@ -78,11 +87,43 @@ def _telemetry(start_ns: int) -> Iterator[tuple[int, str, bytes]]:
                 "tracked": [{"x": 5.3, "y": 0}, {"x": 0, "y": 99 if after % 60_000_000_000 < 10_000_000_000 else 9}],
             }
             yield after, f"vehicles/{vehicle.name}/telemetry", json.dumps(values).encode()
+            if step % WARNED == number:
+                yield after, f"vehicles/{vehicle.name}/warning", _warning(start_ns + after, number)
             if step % 5 == 0:
                 battery = 50 + 45 * math.sin(after / 60e9 + number)
                 status = {"t": (start_ns + after) / 1e9, "battery": battery}
                 yield after, f"vehicles/{vehicle.name}/status", cbor2.dumps(status)
         step += 1
+
+
+def _warning(now: int, number: int) -> bytes:
+    """A DENM: for twenty seconds of each minute the events are close together."""
+    time = now // 1_000_000 - ITS_EPOCH
+    apart = 100 if now % (60 * 10**9) < 20 * 10**9 else 10_000
+    DENM.set_val(
+        {
+            "header": {"protocolVersion": 2, "messageID": 1, "stationID": number},
+            "denm": {
+                "management": {
+                    "actionID": {"originatingStationID": number, "sequenceNumber": 1},
+                    "detectionTime": time,
+                    "referenceTime": time,
+                    "eventPosition": {
+                        "latitude": 507_770_000,
+                        "longitude": 61_000_000 + number * apart,
+                        "positionConfidenceEllipse": {
+                            "semiMajorConfidence": 100,
+                            "semiMinorConfidence": 100,
+                            "semiMajorOrientation": 900,
+                        },
+                        "altitude": {"altitudeValue": 20_000, "altitudeConfidence": "unavailable"},
+                    },
+                    "stationType": 5,
+                }
+            },
+        }
+    )
+    return bytes(DENM.to_uper())
 
 
 def _bad(start_ns: int) -> Iterator[tuple[int, str, str, bytes]]:
