@@ -25,6 +25,8 @@ POLYGON = [[0.0, 0.0], [5.0, 0.0], [5.0, 5.0]]
         ("unmatched(msg.a, msg.b, 1.5)", {"a": POLYGON, "b": [[9.0, 9.0]]}),  # a list comes back
         ("utf8(msg.data)", {"data": b"some text that is long"}),
         ("[1.5, 2.5].map(v, hypot(v, msg.x))", {"x": 2.5}),
+        ("'its-' + string(msg.x)", {"x": 4294967295.0}),
+        ("string(msg.x)", {"x": "some text that is long"}),
         ("msg.x * 2.5", {"x": 2.5}),
     ],
 )

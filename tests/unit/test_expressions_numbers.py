@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wayside.expressions import Environment, EvaluationError, Kind
+from wayside.expressions import Environment, EvaluationError, ExpressionError, Kind
 from wayside.expressions.lexer import TokenKind, tokens
 from wayside.expressions.numbers import MAX_EXACT, doubled
 
@@ -167,3 +167,29 @@ def test_integers_beyond_2_to_53_keep_equality_membership_and_order() -> None:
     assert holds("x") == MAX_EXACT + 1
     with pytest.raises(EvaluationError, match="does not take these types"):
         holds("x - 1")
+
+
+@pytest.mark.parametrize(
+    ("source", "text"),
+    [
+        ("'its-' + string(x.station)", "its-4294967295"),
+        ("string(4711000)", "4711000"),
+        ("string(x.share)", "0.25"),
+        ("string(x.huge)", "1e+300"),
+        ("string(x.exact)", "9007199254740993"),
+        ("string(x.name) + string(x.on)", "atrue"),
+        ("string(timestamp(0))", "1970-01-01T00:00:00Z"),
+        ("string(string(2))", "2"),
+    ],
+)
+def test_whole_numbers_are_written_with_all_their_digits(source: str, text: str) -> None:
+    values = {"station": 4294967295.0, "share": 0.25, "huge": 1e300, "exact": 2**53 + 1, "name": "a", "on": True}
+    assert ENVIRONMENT.compile(source).evaluate(VALUES | {"x": values}) == text
+
+
+@pytest.mark.parametrize("value", [b"ab", [1], {"a": 1}])
+def test_what_has_no_text_is_named_as_the_author_wrote_it(value: object) -> None:
+    with pytest.raises(EvaluationError, match=r"string\("):
+        ENVIRONMENT.compile("string(x)").evaluate(VALUES | {"x": value})
+    with pytest.raises(ExpressionError, match="`string` does not take"):
+        ENVIRONMENT.compile("string([1])")

@@ -9,7 +9,7 @@ from collections.abc import Collection
 from wayside.expressions.errors import ExpressionError, position
 from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.lexer import TokenKind, tokens
-from wayside.expressions.numbers import Doubled
+from wayside.expressions.numbers import DIGITS, Doubled
 
 _ENTRY = re.compile(r"^(?:[A-Z_]+: )?ERROR: <input>:(-?\d+):(-?\d+): (.*)$", re.MULTILINE)
 _UNDECLARED = re.compile(r"undeclared reference to '([^']*)'")
@@ -70,7 +70,7 @@ def _explain(text: str, source: str, at: int, names: Collection[str]) -> tuple[s
     if match := _UNDECLARED.search(text):
         return _undeclared(match[1], source, at, names)
     if match := _OVERLOAD.search(text):
-        return _overload(match[1], match[2])
+        return _overload("string" if match[1] == DIGITS else match[1], match[2])
     if match := _UNRECOGNISED.search(text):
         sign = match[1].strip()[:1]
         return f"unexpected `{sign}`", _SIGNS[sign] or _QUOTE if sign in _SIGNS else None

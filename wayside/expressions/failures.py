@@ -6,6 +6,7 @@ import re
 from typing import Final
 
 from wayside.expressions.functions import FUNCTIONS
+from wayside.expressions.numbers import DIGITS
 
 _ABSENT = ("no value for ", "no key ", "no index ")
 _OVERLOAD: Final = re.compile(r"^\w+: No matching overloads found : (.*)$")
@@ -44,6 +45,8 @@ def says_absent(message: str) -> bool:
 
 def _no_overload(operation: str) -> str:
     """Of a function of ours, what it takes and was given; of CEL's operations, those on bytes have a remedy."""
+    if operation.startswith(f"{DIGITS}("):
+        operation = operation.replace(DIGITS, "string", 1)
     call = _CALL.search(operation)
     if call is not None and (function := FUNCTIONS.get(call[1])) is not None:
         given = ", ".join(_TYPES.get(kind, kind) for kind in call[2].split(", "))

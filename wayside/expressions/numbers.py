@@ -3,12 +3,14 @@
     speed > 3                 →  speed > 3.0
     size(points) / 2          →  double(size(points)) / 2.0
     ranges[0] + ranges[i + 1] →  ranges[0] + ranges[dyn(i + 1.0)]
+    string(msg.station)       →  string(digits(msg.station))
 
 Integer literals become doubles, and so do the results of functions that count, and of `int(x)`, which cuts off the
 fraction. A literal index stays an integer; any other index is wrapped in `dyn()`, because a list takes an integral
 double as its index at run time, but not when types are checked. Integers stay where only integers work: beside `%`,
-as the argument of `timestamp` and of `string` (which writes large doubles with an exponent), and beyond 2^53, where a
-double would be another number. Strings, comments and `3u` are left alone.
+as the argument of `timestamp` and of `string`, and beyond 2^53, where a double would be another number. `digits` makes
+a whole double an integer again, since `string` writes large doubles with an exponent. Strings, comments and `3u` are
+left alone.
 """
 
 from __future__ import annotations
@@ -19,6 +21,9 @@ from wayside.expressions.lexer import Token, TokenKind, tokens
 
 MAX_EXACT = 2**53
 """Up to here every integer is a double as well."""
+
+DIGITS = "digits"
+"""Not for authors: the function that `string` is given its argument by."""
 
 _COUNTING_METHODS = frozenset(
     {"size"}
@@ -77,6 +82,8 @@ def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int,
                 wrap(_operand_start(line, matches, i - 2), matches[i + 1], "double")
             elif token.text == "size":
                 wrap(i, matches[i + 1], "double")
+        elif token.text == "string" and i + 1 in matches and _is_call(line, i) and matches[i + 1] > i + 2:
+            wrap(i + 2, matches[i + 1] - 1, DIGITS)
         elif (
             token.text == "int"
             and i + 1 in matches
@@ -112,6 +119,11 @@ def _stays_integer(line: list[Token], matches: dict[int, int], i: int, last: int
     if opening == "[":
         return _ends_operand(line, first - 2)
     return opening == "(" and first > 1 and line[first - 2].text in ("timestamp", "string")
+
+
+def _is_call(line: list[Token], i: int) -> bool:
+    """Whether the name at i is called as a function, not as a method."""
+    return line[i + 1].text == "(" and (i == 0 or line[i - 1].text != ".")
 
 
 def _is_lone_literal(line: list[Token], first: int, end: int) -> bool:

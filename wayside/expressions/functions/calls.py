@@ -112,6 +112,7 @@ def _lost(implementation: Callable[[Arguments], object], yields: cel.Type) -> tu
 
 _PROBES: Final[tuple[tuple[type, cel.Type, Callable[[Arguments], object]], ...]] = (
     (float, cel.Type.DOUBLE, lambda arguments: cast("float", arguments[0]) + 0.25),
+    (int, cel.Type.INT, lambda arguments: int(cast("float", arguments[0])) + 2**40),
     (str, cel.Type.STRING, lambda arguments: f"probe {arguments[0]}"),
     (list, cel.Type.List(cel.Type.DYN), lambda arguments: [f"probe {arguments[0]}"]),
 )
