@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.buffering.latched import LatchedLane, by_key
-from detector.engine.buffering.usage import buffer_usage
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
 from detector.replay.latched import recorded_arrivals
 from detector.replay.replaying import replay_arrivals
@@ -92,9 +91,9 @@ def test_a_detectors_count_holds_for_what_comes_in() -> None:
     drive = Drive(a_detector(a_stream("speed", buffer={"count": 2})))
     drive.take(*(arrival(0.1 * n, "a", {"v": n}) for n in range(1, 6)), until=0.6)
     assert [json.loads(sample.payload)["v"] for lane in drive.engine.buffer for sample in lane.samples] == [4, 5]
-    usage = buffer_usage(drive.engine.buffer)["speed"]
-    assert (usage.clients, usage.samples, usage.evicted) == (1, 2, 3)
-    assert usage.bytes == drive.engine.buffer.bytes
+    (lane,) = drive.engine.buffer
+    assert (len(lane.samples), lane.evicted, drive.engine.buffer.evicted) == (2, 3, 3)
+    assert lane.bytes == drive.engine.buffer.bytes
 
 
 def test_what_is_latched_is_known_for_ever_and_each_key_for_itself() -> None:
