@@ -19,7 +19,7 @@ from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions, own_defini
 from detector.streams.codecs.fields import message_fields
 from detector.streams.codecs.ros import RosTypes, standard, types_with
 from wayside.api import Detector, EventRule
-from wayside.api.detector import MessageDefinition
+from wayside.api.stream import MessageDefinition
 from wayside.keys import KeyPattern
 from wayside.rules import (
     CompiledRule,

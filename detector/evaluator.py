@@ -29,7 +29,7 @@ from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from detector.streams.codecs.ros import RosTypes
-from wayside.api.detector import Stream
+from wayside.api.stream import Stream
 
 _log = logging.getLogger(__name__)
 

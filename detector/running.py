@@ -32,8 +32,8 @@ from detector.streams.answering import Answering
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
 from wayside.api import Detector
-from wayside.api.detector import Stream
 from wayside.api.source import ZENOH
+from wayside.api.stream import Stream
 
 _log = logging.getLogger(__name__)
 

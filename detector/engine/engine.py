@@ -33,7 +33,8 @@ from detector.engine.timing.schedule import Only, Schedule
 from detector.engine.timing.ticks import Ticks
 from detector.engine.timing.timeline import DataTimeline, Gap, Insert, Step, Tick, Timeline, WallTimeline
 from wayside.api import Detector
-from wayside.api.detector import Clock, Encoding, Stream
+from wayside.api.detector import Clock
+from wayside.api.stream import Encoding, Stream
 from wayside.rules import CompiledRule, compile_stream, in_order
 
 __all__ = ["Engine", "KeyReader"]

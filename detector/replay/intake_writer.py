@@ -19,7 +19,7 @@ from mcap.writer import Writer
 from detector.engine.samples.sample import Arrival
 from detector.replay.intake_file import CONTROL_TOPIC, LIBRARY, STREAM, Control
 from detector.streams.codecs.ros import RosTypes, standard
-from wayside.api.detector import Stream
+from wayside.api.stream import Stream
 
 log = logging.getLogger(__name__)
 

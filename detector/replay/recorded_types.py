@@ -16,7 +16,7 @@ from detector.replay.recordings import types_of
 from detector.streams.codecs.definitions import Definition, DefinitionsError, from_idl, parsed
 from detector.streams.codecs.ros import RosTypes, standard
 from wayside.api import Detector
-from wayside.api.detector import Encoding, MessageDefinition
+from wayside.api.stream import Encoding, MessageDefinition
 
 _log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.message import Message
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 from wayside.keys import KeyPattern
 
 _SHOWN = 20

@@ -10,7 +10,7 @@ from typing import ClassVar, Generic, TypeVar
 
 from pydantic import BaseModel
 
-from wayside.api.detector import Stream
+from wayside.api.stream import Stream
 from wayside.keys import KeyPattern
 
 P = TypeVar("P", bound=BaseModel)

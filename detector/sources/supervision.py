@@ -13,8 +13,8 @@ from detector.sources.base import Feed, Put
 from detector.sources.registry import Make, prepare
 from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
-from wayside.api.detector import Stream
 from wayside.api.source import DataSource
+from wayside.api.stream import Stream
 
 log = logging.getLogger(__name__)
 

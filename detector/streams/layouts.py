@@ -13,7 +13,7 @@ import zenoh
 from detector.streams import plain, rmw_zenoh
 from detector.streams.bursts import Put
 from detector.streams.tally import Tally
-from wayside.api.detector import Layout, Stream
+from wayside.api.stream import Layout, Stream
 from wayside.keys import KeyPattern
 
 Pump = Callable[[zenoh.handlers.Handler[zenoh.Sample]], None]

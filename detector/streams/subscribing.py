@@ -13,7 +13,7 @@ from zenoh import ext
 
 from detector.streams.layouts import expression
 from detector.streams.tally import Cause, Tally
-from wayside.api.detector import Layout, Stream
+from wayside.api.stream import Layout, Stream
 
 
 class Subscription(Protocol):

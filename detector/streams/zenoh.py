@@ -23,7 +23,7 @@ from detector.streams.liveliness import TokenWatch
 from detector.streams.session import Connections, NetworkError, await_session, open_session
 from detector.streams.subscribing import Subscription, subscribe
 from detector.streams.tally import Tally
-from wayside.api.detector import Stream
+from wayside.api.stream import Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 log = logging.getLogger(__name__)

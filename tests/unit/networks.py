@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from detector.streams.zenoh import Put
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 
 
 class Arrivals:

@@ -18,8 +18,8 @@ from detector.streams.codecs import CdrDecoder
 from detector.streams.tally import Tally
 from tests.unit.driving import a_detector
 from tests.unit.networks import Arrivals, stream, wait_for
-from wayside.api.detector import Encoding, Stream
 from wayside.api.source import DataSource
+from wayside.api.stream import Encoding, Stream
 
 POSE = "geometry_msgs/msg/PoseStamped"
 SECOND = 10**9

@@ -18,7 +18,7 @@ from tests.unit import hostile
 from tests.unit.driving import Drive, a_detector, a_rule, at
 from tests.unit.hostile import assert_plain
 from tests.unit.ros_messages import cdr, make, odometry, point_cloud, pose_stamped
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 
 MESSAGES = [pose_stamped(), odometry(), point_cloud()]
 SECOND = 1_000_000_000

@@ -19,7 +19,7 @@ from detector.streams.codecs.cbor import MAX_DEPTH
 from detector.streams.codecs.doubles import EXACT
 from tests.unit import hostile
 from tests.unit.driving import Drive, a_detector, a_rule, arrival
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats(allow_nan=False) | st.text() | st.binary(),

@@ -20,7 +20,7 @@ from detector.replay.intake_file import Control, is_intake_file, read_intake
 from detector.replay.intake_writer import IntakeWriter
 from detector.streams.codecs.ros import standard
 from tests.unit.ros_messages import cdr, pose_stamped
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 POSES = Stream(name="pose", key="vehicles/${client:*}/pose", encoding=Encoding.CDR, type=POSE_TYPE)

@@ -13,7 +13,7 @@ from detector.streams.zenoh import Network
 from tests.unit.driving import a_detector, a_stream
 from tests.unit.networks import Arrivals, free_endpoint, router, stream, wait_for
 from wayside.api.base import PositiveDuration
-from wayside.api.detector import History, Stream
+from wayside.api.stream import History, Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 KEY = "vehicles/car1/pose"

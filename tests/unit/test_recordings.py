@@ -18,7 +18,7 @@ from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from detector.streams.codecs.ros import standard
 from tests.unit.ros_messages import cdr, odometry, pose_stamped
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from wayside.api import Detector, EventRule
-from wayside.api.detector import Stream
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Signal
+from wayside.api.stream import Stream
 from wayside.expressions import (
     CompiledTemplate,
     Embedded,

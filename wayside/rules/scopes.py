@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from wayside.api import EventRule
-from wayside.api.detector import Stream
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import EventRuleSpec
 from wayside.api.scopes import Each, PairsScope
+from wayside.api.stream import Stream
 from wayside.expressions import Environment, Expression, Kind
 from wayside.rules.compiled import (
     ClientSubject,

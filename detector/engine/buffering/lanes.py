@@ -8,7 +8,7 @@ from detector.engine.buffering.buffer import Lane
 from detector.engine.buffering.latched import LatchedLane, Topic, by_key, by_key_and_frames
 from detector.engine.samples.sample import Decoder
 from wayside.api import Detector
-from wayside.api.detector import Stream
+from wayside.api.stream import Stream
 
 
 class LaneMaker:

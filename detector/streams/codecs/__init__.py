@@ -9,7 +9,7 @@ from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder, OwnDefini
 from detector.streams.codecs.json_ import JsonDecoder
 from detector.streams.codecs.raw import RawDecoder
 from detector.streams.codecs.ros import RosTypes, UnknownTypeError, standard
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 
 
 def codec_for(stream: Stream, *, types: RosTypes | None = None, asn1: OwnDefinitions | None = None) -> Decoder:

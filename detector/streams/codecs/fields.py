@@ -8,7 +8,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
 from detector.streams.codecs.ros import RosTypes, standard
-from wayside.api.detector import Encoding, Stream
+from wayside.api.stream import Encoding, Stream
 from wayside.rules import Fields
 
 
