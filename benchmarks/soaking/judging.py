@@ -14,7 +14,7 @@ import yaml
 
 from benchmarks.soaking.traffic import EXAMPLE, FLUSH, START, Sent
 
-GROWTH, SLACK = 0.05, 8 * 2**20
+GROWTH, SLACK = 0.02, 3 * 2**20
 """How much memory may differ between the second sixth and the last, for noise: this share, or these bytes."""
 
 Metrics = dict[tuple[str, ...], float]
