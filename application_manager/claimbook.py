@@ -6,6 +6,7 @@ It saves asking every task again whenever one changes. What it holds follows fro
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from application_manager.core.claims import Claim, InvalidTemplate, Refused
 from application_manager.core.demand import Standing, Verdict, claim_or_verdict
@@ -26,6 +27,7 @@ class ClaimBook:
 
     def note(self, name: Name, entry: Entry, template: ApplicationTemplate | InvalidTemplate | None) -> set[Name]:
         """Note a task as it is now; returns the instances that it claimed or claims."""
+        before = self._claims.get(name)
         touched = self.forget(name)
         task = entry.model
         if not isinstance(task, ApplicationTask):
@@ -37,6 +39,8 @@ class ClaimBook:
         self._by_template.setdefault(of, {})[name] = task
         claimed = claim_or_verdict(template, task)
         if isinstance(claimed, Verdict):
+            if claimed.standing is Standing.FINISHED and before is not None:  # its status may not name it yet
+                claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched
         instance = (name[0], claimed.instance)

@@ -52,7 +52,7 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
             _latched(old.conditions, "Ready", service.ready, "Ready", "NotReady", service),
         ]
     conditions = updated(old.conditions, aspects, task.metadata.generation, now)
-    instance = old.instance if finished else verdict.instance
+    instance = old.instance or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, service),
         instance=instance,

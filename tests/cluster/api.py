@@ -150,7 +150,7 @@ class Api:
         name: str,
         holds: Callable[[Object], bool],
         *,
-        timeout: float = 20,
+        timeout: float = 40,
         what: str,
         namespace: str = "",
     ) -> Object:
@@ -168,7 +168,7 @@ class Api:
         )
         return cast("Object", found)
 
-    def wait_gone(self, kind: str, name: str, *, timeout: float = 20, namespace: str = "") -> None:
+    def wait_gone(self, kind: str, name: str, *, timeout: float = 40, namespace: str = "") -> None:
         """Wait until there is no such object.
 
         Raises:
@@ -187,7 +187,7 @@ class Api:
         kind: str,
         holds: Callable[[Objects], bool],
         *,
-        timeout: float = 20,
+        timeout: float = 40,
         what: str,
         labels: str = "",
         namespace: str = "",

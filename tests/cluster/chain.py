@@ -136,7 +136,7 @@ class Chain:
         assert len(found) < 2, f"one demand has several tasks: {found}"
         return found[0] if found else None
 
-    def wait_task(self, pair: Pair, *, timeout: float = 10) -> Object:
+    def wait_task(self, pair: Pair, *, timeout: float = 30) -> Object:
         """Wait for the pair's task."""
         found = wait_until(
             lambda: self.task(pair), lambda task: task is not None, timeout=timeout, what=f"{pair} has a task"
@@ -150,7 +150,7 @@ class Chain:
         assert len(found) < 2, f"{pair} has several Deployments"
         return found[0] if found else None
 
-    def wait_deployed(self, pair: Pair, *, timeout: float = 10) -> Object:
+    def wait_deployed(self, pair: Pair, *, timeout: float = 30) -> Object:
         """Wait for the pair's Deployment."""
         found = wait_until(
             lambda: self.deployment(pair), lambda it: it is not None, timeout=timeout, what=f"{pair} has a Deployment"
@@ -158,7 +158,7 @@ class Chain:
         assert found is not None
         return found
 
-    def wait_removed(self, pair: Pair, *, timeout: float = 10) -> None:
+    def wait_removed(self, pair: Pair, *, timeout: float = 30) -> None:
         """Wait until the pair's Deployment is gone."""
         wait_until(
             lambda: self.deployment(pair), lambda it: it is None, timeout=timeout, what=f"{pair} has no Deployment"
@@ -174,7 +174,7 @@ class Chain:
         lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
         return [event for event in map(json.loads, lines) if event["subject"] == "+".join(subject)]
 
-    def wait_events(self, pair: Pair, *kinds: str, timeout: float = 10) -> list[Object]:
+    def wait_events(self, pair: Pair, *kinds: str, timeout: float = 30) -> list[Object]:
         """Wait until the pair's events are of these kinds (`started`, or the reason of an end)."""
         return wait_until(
             lambda: self.events(*pair),

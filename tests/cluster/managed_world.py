@@ -36,7 +36,7 @@ def start_manager(processes: Processes, namespace: str | None = None, *options: 
 
 
 def wait_settled(
-    api: Api, *, timeout: float = 30, lost: Mapping[str, LeaseView] | None = None, refused: Collection[str] = ()
+    api: Api, *, timeout: float = 60, lost: Mapping[str, LeaseView] | None = None, refused: Collection[str] = ()
 ) -> None:
     """Wait until the namespace is as what is live in it demands.
 

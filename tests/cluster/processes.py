@@ -55,7 +55,7 @@ class Process:
         """Send SIGKILL to it and to all that it started."""
         self._child.kill9()
 
-    def wait(self, timeout: float = 20) -> int:
+    def wait(self, timeout: float = 40) -> int:
         """Wait until it ends by itself and return the exit code; TimeoutError with its log after `timeout` seconds."""
         return self._child.wait(timeout)
 
@@ -75,7 +75,7 @@ class Process:
             log.seek(self._seen_from)
             return log.read().decode(errors="replace")
 
-    def wait_for_output(self, pattern: str, timeout: float = 20) -> re.Match[str]:
+    def wait_for_output(self, pattern: str, timeout: float = 40) -> re.Match[str]:
         """Wait until the output of the present run matches; return the match.
 
         Raises:

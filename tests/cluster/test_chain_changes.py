@@ -113,7 +113,7 @@ def test_a_detector_is_changed_while_it_runs(chain: Chain, vehicles: Vehicles) -
             vehicles.send("vehicles/car1/mood", message)  # again and again: the detector may just be subscribing
             return [kind_of(event) for event in chain.events("car1")]
 
-        wait_until(heard, kinds.__eq__, timeout=10, what="the new stream is followed")
+        wait_until(heard, kinds.__eq__, timeout=20, what="the new stream is followed")
     assert untouched(deployed, chain.deployment(CARS))
     assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
     chain.wait_events(CARS, "started")

@@ -128,7 +128,7 @@ def test_a_detector_ends_and_starts_while_the_api_server_is_away(
     deployed = chain.wait_deployed(CARS)
     task = chain.wait_task(CARS)
     with control_plane.outage():
-        assert running.terminate(patience=8) == 0
+        assert running.terminate(patience=15) == 0
         vehicles.place(CARS, BETWEEN)
         running.start()
         running.wait_for_output("WARNING")  # it says what it waits for
@@ -163,7 +163,7 @@ def test_a_detector_told_to_end_does_so_promptly_and_its_tasks_stay(chain: Chain
     vehicles.place(CARS, NEAR)
     deployed = chain.wait_deployed(CARS)
     task = chain.wait_task(CARS)
-    assert running.terminate(patience=5) == 0
+    assert running.terminate(patience=15) == 0
     assert chain.wait_task(CARS)["spec"] == task["spec"]
     lease = chain.api.get("Lease", f"wayside-{HOLDER}")
     assert not lease["spec"].get("holderIdentity"), "a successor need not wait"

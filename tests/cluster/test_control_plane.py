@@ -187,7 +187,7 @@ class TestOutage:
         with control_plane.outage():
             pass
         api.apply(deployment("app"))
-        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=10, what="the controllers make pods again")
+        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=20, what="the controllers make pods again")
 
     def test_what_a_failed_test_left_stopped_is_started_for_the_next(
         self, control_plane: ControlPlane, api: Api
@@ -196,4 +196,4 @@ class TestOutage:
         control_plane.stop_api_server()
         control_plane.recover()
         api.apply(deployment("app"))
-        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=10, what="the controllers make pods again")
+        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=20, what="the controllers make pods again")

@@ -167,10 +167,12 @@ def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, runnin
         "ApplicationTask",
         wanted.name,
         lambda task: task["metadata"]["uid"] != before["metadata"]["uid"],
-        timeout=3,  # by the watch, not by the resync
+        timeout=15,  # by the watch: the resync is at 30 s
         what="the task is there again",
     )
-    wait_until(lambda: running.counts, lambda counts: counts.recreated == 1, timeout=3, what="counted as created again")
+    wait_until(
+        lambda: running.counts, lambda counts: counts.recreated == 1, timeout=20, what="counted as created again"
+    )
 
 
 def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: Running) -> None:
@@ -194,7 +196,7 @@ def test_an_outage_delays_starts_and_ends_and_loses_none(
     before = tasks_are(api, {stays.name, ends.name})
     with control_plane.outage():
         running.update(by_name(stays, passes), {ends.name: START + SECOND})
-        wait_until(lambda: running.counts, lambda c: c.retried > 0, timeout=10, what="the outage was met")
+        wait_until(lambda: running.counts, lambda c: c.retried > 0, timeout=20, what="the outage was met")
         running.update(by_name(stays, starts), {passes.name: START + 2 * SECOND})
     after = tasks_are(api, {stays.name, starts.name}, {ends.name})
     versions = {task["metadata"]["name"]: task["metadata"]["resourceVersion"] for task in before}
@@ -265,7 +267,7 @@ def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: s
     other = demand(namespace, "car3+car4")
     running.update(by_name(wanted, other))
     tasks_are(api, {wanted.name, foreign.name, "mine", other.name})
-    wait_until(lambda: running.counts.refused, lambda r: bool(r["AlreadyExists"]), timeout=5, what="it was refused")
+    wait_until(lambda: running.counts.refused, lambda r: bool(r["AlreadyExists"]), timeout=20, what="it was refused")
     running.update({}, {wanted.name: START, other.name: START})
     tasks_are(api, {wanted.name, foreign.name, "mine"}, {other.name})
     assert [api.get("ApplicationTask", each["metadata"]["name"]) for each in before] == before
@@ -287,7 +289,7 @@ def test_what_is_forbidden_is_done_once_it_is_allowed(control_plane: ControlPlan
     kubeconfig = control_plane.kubeconfig_of_service_account(namespace, "default")
     with reconciling(kubeconfig, namespace, resync=1.0) as running:
         running.update(by_name(wanted))
-        wait_until(lambda: running.counts.refused, lambda r: r["Forbidden"] > 0, timeout=10, what="it was refused")
+        wait_until(lambda: running.counts.refused, lambda r: r["Forbidden"] > 0, timeout=20, what="it was refused")
         assert api.list("ApplicationTask") == []
         api.apply(_role("reads", ["get", "list", "watch", "create", "patch"]))
         tasks_are(api, {wanted.name})

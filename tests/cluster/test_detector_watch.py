@@ -45,7 +45,7 @@ class Following:
             self.changes.append(change)
 
     def wait(self, **data: str) -> None:
-        wait_until(lambda: dict(self.data), lambda found: found == data, timeout=15, what=f"known: {data}")
+        wait_until(lambda: dict(self.data), lambda found: found == data, timeout=20, what=f"known: {data}")
 
 
 def name(obj: JsonObject) -> str:
@@ -74,7 +74,7 @@ def test_creations_changes_and_deletions_come_without_another_list(api: Api, nam
 def test_all_is_listed_again_after_the_resync_period(api: Api, namespace: str, loop: Background) -> None:
     api.create(config_map("a", "1"))
     following = Following(loop, namespace, resync=1.0)
-    wait_until(lambda: following.reflector.lists, lambda n: n >= 3, timeout=10, what="three lists")
+    wait_until(lambda: following.reflector.lists, lambda n: n >= 3, timeout=20, what="three lists")
     assert following.reflector.outages == 0
     assert following.data == {"a": "1"}
 
@@ -88,7 +88,7 @@ def test_what_happens_around_an_outage_is_not_missed(
     following.wait(a="1", b="1")
     control_plane.stop_api_server()
     try:
-        wait_until(lambda: following.reflector.outages, lambda n: n == 1, timeout=10, what="the outage was noticed")
+        wait_until(lambda: following.reflector.outages, lambda n: n == 1, timeout=20, what="the outage was noticed")
     finally:
         control_plane.start_api_server()
     api.delete("ConfigMap", "a")

@@ -117,7 +117,7 @@ def test_a_deployment_deleted_by_hand_comes_back(api: Api, manager: Process) -> 
     wait_settled(api)
     uid = api.get("Deployment", NORTH)["metadata"]["uid"]
     api.delete("Deployment", NORTH)
-    api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, timeout=3, what="it is back")
+    api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, what="it is back")
     wait_settled(api)
 
 
@@ -127,7 +127,7 @@ def test_a_field_changed_by_hand_is_set_right(api: Api, manager: Process) -> Non
     there(api, NORTH)
     wait_settled(api)
     api.patch("Deployment", NORTH, {"spec": {"replicas": 5}})
-    api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, timeout=3, what="it is set right")
+    api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is set right")
 
 
 def test_an_object_of_somebody_else_is_left_alone(api: Api, manager: Process) -> None:
@@ -236,7 +236,7 @@ def test_without_its_template_an_instance_lingers_and_goes(api: Api, manager: Pr
 
 
 def test_a_linger_goes_on_through_a_restart(api: Api, manager: Process) -> None:
-    api.create(template(linger="6s"))
+    api.create(template(linger="15s"))
     api.create(task("north"))
     there(api, NORTH)
     end(api, "north")
@@ -284,6 +284,6 @@ def test_a_namespace_that_goes_is_left_quietly(api: Api, manager: Process, names
     api.delete("Namespace", namespace)
     api.wait_list("ApplicationTask", lambda found: not found, what="the tasks are gone")
     api.wait_list("Deployment", lambda found: not found, what="the Deployments are gone")
-    assert manager.terminate(patience=2) == 0
+    assert manager.terminate(patience=15) == 0
     assert "Traceback" not in manager.output()
     assert "WARNING" not in manager.output()

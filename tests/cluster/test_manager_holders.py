@@ -23,21 +23,24 @@ def manager(processes: Processes, namespace: str) -> Process:
     return start_manager(processes, namespace)
 
 
+LONG = 600  # s: for as long as the test looks
+
+
 @pytest.fixture
-def renew(api: Api) -> Callable[[], None]:
-    """Renews the Lease of the holder `det`, which lasts for one second; the first call creates it."""
+def renew(api: Api) -> Callable[[int], None]:
+    """Renews the Lease of the holder `det` for so many seconds; it begins with a long one."""
     seconds = itertools.count()
 
-    def renew() -> None:
+    def renew(duration: int) -> None:
         spec = {
             "holderIdentity": "det",
-            "leaseDurationSeconds": 1,
+            "leaseDurationSeconds": duration,
             "renewTime": f"2020-01-01T00:00:{next(seconds):02}.000000Z",  # a clock that is far behind
         }
         metadata = {"name": "wayside-det"}
         api.apply({"apiVersion": "coordination.k8s.io/v1", "kind": "Lease", "metadata": metadata, "spec": spec})
 
-    renew()
+    renew(LONG)
     return renew
 
 
@@ -50,12 +53,13 @@ def reason(raw: Any) -> Any:
 
 
 def test_a_lost_holder_releases_and_a_returning_one_counts_again(
-    api: Api, manager: Process, renew: Callable[[], None]
+    api: Api, manager: Process, renew: Callable[[int], None]
 ) -> None:
     api.create(lossy())
     api.create(task("north", holder="det"))
     api.create(task("person"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
+    renew(1)
     lost = api.wait_for("ApplicationTask", "north", lambda raw: reason(raw) == "HolderLost", what="the holder is lost")
     assert "wayside-det was not renewed for 2 s" in condition(lost, "Accepted")["message"]
     assert lost["status"]["phase"] == "Lapsed"
@@ -69,18 +73,18 @@ def test_a_lost_holder_releases_and_a_returning_one_counts_again(
     wait_settled(api, lost=LOST)
     assert api.find("Deployment", NORTH) is None
 
-    renew()
-    api.wait_for("Deployment", NORTH, lambda _: True, timeout=5, what="the demand counts again")
+    renew(LONG)
+    api.wait_for("Deployment", NORTH, lambda _: True, what="the demand counts again")
     api.wait_for("ApplicationTask", "north", lambda raw: reason(raw) == "Accepted", what="the task is told")
 
 
-def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, renew: Callable[[], None]) -> None:
+def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, renew: Callable[[int], None]) -> None:
     api.create(lossy())
     api.create(task("north", holder="det"))
     api.create(task("unknown", holder="nobody"))
     uid = api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")["metadata"]["uid"]
-    for _ in range(8):
-        renew()
+    for _ in range(14):  # seven seconds: without the renewals, the holder would be lost after four
+        renew(3)
         api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] == uid, what="it stays")
         with pytest.raises(TimeoutError):  # half a second goes by, in which nothing may change
             api.wait_gone("Deployment", NORTH, timeout=0.5)
@@ -88,12 +92,15 @@ def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, re
     assert reason(api.get("ApplicationTask", "unknown")) == "Accepted", "15 s of patience with one that has no Lease"
 
 
-def test_policy_hold_keeps_the_demands_of_a_lost_holder(api: Api, manager: Process, renew: Callable[[], None]) -> None:
+def test_policy_hold_keeps_the_demands_of_a_lost_holder(
+    api: Api, manager: Process, renew: Callable[[int], None]
+) -> None:
     api.create(lossy("Hold"))
     api.create({**lossy(), "metadata": {"name": "other"}})
     api.create(task("north", holder="det"))
     api.create(task("witness", of="other", holder="det"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
+    renew(1)
     api.wait_for("ApplicationTask", "witness", lambda raw: reason(raw) == "HolderLost", what="the holder is lost")
     assert reason(api.get("ApplicationTask", "north")) == "Accepted"
     assert api.find("Deployment", NORTH) is not None

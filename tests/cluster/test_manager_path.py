@@ -61,7 +61,7 @@ def test_a_task_becomes_a_deployment_that_is_ready_when_its_pods_are(api: Api, m
 
 
 def test_when_the_demand_ends_the_instance_lingers_and_goes_with_all_that_is_its(api: Api, manager: Process) -> None:
-    api.create(template(linger="2s"))
+    api.create(template(linger="4s"))
     api.create(task("north"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
     end(api, "north")
@@ -82,7 +82,7 @@ def test_when_the_demand_ends_the_instance_lingers_and_goes_with_all_that_is_its
 
 
 def test_a_new_demand_within_the_linger_keeps_the_instance_untouched(api: Api, manager: Process) -> None:
-    api.create(template(linger="3s"))
+    api.create(template(linger="30s"))
     api.create(task("north"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
     wait_settled(api)
@@ -182,4 +182,4 @@ def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
 
 
 def test_sigterm_ends_it_at_once(manager: Process) -> None:
-    assert manager.terminate(patience=2) == 0
+    assert manager.terminate(patience=15) == 0

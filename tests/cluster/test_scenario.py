@@ -122,7 +122,7 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
     observer = Observer(api, start_ns)
     with observer.watching():
         assert drive(endpoint, start_ns).wait(DURATION + 20) == 0
-        api.wait_list("Deployment", lambda found: not found, timeout=15, what="all applications are gone")
+        api.wait_list("Deployment", lambda found: not found, timeout=20, what="all applications are gone")
     assert detector.terminate() == 0
 
     judge = episodes(simulate(SEED, DURATION), DURATION)
@@ -206,7 +206,7 @@ def test_with_clock_data_a_recording_gives_the_same_events_played_live_and_repla
     detector.wait_for_output("Detector town runs with 1 rules")
     assert drive(endpoint, start_ns).wait(DURATION + 30) == 0
     expected = 2 * len(episodes(simulate(SEED, DURATION), DURATION))
-    wait_until(lambda: len(events_of(live)), lambda count: count >= expected, timeout=10, what="all events are there")
+    wait_until(lambda: len(events_of(live)), lambda count: count >= expected, timeout=20, what="all events are there")
     assert detector.terminate() == 0
     subprocess.run(
         [sys.executable, "-m", "detector.cli", "replay", str(recording), *files, "--output", str(replayed)],

@@ -6,11 +6,13 @@ from typing import Any
 
 import pytest
 
+from application_manager.claimbook import ClaimBook
 from application_manager.core.conditions import Aspect, changed, updated
 from application_manager.core.demand import Standing, Verdict
 from application_manager.core.readiness import not_ready
 from application_manager.core.status import Service, difference, finished_since, task_status
-from tests.unit.manager_objects import NOW, task
+from application_manager.store import Entry
+from tests.unit.manager_objects import NOW, task, template
 from wayside.api.applicationtask import TaskPhase
 from wayside.times import format_seconds, parse_seconds
 
@@ -58,6 +60,19 @@ def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
     assert (done.phase, done.instance) == (TaskPhase.FINISHED, "app")
     assert finished_since(served.model_copy(update={"status": done})) == NOW + 7
     assert finished_since(served) is None
+
+
+def test_a_task_that_ends_before_its_status_is_written_still_says_what_served_it() -> None:
+    book, name = ClaimBook(), ("site", "a")
+    book.note(name, Entry({}, task("a")), template())
+    claimed = book.claim(name)
+    assert claimed is not None
+    ended = task("a", ended=True)
+    book.note(name, Entry({}, ended), template())
+    verdict = book.verdict(name)
+    assert verdict is not None
+    done = task_status(ended, verdict, None, NOW)
+    assert (done.phase, done.instance) == (TaskPhase.FINISHED, claimed.instance)
 
 
 def test_a_holder_that_returns_takes_back_that_its_task_is_finished() -> None:
