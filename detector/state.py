@@ -152,8 +152,10 @@ class StateFile:
             "of": self._whose,
             "episodes": [episode.to_document() for episode in episodes],
         }
+        # Not json.dump: each call leaves some thirty objects in cycles, which are collected rarely here.
+        text = json.dumps(document, separators=(",", ":"), allow_nan=False)
         with self._draft.open("w", encoding="utf-8") as file:
-            json.dump(document, file, separators=(",", ":"), allow_nan=False)
+            file.write(text)
             file.flush()
             os.fsync(file.fileno())
         self._draft.replace(self.path)
