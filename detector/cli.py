@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from detector import inquiry
-from detector.actions.file_store import write_tasks_yaml
+from detector.actions.deploy.file_store import write_tasks_yaml
 from detector.assembly import DetectorError
 from detector.checking import check_documents, summary
 from detector.cluster.errors import NoClusterError

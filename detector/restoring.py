@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import aclosing
 from dataclasses import dataclass
 
-from detector.actions.stores import Snapshot, TaskStore, live_demands
+from detector.actions.deploy.stores import Snapshot, TaskStore, live_demands
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.state import StateFile

@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 
-from detector.actions.deploy import DemandReconciler
+from detector.actions.deploy.reconciler import DemandReconciler
 from detector.answers import Answers
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.samples.intake import Intake

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from detector.actions.lease import HolderLease, Identity
+from detector.actions.deploy.lease import HolderLease, Identity
 from tests.cluster.api import Api, Object
 from tests.cluster.background import PATIENCE, Background, background
 from tests.cluster.controlplane import ControlPlane

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from detector.actions.deploy import DemandReconciler, DeployCounts
-from detector.actions.kubernetes_store import KubernetesTaskStore
-from detector.actions.stores import TaskExistsError, manifest, restore
+from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
+from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
+from detector.actions.deploy.stores import TaskExistsError, manifest, restore
 from detector.engine.episodes.demands import Demand, to_task
 from tests.cluster.api import Api, Object, Objects
 from tests.cluster.background import PATIENCE, Background, background

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from detector.actions.queue import WorkQueue
+from detector.actions.deploy.queue import WorkQueue
 from detector.cluster.backoff import Backoff
 
 

@@ -7,9 +7,9 @@ import dataclasses
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.actions.ledger import Ledger
-from detector.actions.steps import Step, next_step
-from detector.actions.stores import Snapshot, StoredTask, Update
+from detector.actions.deploy.ledger import Ledger
+from detector.actions.deploy.steps import Step, next_step
+from detector.actions.deploy.stores import Snapshot, StoredTask, Update
 from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.test_demands import DEMAND
 

@@ -21,7 +21,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.actions.file_store import FileTaskStore
+from detector.actions.deploy.file_store import FileTaskStore
 from detector.engine.episodes.demands import to_task
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from detector.engine.episodes.subjects import Subject

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping
 
-from detector.actions.steps import Step, next_step
-from detector.actions.stores import Snapshot, StoredTask, Update
+from detector.actions.deploy.steps import Step, next_step
+from detector.actions.deploy.stores import Snapshot, StoredTask, Update
 from detector.engine.episodes.demands import Demand
 
 _log = logging.getLogger(__name__)

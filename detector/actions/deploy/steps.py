@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import Any
 
-from detector.actions.stores import StoredTask
+from detector.actions.deploy.stores import StoredTask
 from detector.engine.episodes.demands import Demand, plain
 from wayside.times import format_time
 

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import yaml
 from pydantic import ValidationError
 
-from detector.actions.stores import (
+from detector.actions.deploy.stores import (
     Snapshot,
     StoredTask,
     StoreUnavailableError,

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from pydantic import ValidationError
 
-from detector.actions.stores import (
+from detector.actions.deploy.stores import (
     Snapshot,
     StoredTask,
     StoreUnavailableError,

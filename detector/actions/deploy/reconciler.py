@@ -17,10 +17,10 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from detector.actions.ledger import Ledger
-from detector.actions.queue import WorkQueue
-from detector.actions.steps import Step, differences
-from detector.actions.stores import (
+from detector.actions.deploy.ledger import Ledger
+from detector.actions.deploy.queue import WorkQueue
+from detector.actions.deploy.steps import Step, differences
+from detector.actions.deploy.stores import (
     Snapshot,
     StoredTask,
     StoreUnavailableError,
