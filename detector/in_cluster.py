@@ -10,9 +10,9 @@ from collections.abc import Awaitable
 from pathlib import Path
 from typing import TypeVar
 
-from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
 from detector.actions.deploy.lease import HolderLease
+from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.stores import TaskStore
 from detector.cluster.connection import connect
 from detector.restoring import what_was_open

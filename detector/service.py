@@ -13,8 +13,8 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
+from detector.actions.deploy.reconciler import DemandReconciler
 from detector.restoring import what_was_open
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
+from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.stores import TaskExistsError, manifest, restore
 from detector.engine.episodes.demands import Demand, to_task
 from tests.cluster.api import Api, Object, Objects

@@ -15,8 +15,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
+from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.stores import manifest, restore
 from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.test_demands import DEMAND

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.file_store import FileTaskStore
+from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
 from detector.engine.samples import liveliness
 from detector.engine.samples.liveliness import LIVELINESS, Token

@@ -13,8 +13,8 @@ import zenoh
 from pydantic import ValidationError
 
 from detector.access import AccessError, Login, login, tls_files
-from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.file_store import FileTaskStore
+from detector.actions.deploy.reconciler import DemandReconciler
 from detector.engine.samples.liveliness import LIVELINESS, Token
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.file_store import FileTaskStore
+from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet

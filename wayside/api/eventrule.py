@@ -7,17 +7,16 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
+from wayside.api.actions.action import Action
 from wayside.api.base import (
     Condition,
     Duration,
     Expression,
     Identifier,
-    JsonValue,
     Kind,
     Model,
     ObjectName,
     PositiveDuration,
-    TemplateName,
     conditions_field,
     validations,
 )
@@ -140,32 +139,6 @@ class Signal(Model):
         if self.aggregate in WITHOUT_VALUE and self.value is not None:
             raise ValueError(f"aggregate {self.aggregate} looks at no value: remove value (where picks samples)")
         return self
-
-
-class Deploy(Model):
-    """Demand an application for as long as the episode lasts."""
-
-    template: TemplateName = Field(description="The ApplicationTemplate, in the rule's namespace.")
-    priority: int = Field(
-        default=0, ge=-1_000_000, le=1_000_000, description="Tasks of higher priority are looked at first."
-    )
-    parameters: dict[Identifier, JsonValue] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="The template's parameters, with ${…} over the rule's variables at the start of the episode.",
-    )
-    follow: bool = Field(
-        default=False,
-        description="true: the parameters are evaluated again at each evaluation while the episode lasts, and the task "
-        "is patched when they change. One that is unknown or fails keeps its last value.",
-    )
-
-
-class Action(Model):
-    """What an episode leads to."""
-
-    name: ObjectName = Field(description="Unique within the rule.")
-    deploy: Deploy = Field(description="Emit an ApplicationTask that holds while the episode lasts.")
 
 
 class EventRuleSpec(Model):

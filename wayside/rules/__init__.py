@@ -2,6 +2,7 @@
 
 from wayside.rules.compiled import (
     ClientSubject,
+    CompiledAction,
     CompiledDeploy,
     CompiledElement,
     CompiledModel,
@@ -23,6 +24,7 @@ from wayside.rules.sources import source_problems
 
 __all__ = [
     "ClientSubject",
+    "CompiledAction",
     "CompiledDeploy",
     "CompiledElement",
     "CompiledModel",

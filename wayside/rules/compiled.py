@@ -130,6 +130,33 @@ class CompiledDeploy:
     """The parameters one by one, where they follow."""
 
 
+@dataclass(frozen=True, slots=True)
+class CompiledWindow:
+    """The samples that an action gets of an episode."""
+
+    streams: frozenset[str]
+    latched: frozenset[str]
+    """Streams of which what was said last comes as well, however long ago."""
+    shared: frozenset[str]
+    """The latched streams that belong to one client whom the Detector names: they come with everybody's samples."""
+    clients: frozenset[str] | None
+    """Beside the episode's own; None: those of all clients."""
+    before_ns: int
+    """Before the onset."""
+    after_ns: int
+    """After the end."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledAction:
+    """An action other than deploy."""
+
+    name: str
+    templates: Mapping[str, CompiledTemplate] = field(compare=False)
+    """What is rendered over the rule's variables at the start of each episode."""
+    window: CompiledWindow | None
+
+
 class ModelRunner(Protocol):
     """A model that is ready to run. Deterministic: the same inputs give the same outputs."""
 
@@ -182,6 +209,7 @@ class CompiledRule:
     enabled: bool
     dry_run: bool
     deploys: tuple[CompiledDeploy, ...]
+    actions: tuple[CompiledAction, ...]
     classification: dict[str, Any] | None
     digest: str
     """Of the fields that decide which episodes there are: open episodes end when it changes."""

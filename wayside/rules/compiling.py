@@ -10,6 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from wayside.api import Detector, EventRule
+from wayside.api.actions.action import Action
+from wayside.api.base import JsonValue
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Signal
 from wayside.api.stream import Stream
@@ -25,6 +27,7 @@ from wayside.expressions import (
     compile_template,
 )
 from wayside.keys import KeyPattern, KeyPatternError
+from wayside.rules.actions import compile_actions
 from wayside.rules.compiled import (
     CompiledDeploy,
     CompiledPlugin,
@@ -154,14 +157,15 @@ class _RuleCompiler:
         environment = condition_environment(self.spec)
         when = self.condition(("spec", "when"), self.spec.when, environment)
         until = self.condition(("spec", "until"), self.spec.until, environment)
-        deploys = [
-            self._deploy(index, action.name, environment) for index, action in enumerate(self.spec.actions)
-        ]  # fmt: skip
+        deploys = [self._deploy(index, action.name, environment) for index, action in self._actions(deploy=True)]
+        actions = compile_actions(self, self._actions(deploy=False), environment)
         elements = with_signals(elements, element_of(self.spec), [each for each in signals if each is not None])
         for path, text in element_problems(elements, models):
             self.problem(path, text)
         if subject is not None:
-            embedded = [each.expression for deploy in deploys if deploy for each in deploy.parameters.embedded]
+            templates = [deploy.parameters for deploy in deploys if deploy]
+            templates += [template for action in actions for template in action.templates.values()]
+            embedded = [each.expression for template in templates for each in template.embedded]
             subject = self._closing(subject, (when, until, *embedded))
         if self.problems or subject is None or when is None:
             return None
@@ -180,6 +184,7 @@ class _RuleCompiler:
             enabled=spec.enabled,
             dry_run=spec.dry_run,
             deploys=tuple(deploy for deploy in deploys if deploy is not None),
+            actions=tuple(actions),
             classification=None if spec.classification is None else spec.classification.to_json(),
             digest=_digest(self.rule, self.detector),
             elements=elements,
@@ -229,18 +234,18 @@ class _RuleCompiler:
             signal.name, episode_stream(rule), signal.aggregate, value, where, over, self.parameters, rule
         )
 
+    def _actions(self, *, deploy: bool) -> list[tuple[int, Action]]:
+        """The actions that deploy, or those that do not, with their places."""
+        return [each for each in enumerate(self.spec.actions) if (each[1].deploy is not None) is deploy]
+
     def _deploy(self, index: int, action: str, environment: Environment) -> CompiledDeploy | None:
         deploy = self.spec.actions[index].deploy
-        at: FieldPath = ("spec", "actions", index, "deploy", "parameters")
-        parameters: CompiledTemplate
-        try:
-            parameters = compile_template(dict(deploy.parameters), self._typed(environment))
-        except InterpolationError as error:
-            for each in (error, *error.others):
-                self.problem((*at, _parameter_of(each)), str(each))
+        if deploy is None:
             return None
-        for embedded in parameters.embedded:
-            self._members((*at, _parameter_of(embedded)), embedded.expression.paths)
+        at: FieldPath = ("spec", "actions", index, "deploy", "parameters")
+        parameters = self.template(at, dict(deploy.parameters), environment)
+        if parameters is None:
+            return None
         one_by_one = {
             name: compile_template(value, environment, path=name)
             for name, value in deploy.parameters.items()
@@ -248,6 +253,20 @@ class _RuleCompiler:
         }
         source = _canonical(deploy.parameters)
         return CompiledDeploy(action, deploy.template, deploy.priority, source, parameters, deploy.follow, one_by_one)
+
+    def template(
+        self, path: FieldPath, value: Mapping[str, JsonValue], environment: Environment
+    ) -> CompiledTemplate | None:
+        """Texts with ${…}, which stand at the path by name; None where one is wrong."""
+        try:
+            compiled = compile_template(dict(value), self._typed(environment))
+        except InterpolationError as error:
+            for each in (error, *error.others):
+                self.problem((*path, _parameter_of(each)), str(each))
+            return None
+        for embedded in compiled.embedded:
+            self._members((*path, _parameter_of(embedded)), embedded.expression.paths)
+        return compiled
 
     def stream(self, path: FieldPath, name: str) -> Stream | None:
         """The Detector's stream of that name; None, and a problem, where it has none."""

@@ -1,0 +1,113 @@
+"""What an action is: a class with typed parameters that is told of a rule's episodes, one after the other.
+
+An action has a thread of its own: it may wait for disks and networks, and nobody else notices. What it raises ends its
+work for that episode and no other.
+"""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Generic, Protocol, TypeVar
+
+from pydantic import BaseModel
+
+from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome
+from detector.engine.samples.sample import Decoder
+from detector.streams.codecs.ros import RosTypes
+from wayside.api import Detector, EventRule
+
+P = TypeVar("P", bound=BaseModel)
+"""The model of an action's parameters."""
+
+
+class ActionError(Exception):
+    """Raised by an action that cannot do its work for an episode, with a text for people."""
+
+
+class Messenger(Protocol):
+    """The detector's Zenoh session, as far as actions use it. Thread-safe."""
+
+    def publish(self, key: str, payload: bytes, encoding: str) -> None:
+        """Queue a message; never waits. With the queue full it is dropped and counted."""
+
+    def ask(self, selector: str, payload: bytes | None, timeout: float) -> list[bytes]:
+        """Send a query and wait for the answers, at most so many seconds.
+
+        Raises ActionError where there is no session, nobody answers, or the answer is an error.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the detector is just now. It may be another after a change of the Detector."""
+
+    detector: Detector
+    decoders: Mapping[str, Decoder]
+    """By stream."""
+    types: RosTypes
+    """The ROS 2 message types that the Detector knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Where an action works. All of it is thread-safe."""
+
+    rule: EventRule
+    action: str
+    """The action's name in the rule."""
+    holder: str
+    surroundings: Callable[[], Surroundings]
+    messenger: Messenger
+    report: Callable[[Episode, Outcome], None]
+    """Say how far the work for an episode has come: it is published, counted and shown by `detector status`.
+
+    Every episode that was started must be reported DONE or FAILED at last, and may be RUNNING before, also repeatedly.
+    """
+    lose: Callable[[str, int, str], None]
+    """Count what was lost: in a few words what, how many, and the reason. It is shown beside the detector's losses."""
+    closing: threading.Event
+    """Set when the detector ends: whoever waits for something should give up soon."""
+
+
+class Action(ABC, Generic[P]):
+    """What a rule does about its episodes.
+
+    There is one object for each action of each rule. All its methods are called on one thread that belongs to it, never
+    two at a time, and for each episode in this order: `started`, `samples` and `ended` as it happens, `completed` last.
+    Episodes overlap.
+
+    What `started`, `samples`, `ended` or `completed` raises is reported as the failure of that episode, which is then
+    not told of any more.
+    """
+
+    Parameters: ClassVar[type[BaseModel]]
+    """The model of its parameters; what it refuses, `detector check` reports with its place."""
+
+    def __init__(self, parameters: P, setting: Setting) -> None:
+        self.parameters = parameters
+        self.setting = setting
+
+    def started(self, episode: Episode) -> None:
+        """An episode began, or was taken up again after a restart (`episode.resumed`)."""
+
+    def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
+        """The next samples of its window: of each client and stream in order of time, but for late ones."""
+
+    def ended(self, episode: Episode) -> None:
+        """Its event ended; samples of the window's `after` may follow."""
+
+    def completed(self, episode: Episode, completion: Completion) -> None:
+        """There is nothing more to come of it. It may not have ended, where the detector or the action ends."""
+
+    def wake(self) -> float | None:
+        """Called between the others: do what is due now, and say in how many seconds to call again at the latest.
+
+        None: when there is something new. What it raises is counted, and it is called again after a second.
+        """
+        return None
+
+    def close(self) -> None:
+        """The last call: all episodes are completed. Give up after a few seconds where something hangs."""

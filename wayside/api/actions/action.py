@@ -1,0 +1,72 @@
+"""An action of a rule: its name, and exactly one of the kinds that there are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from wayside.api.actions.deploy import Deploy
+from wayside.api.actions.plugin import ActionPlugin
+from wayside.api.actions.window import Window
+from wayside.api.base import JsonValue, Model, ObjectName, validations
+
+_KINDS = ("deploy", "plugin")
+_ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
+
+
+class Action(Model):
+    """What an episode leads to."""
+
+    model_config = validations(
+        (f"[{', '.join(f'has(self.{kind})' for kind in _KINDS)}].filter(given, given).size() == 1", _ONE)
+    )
+
+    name: ObjectName = Field(description="Unique within the rule.")
+    deploy: Deploy | None = Field(
+        default=None, description="Emit an ApplicationTask that holds while the episode lasts."
+    )
+    plugin: ActionPlugin | None = Field(default=None, description="What an installed package does about it.")
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Action:
+        if sum(getattr(self, kind) is not None for kind in _KINDS) != 1:
+            raise ValueError(_ONE)
+        return self
+
+    @property
+    def field(self) -> str:
+        """The name of the field that says what to do."""
+        return next(kind for kind in _KINDS if getattr(self, kind) is not None)
+
+    @property
+    def kind(self) -> str:
+        """What acts: the name of a built-in action, or of a plugin."""
+        return self.field if self.plugin is None else self.plugin.name
+
+    @property
+    def parameters(self) -> Model | Mapping[str, Any]:
+        """What it is to do: the model of a built-in action, or what is written for a plugin."""
+        if self.plugin is not None:
+            return self.plugin.parameters
+        chosen: Model = getattr(self, self.field)
+        return chosen
+
+    @property
+    def window(self) -> Window | None:
+        """The samples that it gets of an episode; None: none."""
+        chosen = getattr(self, self.field)
+        if isinstance(chosen, Window):
+            return chosen
+        return None if self.plugin is None else self.plugin.window
+
+    @property
+    def templates(self) -> tuple[tuple[str, ...], Mapping[str, JsonValue]]:
+        """What is rendered for each episode, by name, with ${…}; and the field of the action that they stand in.
+
+        A built-in action says by its attribute `templates` which of its fields these are.
+        """
+        if self.plugin is not None:
+            return ("plugin", "values"), self.plugin.values
+        return (self.field,), getattr(getattr(self, self.field), "templates", {})

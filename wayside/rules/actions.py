@@ -1,0 +1,93 @@
+"""Actions other than deploy: the samples that they get, and what is rendered for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+
+from wayside.api import Detector
+from wayside.api.actions.action import Action
+from wayside.api.actions.window import Window, WindowClients
+from wayside.api.base import JsonValue
+from wayside.api.eventrule import EventRuleSpec
+from wayside.api.stream import Stream
+from wayside.api.wording import FieldPath
+from wayside.expressions import CompiledTemplate, Environment
+from wayside.rules.compiled import CompiledAction, CompiledWindow
+
+
+class Compiler(Protocol):
+    """What of the rule's compiler is needed here."""
+
+    detector: Detector
+    spec: EventRuleSpec
+
+    def template(
+        self, path: FieldPath, value: Mapping[str, JsonValue], environment: Environment
+    ) -> CompiledTemplate | None:
+        """Texts with ${…}; None where one is wrong."""
+
+    def stream(self, path: FieldPath, name: str) -> Stream | None:
+        """The Detector's stream of that name; None, and a problem, where it has none."""
+
+    def kept_ns(self, stream: Stream) -> int:
+        """How long the Detector keeps the stream's samples, in nanoseconds."""
+
+    def problem(self, path: FieldPath, message: str) -> None:
+        """Say what is wrong with a field."""
+
+
+def compile_actions(
+    compiler: Compiler, actions: Iterable[tuple[int, Action]], environment: Environment
+) -> list[CompiledAction]:
+    """The actions, each with its place among the rule's; problems are told to the compiler."""
+    return [_compiled(compiler, ("spec", "actions", index), action, environment) for index, action in actions]
+
+
+def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: Environment) -> CompiledAction:
+    below, values = action.templates
+    rendered = {
+        name: compiler.template((*at, *below), {name: value}, environment) for name, value in values.items()
+    }  # one by one: what cannot be rendered takes nothing else with it
+    window = action.window
+    return CompiledAction(
+        action.name,
+        {name: template for name, template in rendered.items() if template is not None},
+        None if window is None else _window(compiler, (*at, action.field), action, window),
+    )
+
+
+def _window(compiler: Compiler, at: FieldPath, action: Action, window: Window) -> CompiledWindow:
+    if action.plugin is not None:
+        at = (*at, "window")
+    spec = compiler.detector.spec
+    if window.streams is None:
+        streams = list(spec.streams)
+    else:
+        named = (compiler.stream((*at, "streams", index), name) for index, name in enumerate(window.streams))
+        streams = [stream for stream in named if stream is not None]
+    back = window.before.ns + compiler.spec.for_.ns
+    for stream in streams:
+        kept = compiler.kept_ns(stream)
+        if window.before.ns and back > kept and not stream.latched:
+            with_for = f" and the rule's for ({compiler.spec.for_})" if compiler.spec.for_.ns else ""
+            compiler.problem(
+                (*at, "before"),
+                f"{window.before}{with_for} reach back further than the {kept / 1e9:g} s that Detector "
+                f"{compiler.detector.name} keeps of stream {stream.name}: shorten it, or raise the stream's "
+                "buffer.duration",
+            )
+    everyone = window.clients is WindowClients.ALL or compiler.spec.scope.fleet is not None
+    return CompiledWindow(
+        frozenset(stream.name for stream in streams if not stream.latched),
+        frozenset(stream.name for stream in spec.streams if stream.latched),
+        frozenset(stream.name for stream in spec.streams if stream.latched and _of_one(stream)),
+        None if everyone else frozenset(window.with_clients),
+        window.before.ns,
+        window.after.ns,
+    )
+
+
+def _of_one(stream: Stream) -> bool:
+    """Whether all its samples belong to a client whom the Detector names."""
+    return stream.client is not None and not stream.names_by_message
