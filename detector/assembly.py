@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from detector.actions.registry import action_problems
 from detector.engine.buffering.naming import CLIENT_NAME
 from detector.engine.engine import Engine, KeyReader
 from detector.engine.samples.liveliness import LIVELINESS
@@ -144,6 +145,12 @@ def _asn1(detector: Detector, problems: list[RuleProblem]) -> OwnDefinitions | N
         return None
 
 
+def offer_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
+    """What is wrong with what a rule asks of installed packages: its plugin signals and its actions."""
+    yield from plugin_problems(rule, detector)
+    yield from action_problems(rule, detector)
+
+
 class RuleBook:
     """Compiles rules, time and again. A rule that is refused goes on as it last was, and never harms the others.
 
@@ -163,7 +170,7 @@ class RuleBook:
         wrong = dependency_problems(rules)
         for rule in rules:
             try:
-                known = (*wrong.get(rule.name, ()), *plugin_problems(rule, detector))
+                known = (*wrong.get(rule.name, ()), *offer_problems(rule, detector))
                 compiled.append(bind_models(compile_rule(rule, detector, fields, known)))
                 good[rule.name] = rule
             except RuleError as error:
@@ -180,7 +187,7 @@ class RuleBook:
 def _compiled(rule: EventRule, detector: Detector, fields: Mapping[str, Fields]) -> CompiledRule | None:
     """The rule, or None where the Detector no longer allows it."""
     try:
-        return bind_models(compile_rule(rule, detector, fields, plugin_problems(rule, detector)))
+        return bind_models(compile_rule(rule, detector, fields, offer_problems(rule, detector)))
     except RuleError:
         return None
 

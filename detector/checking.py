@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from detector.assembly import DetectorError, Inlets, inlets
+from detector.assembly import DetectorError, Inlets, inlets, offer_problems
 from detector.models.binding import bind_models
-from detector.plugins.registry import plugin_problems as signal_plugin_problems
 from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
@@ -64,7 +63,7 @@ def _rule_problems(
         yield document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
     for of_detector, detector, entries in selecting:
         try:
-            known = (*wrong[detector.name].get(rule.name, ()), *signal_plugin_problems(rule, detector))
+            known = (*wrong[detector.name].get(rule.name, ()), *offer_problems(rule, detector))
             bind_models(compile_rule(rule, detector, entries.fields, known))
         except RuleError as error:
             for each in error.problems:

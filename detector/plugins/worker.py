@@ -21,9 +21,9 @@ from detector.engine.queries.geometry import Pose
 from detector.engine.queries.poses import PoseError
 from detector.engine.queries.queries import DecodedSample, QueryError
 from detector.engine.queries.transforms import TransformError
+from detector.entrypoints import PluginError
 from detector.plugins.base import Subject
 from detector.plugins.instances import Instances, failure_text
-from detector.plugins.registry import PluginError
 from detector.plugins.wire import ClosedError, Wire
 
 _RAISED = {kind.__name__: kind for kind in (TransformError, PoseError, QueryError)}

@@ -11,7 +11,7 @@ import pytest
 
 from detector.checking import check_documents
 from detector.plugins.instances import LocalHost
-from detector.plugins.registry import installed
+from detector.plugins.registry import OFFERS
 from detector.plugins.values import plain
 from tests.unit.driving import POSITION, START, a_detector, a_stream, arrival, at
 from tests.unit.plugin_rules import PluginDrive, plugin_rule, plugins
@@ -48,7 +48,7 @@ def problems(tmp_path: Path, plugin: str, parameters: str, when: str = "p.count 
 
 
 def test_what_is_installed_and_what_is_shipped_is_there() -> None:
-    assert {"counting", "strange", "unmatched-objects"} <= installed().keys()
+    assert {"counting", "strange", "unmatched-objects"} <= OFFERS.installed().keys()
 
 
 def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None:

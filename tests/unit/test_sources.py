@@ -10,14 +10,15 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ConfigDict
 
+from detector import entrypoints
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
-from detector.sources import Feed, Source, registry
-from detector.sources.registry import plugin_problems
+from detector.sources import Feed, Source
+from detector.sources.registry import OFFERS, plugin_problems
 from detector.sources.supervision import Sources, SourceThread, State
 from detector.streams.tally import Cause, Tally
 from tests.unit.driving import a_detector, a_stream
@@ -85,12 +86,12 @@ class Unfinished(Source[Any]):
 def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     """The classes above as installed plugins."""
     here = [
-        EntryPoint(each.lower(), f"{__name__}:{each}", registry.GROUP)
+        EntryPoint(each.lower(), f"{__name__}:{each}", OFFERS.group)
         for each in ("Once", "Failing", "Leaving", "Lasting", "Hanging", "Unfinished", "NoParameters", "Absent")
     ]
-    here.append(EntryPoint("unmet", "no_such_module:Plugin", registry.GROUP))
-    monkeypatch.setattr(registry, "entry_points", lambda group: here)
-    registry._load.cache_clear()
+    here.append(EntryPoint("unmet", "no_such_module:Plugin", OFFERS.group))
+    monkeypatch.setattr(entrypoints, "entry_points", lambda group: here)
+    entrypoints._load.cache_clear()
 
 
 @pytest.fixture
@@ -201,14 +202,17 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
 @pytest.mark.parametrize(
     ("source", "problem"),
     [
-        ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed; did you mean once?"),
+        ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed here; did you mean once?"),
         (
             {"plugin": "unmet"},
-            "spec.sources[0].plugin: plugin unmet cannot be loaded: No module named 'no_such_module'",
+            "spec.sources[0].plugin: plugin unmet cannot be loaded: ModuleNotFoundError: No module named",
         ),
         ({"plugin": "absent"}, "spec.sources[0].plugin: plugin absent cannot be loaded: AttributeError"),
-        ({"plugin": "noparameters"}, "which is no detector.sources.Source"),
-        ({"plugin": "unfinished"}, "spec.sources[0].plugin: plugin unfinished has no Parameters"),
+        ({"plugin": "noparameters"}, "which is no complete detector.sources.base.Source"),
+        (
+            {"plugin": "unfinished"},
+            "spec.sources[0].plugin: plugin unfinished: give tests.unit.test_sources:Unfinished a",
+        ),
         (
             {"plugin": "once", "parameters": {"text": 1}},
             "spec.sources[0].parameters.text: must be a text, is 1: put what you mean in quotes",

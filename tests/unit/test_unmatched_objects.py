@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.samples.sample import Arrival
+from detector.entrypoints import PluginError
 from detector.plugins.assignment import assigned
 from detector.plugins.instances import LocalHost
-from detector.plugins.registry import PluginError, prepare
+from detector.plugins.registry import prepare
 from detector.plugins.tracking import Tracks
 from tests.unit.driving import a_detector, a_rule, a_stream, arrival, at
 from tests.unit.plugin_rules import PluginDrive

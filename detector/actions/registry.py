@@ -1,0 +1,57 @@
+"""Which actions there are, and whether a rule gives them what they ask for.
+
+Built-in actions are found as those of other packages are. Their parameters are fields of the rule, so they are known to
+be right once the rule is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from pydantic import BaseModel
+
+from detector.actions.base import Action
+from detector.entrypoints import Offers, PluginError
+from wayside.api import Detector, EventRule
+from wayside.api.actions import action as api
+from wayside.rules import RuleProblem
+
+OFFERS = Offers[Action[Any]](
+    group="wayside.actions", noun="action", base=Action, model=BaseModel, guide="docs/actions.md"
+)
+
+DEPLOY = "deploy"
+"""The action that is none of these: its tasks are reconciled (detector/actions/deploy)."""
+
+
+def prepare(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
+    """The class of an action other than deploy, and its parameters; `streams` are those that parameters may name.
+
+    Raises PluginError; the paths begin at the action.
+    """
+    if action.plugin is None:
+        offered = OFFERS.load(action.kind, (action.field,))
+        given = action.parameters
+        if not isinstance(given, offered.Parameters):
+            wanted = f"{offered.Parameters.__module__}.{offered.Parameters.__name__}"
+            raise PluginError(((action.field,), f"what is installed as action {action.kind} asks for {wanted}"))
+        return offered, given
+    name = action.plugin.name
+    if name in api.Action.model_fields:
+        raise PluginError((("plugin", "name"), f"{name} is no plugin: write {name}: {{…}} in place of plugin: {{…}}"))
+    offered = OFFERS.load(name, ("plugin", "name"))
+    context = {"streams": None if streams is None else list(streams)}
+    return offered, OFFERS.parameters(offered, action.plugin.parameters, ("plugin", "parameters"), context)
+
+
+def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
+    """What is wrong with a rule's actions, as far as their classes can tell here."""
+    streams = [stream.name for stream in detector.spec.streams]
+    for index, action in enumerate(rule.spec.actions):
+        if action.field != DEPLOY:
+            try:
+                prepare(action, streams)
+            except PluginError as error:
+                for path, text in error.problems:
+                    yield RuleProblem(("spec", "actions", index, *path), text)

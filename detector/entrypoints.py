@@ -1,0 +1,116 @@
+"""What installed packages offer: classes of one kind, each with a model of its parameters.
+
+A package says by an entry point what it brings; whoever writes a resource names it and gives it parameters. Whatever is
+wrong with that (nothing of that name, a module that does not load, parameters that it refuses) is told with its field.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from wayside.api.wording import FieldPath, messages
+
+T = TypeVar("T")
+"""The base class of what is offered."""
+
+_OWN = "wayside"
+"""The distribution whose offers come before those of others with the same name."""
+
+
+class PluginError(ValueError):
+    """A plugin that is not there, cannot be loaded, or refuses its parameters; `problems` says where and why.
+
+    The paths begin at the part of the resource that names the plugin.
+    """
+
+    def __init__(self, *problems: tuple[FieldPath, str]) -> None:
+        self.problems = problems
+        super().__init__("; ".join(text for _, text in problems))
+
+
+@dataclass(frozen=True)
+class Offers(Generic[T]):
+    """One kind of what packages offer. Loading runs their code: only what is named is loaded, and only once."""
+
+    group: str
+    """Of the entry points, e.g. wayside.signals."""
+    noun: str
+    """What people call one of them, e.g. plugin."""
+    base: type
+    """T: what the classes derive from; they have an attribute `Parameters`."""
+    model: type[BaseModel]
+    """What `Parameters` derives from."""
+    guide: str
+    """Where it is told how to write one, e.g. docs/plugins.md."""
+    shipped: tuple[EntryPoint, ...] = ()
+    """Those that need no installed package."""
+
+    def installed(self) -> dict[str, EntryPoint]:
+        """By name; of two with the same name, the detector's own, or the one found first."""
+        found: dict[str, EntryPoint] = {}
+        for entry in (*self.shipped, *sorted(entry_points(group=self.group), key=_foreign)):
+            found.setdefault(entry.name, entry)
+        return dict(sorted(found.items()))
+
+    def load(self, name: str, at: FieldPath) -> type[T]:
+        """The class of that name, which stands in the field `at`. Raises PluginError; then nothing is remembered."""
+        try:
+            found: type[T] = _load(self, name)
+        except LookupError as error:
+            raise PluginError((at, str(error))) from error.__cause__
+        return found
+
+    def parameters(
+        self, offered: type[T], given: Mapping[str, Any], at: FieldPath, context: Mapping[str, Any] | None = None
+    ) -> Any:
+        """An instance of the class's Parameters, from what stands in the field `at`. Raises PluginError."""
+        written = dict(given)
+        try:
+            return offered.Parameters.model_validate(written, context=context)  # type: ignore[attr-defined]
+        except ValidationError as error:
+            raise PluginError(*(((*at, *path), text) for path, text in messages(error, written))) from error
+
+
+def _foreign(entry: EntryPoint) -> bool:
+    return entry.dist is None or entry.dist.name != _OWN
+
+
+@cache
+def _load(offers: Offers[T], name: str) -> type[T]:
+    """Raises LookupError, with a text for the one who named it."""
+    entries = offers.installed()
+    entry = entries.get(name)
+    what = f"{offers.noun} {name}"
+    if entry is None:
+        close = difflib.get_close_matches(name, entries, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(entries) or 'none'}"
+        raise LookupError(f"no {what} is installed here; {hint} ({offers.guide})")
+    try:
+        offered: Any = entry.load()
+    except Exception as error:  # somebody else's module, which may raise whatever it likes
+        raise LookupError(f"{what} cannot be loaded: {type(error).__name__}: {error}{_remedy(entry, error)}") from error
+    base = f"{offers.base.__module__}.{offers.base.__qualname__}"
+    complete = inspect.isclass(offered) and issubclass(offered, offers.base) and not inspect.isabstract(offered)
+    if not complete:
+        raise LookupError(f"{what} is {entry.value}, which is no complete {base} ({offers.guide})")
+    model = getattr(offered, "Parameters", None)
+    if not (inspect.isclass(model) and issubclass(model, offers.model)):
+        raise LookupError(f"{what}: give {entry.value} a class Parameters({offers.model.__name__}) ({offers.guide})")
+    loaded: type[T] = offered
+    return loaded
+
+
+def _remedy(entry: EntryPoint, error: Exception) -> str:
+    """What to install where an offer of the detector's own lacks a library."""
+    if not isinstance(error, ImportError) or entry.dist is None or _foreign(entry):
+        return ""
+    extras = entry.dist.metadata.get_all("Provides-Extra") or []
+    return f": pip install '{_OWN}[{entry.name}]'" if entry.name in extras else ""
