@@ -5,24 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any
 
+from detector.engine.consequences.excerpts import EpisodeSample
 from wayside.api.base import JsonValue
 
-
-class EpisodeSample(NamedTuple):
-    """One message of an episode's window, as it was received."""
-
-    client: str
-    stream: str
-    key: str
-    """The full key it came on, without a leading slash."""
-    time: int
-    """Its place on the detector's time axis, in nanoseconds since the epoch."""
-    received: int
-    """Nanoseconds since the epoch; the stamp as well with clock Data."""
-    payload: bytes
-    """As it came, undecoded."""
+__all__ = ["Completion", "Episode", "EpisodeSample", "Outcome", "OutcomeState"]
 
 
 @dataclass(frozen=True)

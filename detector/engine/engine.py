@@ -14,6 +14,7 @@ from detector.engine.buffering.inflow import Inflow
 from detector.engine.buffering.lanes import lane_makers
 from detector.engine.buffering.messages import KeyReader, Messages
 from detector.engine.buffering.naming import MessageClients
+from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Reason
@@ -81,6 +82,8 @@ class Engine:
         """Windows do not reach back further than the last gap; nanoseconds."""
         self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
         self._inflow = Inflow(self.buffer, self.clients, self.counters)
+        self.consequences = Consequences(self.buffer)
+        """What the actions other than deploy are told."""
         self._configure(detector, decoders, read_key, start)
         self._timeline = self._make_timeline(start)
 
@@ -157,11 +160,13 @@ class Engine:
         for name, run in sorted(self._runs.items()):
             rule = new.get(name)
             if rule is None or not same_semantics(run, rule):
-                events += run.end_all(now, Reason.RULE_CHANGED)
+                events += self._noted(run, run.end_all(now, Reason.RULE_CHANGED))
                 self._starts.forget(name)
                 self.schedule.forget(name)
             else:
+                before = run.rule
                 run.change_actions(rule)
+                self.consequences.change(before, rule, run.open_starts())
                 runs[name] = run
                 kept.add(name)
         for name, rule in new.items():
@@ -202,7 +207,9 @@ class Engine:
         run = self._runs.get(episode.rule)
         if run is None or not run.can_restore(episode):
             return [self._ended_while_away(episode, now)]
-        self._starts.started(run.restore(episode, demands))
+        event = run.restore(episode, demands)
+        self._starts.started(event)
+        self.consequences.begin(run.rule.actions, run.rule, event, resumed=True)
         for client in episode.subject.clients:
             self.clients.heard(client, now)
         return []
@@ -244,8 +251,7 @@ class Engine:
         if not run.rule.enabled or name in self.schedule.paused:
             raise NoAnswerError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
         events, answers = run.answer(self.now, self._views(run, self.now), self.clients, self._plugins)
-        for event in events:
-            self._starts.note(event)
+        self._noted(run, events)
         self._messages.forget()
         self._transforms.forget(self.now)
         return events, answers
@@ -321,10 +327,7 @@ class Engine:
         for name, run in self._runs.items():
             if not run.rule.enabled or name in self.schedule.paused:
                 continue
-            happened = self._turn(run, time, sampled, regular)
-            for event in happened:
-                self._starts.note(event)
-            events += happened
+            events += self._noted(run, self._turn(run, time, sampled, regular))
         self._messages.forget()
         self._transforms.forget(self.now)
         return events
@@ -348,6 +351,14 @@ class Engine:
             events += self._evaluated(run, time, only)
             self._wake(run, time, run.looked_at)
         return sorted(events, key=lambda event: event.subject)
+
+    def _noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
+        """The events, once the rules over this one and its actions know of them."""
+        happened = list(events)
+        for event in happened:
+            self._starts.note(event)
+            self.consequences.note(run.rule, event)
+        return happened
 
     def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
         begin = self.stopwatch()

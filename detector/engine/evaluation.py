@@ -16,6 +16,7 @@ from detector.engine.episodes.episodes import Ended, Observation, Reason, Starte
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
 from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.rendering import render
 from detector.engine.episodes.subjects import Subject, fits
 from detector.engine.scoping.plugins import PluginSignals
 from detector.engine.scoping.scopes import Candidate, Views, candidates
@@ -191,7 +192,7 @@ class RuleRun:
             {d.action: d for d in demands if d.action in deploys},
             {d.action for d in demands if d.action in deploys and deploys[d.action] != (d.template, d.priority)},
         )
-        return self._event(self._open[episode.subject], None, None, episode.values)
+        return self._start_of(self._open[episode.subject])
 
     def episodes(self) -> Iterator[OpenEpisode]:
         """The episodes that have not ended."""
@@ -238,7 +239,7 @@ class RuleRun:
     def open_starts(self) -> Iterator[Event]:
         """The events that said that the episodes which are open started, in order of the subjects."""
         for subject in sorted(self._open, key=lambda each: each.text):
-            yield self._event(self._open[subject], None, None, self._open[subject].values)
+            yield self._start_of(self._open[subject])
 
     def _in_progress(self) -> Iterator[Subject]:
         return (subject for subject, state in self._states.items() if state.is_open or state.onset is not None)
@@ -307,7 +308,12 @@ class RuleRun:
         self._open[subject] = episode
         self.counters.started += 1
         self._render(episode)
-        return self._event(episode, None, None, episode.values)
+        return self._start_of(episode)
+
+    def _start_of(self, episode: Episode) -> Event:
+        """The event of the episode's start, with what is rendered for the rule's actions as they are now."""
+        rendered = {action.name: render(action, episode.variables) for action in self.rule.actions}
+        return replace(self._event(episode, None, None, episode.values), rendered=rendered)
 
     def _ended(self, now: int, episode: Episode, reason: Reason, values: Mapping[str, Any]) -> Event:
         self.counters.ended += 1

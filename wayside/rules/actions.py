@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from typing import Protocol
 
@@ -44,6 +45,11 @@ def compile_actions(
     return [_compiled(compiler, ("spec", "actions", index), action, environment) for index, action in actions]
 
 
+def canonical(value: object) -> str:
+    """JSON that is the same for the same value."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
 def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: Environment) -> CompiledAction:
     below, values = action.templates
     rendered = {
@@ -54,6 +60,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
         action.name,
         {name: template for name, template in rendered.items() if template is not None},
         None if window is None else _window(compiler, (*at, action.field), action, window),
+        canonical(action.to_json()),
     )
 
 

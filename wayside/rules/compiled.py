@@ -155,6 +155,8 @@ class CompiledAction:
     templates: Mapping[str, CompiledTemplate] = field(compare=False)
     """What is rendered over the rule's variables at the start of each episode."""
     window: CompiledWindow | None
+    source: str
+    """The action as written, in canonical JSON: another action where this differs."""
 
 
 class ModelRunner(Protocol):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -27,7 +26,7 @@ from wayside.expressions import (
     compile_template,
 )
 from wayside.keys import KeyPattern, KeyPatternError
-from wayside.rules.actions import compile_actions
+from wayside.rules.actions import canonical, compile_actions
 from wayside.rules.compiled import (
     CompiledDeploy,
     CompiledPlugin,
@@ -251,7 +250,7 @@ class _RuleCompiler:
             for name, value in deploy.parameters.items()
             if deploy.follow
         }
-        source = _canonical(deploy.parameters)
+        source = canonical(deploy.parameters)
         return CompiledDeploy(action, deploy.template, deploy.priority, source, parameters, deploy.follow, one_by_one)
 
     def template(
@@ -356,8 +355,4 @@ def _parameter_of(located: InterpolationError | Embedded) -> str:
 def _digest(rule: EventRule, detector: Detector) -> str:
     """Of what decides which episodes there are, the Detector's values for the parameters among it."""
     clients = {client.name: values for client in detector.spec.clients if (values := client.parameters.get(rule.name))}
-    return hashlib.sha256(_canonical([rule.semantics(), clients]).encode()).hexdigest()[:16]
-
-
-def _canonical(value: object) -> str:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical([rule.semantics(), clients]).encode()).hexdigest()[:16]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample
 
@@ -23,8 +23,8 @@ class Lane:
     """The samples of one client on one stream, in order of time."""
 
     __slots__ = (
-        "bytes", "capped", "client", "duration", "evicted", "latest", "maximum_bytes", "maximum_count", "samples",
-        "stream",
+        "bytes", "came", "capped", "client", "duration", "evicted", "latest", "maximum_bytes", "maximum_count",
+        "samples", "stream",
     )  # fmt: skip
 
     latched = False
@@ -41,6 +41,8 @@ class Lane:
         """`duration` is in nanoseconds."""
         self.client = client
         self.stream = stream
+        self.came: list[Sample] | None = None
+        """What was put in since `record`; None while nobody wants to know."""
         self.limit(duration, maximum_bytes, maximum_count)
         self.samples: deque[Sample] = deque()
         self.bytes = 0
@@ -54,8 +56,16 @@ class Lane:
         self.duration = duration
         self.maximum_bytes = maximum_bytes
         self.maximum_count = maximum_count
-        self.capped = maximum_bytes is not None or maximum_count is not None
-        """Whether samples have to come in through `insert`, since it looks at the caps."""
+        self._decide()
+
+    def record(self, came: list[Sample] | None) -> None:
+        """Add what is put in from now on to the list, in the order in which it comes; or (None) do so no more."""
+        self.came = came
+        self._decide()
+
+    def _decide(self) -> None:
+        self.capped = self.maximum_bytes is not None or self.maximum_count is not None or self.came is not None
+        """Whether samples have to come in through `insert`, which looks at the caps and at `came`."""
 
     @property
     def newest(self) -> Sample | None:
@@ -64,6 +74,8 @@ class Lane:
 
     def insert(self, sample: Sample) -> int:
         """Put the sample in its place; returns by how many bytes the lane grew."""
+        if self.came is not None:
+            self.came.append(sample)
         samples = self.samples
         if sample.time >= self.latest:
             self.latest = sample.time
@@ -123,6 +135,8 @@ class Buffer:
         self.bytes = 0
         self._lanes: dict[str, dict[str, Lane]] = {}
         """By client and stream."""
+        self.on_added: Callable[[Lane], None] = lambda lane: None
+        """Told each lane that is new."""
         self._evicted_before = 0
         """Evicted from lanes that are gone."""
 
@@ -133,7 +147,11 @@ class Buffer:
 
     def add(self, lane: Lane) -> Lane:
         """Take the lane in; the one that is there already where there is one."""
-        return self._lanes.setdefault(lane.client, {}).setdefault(lane.stream, lane)
+        lanes = self._lanes.setdefault(lane.client, {})
+        if lane.stream not in lanes:
+            lanes[lane.stream] = lane
+            self.on_added(lane)
+        return lanes[lane.stream]
 
     def grew(self, size: int) -> None:
         """Account for what was inserted, and keep to the cap."""

@@ -54,9 +54,8 @@ class LatchedLane(Lane):
         self._topic = topic
         self._topics: dict[Sample, Hashable] = {}
 
-    def limit(self, duration: int, maximum_bytes: int | None, maximum_count: int | None) -> None:
-        """See Lane. Every sample comes through `insert`."""
-        super().limit(duration, maximum_bytes, maximum_count)
+    def _decide(self) -> None:
+        """Every sample comes through `insert`."""
         self.capped = True
 
     def insert(self, sample: Sample) -> int:

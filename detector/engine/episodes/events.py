@@ -9,6 +9,7 @@ from typing import Any
 
 from detector.engine.episodes.demands import plain
 from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.rendering import Rendered
 from wayside.api.base import JsonValue
 from wayside.times import format_time
 
@@ -38,6 +39,9 @@ class Event:
 
     dry_run: bool = False
     """No action of the rule runs."""
+
+    rendered: Mapping[str, Rendered] = field(default_factory=dict)
+    """Of a start: what is rendered for the actions, by their names. It is for them alone."""
 
     @property
     def started(self) -> bool:

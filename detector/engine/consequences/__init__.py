@@ -1,0 +1,1 @@
+"""What actions are told: episodes that start and end, and the samples around them."""

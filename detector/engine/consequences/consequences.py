@@ -1,0 +1,156 @@
+"""What the actions of rules are told, in order: an episode begins, its samples, it ends, nothing more comes of it.
+
+The engine notes what happens; the shell takes it and passes it on, to actions that may be as slow as they like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from detector.engine.buffering.buffer import Buffer
+from detector.engine.consequences.excerpts import EpisodeSample, Excerpt, Excerpts
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.rendering import Rendered
+from wayside.rules import CompiledAction, CompiledRule
+
+REPLACED = "the action was changed or removed"
+
+
+class Run(NamedTuple):
+    """One action at work for one episode."""
+
+    rule: str
+    action: str
+    episode: str
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """The action has an episode."""
+
+    run: Run
+    event: Event
+    """Of the start."""
+    rendered: Rendered
+    resumed: bool
+    """The episode was open before the detector started, or before the rule had this action."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """The next samples of the window."""
+
+    run: Run
+    samples: list[EpisodeSample]
+
+
+@dataclass(frozen=True, slots=True)
+class Over:
+    """The episode ended."""
+
+    run: Run
+    event: Event
+    """Of the end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Completed:
+    """There is nothing more to come of the run."""
+
+    run: Run
+    cut: str = ""
+    """Why the window ended before its time; empty where it did not."""
+
+
+Consequence = Begun | Sampled | Over | Completed
+
+
+class Consequences:
+    """The runs of all actions other than deploy."""
+
+    def __init__(self, buffer: Buffer) -> None:
+        self._excerpts = Excerpts(buffer)
+        self._running: dict[Run, Excerpt | None] = {}
+        """With the excerpt, where the action has a window."""
+        self._noted: list[Consequence] = []
+
+    def note(self, rule: CompiledRule, event: Event) -> None:
+        """An episode of the rule started or ended just now, or before the rule changed."""
+        if event.started:
+            self.begin(rule.actions, rule, event, resumed=False)
+            return
+        for run in [run for run in self._running if (run.rule, run.episode) == (event.rule, event.episode)]:
+            self._end(run, event)
+
+    def begin(self, actions: Iterable[CompiledAction], rule: CompiledRule, event: Event, *, resumed: bool) -> None:
+        """These actions of the rule have the episode from now on."""
+        if rule.dry_run:
+            return
+        for action in actions:
+            run = Run(rule.name, action.name, event.episode)
+            window = action.window
+            excerpt = None
+            self._noted.append(Begun(run, event, event.rendered.get(action.name, Rendered()), resumed))
+            if window is not None:
+                clients = None if window.clients is None else window.clients | frozenset(event.subjects)
+                excerpt = self._excerpts.begin(window, clients, event.onset_time - window.before_ns)
+            self._running[run] = excerpt
+
+    def change(self, before: CompiledRule, rule: CompiledRule, open_starts: Iterable[Event]) -> None:
+        """The rule has other actions than before, and these episodes go on."""
+        known, wanted = set(before.actions), set(rule.actions)
+        if (known, before.dry_run) == (wanted, rule.dry_run):
+            return
+        gone = {action.name for action in known - wanted} if not rule.dry_run else {action.name for action in known}
+        for run in [run for run in self._running if run.rule == rule.name and run.action in gone]:
+            self._complete(run, REPLACED)
+        new = [action for action in rule.actions if action not in known or before.dry_run]
+        for event in open_starts:
+            self.begin(new, rule, event, resumed=True)
+
+    def take(self, now: int) -> list[Consequence]:
+        """What is to be told, up to the time `now` that the engine has reached; nanoseconds."""
+        if self._running:
+            self._excerpts.distribute()
+            for run, excerpt in list(self._running.items()):
+                if excerpt is not None:
+                    self._sample(run, excerpt, now)
+                    if excerpt.until is not None and now >= excerpt.until:
+                        self._complete(run, "")
+        noted, self._noted = self._noted, []
+        return noted
+
+    def cut(self, now: int, why: str) -> list[Consequence]:
+        """The same, and the end of all runs: the detector stops."""
+        noted = self.take(now)
+        for run in list(self._running):
+            self._complete(run, why)
+        return noted + self.take(now)
+
+    @property
+    def running(self) -> Mapping[Run, Excerpt | None]:
+        """The runs of which more may come."""
+        return self._running
+
+    def _end(self, run: Run, event: Event) -> None:
+        excerpt = self._running[run]
+        if excerpt is not None and excerpt.until is not None:
+            return  # it has ended already, and its window goes on
+        self._noted.append(Over(run, event))
+        if excerpt is None or event.end_time is None:
+            self._complete(run, "")
+        else:
+            excerpt.until = event.end_time + excerpt.window.after_ns
+
+    def _complete(self, run: Run, cut: str) -> None:
+        excerpt = self._running.pop(run)
+        if excerpt is not None:
+            self._excerpts.stop(excerpt)
+        self._noted.append(Completed(run, cut))
+
+    def _sample(self, run: Run, excerpt: Excerpt, now: int) -> None:
+        samples = excerpt.take(now)
+        if samples:
+            self._noted.append(Sampled(run, samples))

@@ -1,0 +1,127 @@
+"""Excerpts: the samples of an episode's window, each exactly once.
+
+    ──(begin … onset … start … end … until]──▶ time
+
+What is in the buffer when an excerpt begins belongs to it; from then on its lanes keep a list of what is put into them,
+also of what comes late or is pushed out again. A sample is given out when time has reached it: only then it is certain
+that the episode had not ended before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.samples.sample import Sample
+from wayside.rules import CompiledWindow
+
+
+class EpisodeSample(NamedTuple):
+    """One message of an episode's window, as it was received."""
+
+    client: str
+    stream: str
+    key: str
+    """The full key it came on, without a leading slash."""
+    time: int
+    """Its place on the detector's time axis, in nanoseconds since the epoch."""
+    received: int
+    """Nanoseconds since the epoch; the stamp as well with clock Data."""
+    payload: bytes
+    """As it came, undecoded."""
+
+
+@dataclass(slots=True, eq=False)
+class Excerpt:
+    """The samples of one window. Times are nanoseconds."""
+
+    window: CompiledWindow
+    clients: frozenset[str] | None
+    """None: all."""
+    begin: int
+    """Samples after this time belong to it; of latched streams, also what was said last before."""
+    until: int | None = None
+    """Samples up to this time belong to it; None while the episode is open."""
+    waiting: list[tuple[Lane, Sample]] = field(default_factory=list)
+    """What time has not reached yet, or nobody has asked for."""
+
+    def wants(self, lane: Lane) -> bool:
+        """Whether the lane's samples are of the window's streams and clients."""
+        if lane.stream in self.window.shared:
+            return True
+        if lane.stream not in self.window.streams and lane.stream not in self.window.latched:
+            return False
+        return self.clients is None or lane.client in self.clients
+
+    def take(self, now: int) -> list[EpisodeSample]:
+        """What time has reached, in the order in which it came; what lies outside of the window is forgotten."""
+        reached = now if self.until is None else min(now, self.until)
+        taken: list[EpisodeSample] = []
+        waiting: list[tuple[Lane, Sample]] = []
+        for lane, sample in self.waiting:
+            time = sample.time
+            if time > reached:
+                if self.until is None or time <= self.until:
+                    waiting.append((lane, sample))
+            elif time > self.begin or lane.latched:
+                taken.append(EpisodeSample(lane.client, lane.stream, sample.key, time, sample.received, sample.payload))
+        self.waiting = waiting
+        return taken
+
+
+class Excerpts:
+    """All excerpts that are being cut from a buffer."""
+
+    def __init__(self, buffer: Buffer) -> None:
+        self._buffer = buffer
+        self._watchers: dict[Lane, list[Excerpt]] = {}
+        self._excerpts: list[Excerpt] = []
+        buffer.on_added = self._added
+
+    def begin(self, window: CompiledWindow, clients: frozenset[str] | None, begin: int) -> Excerpt:
+        """Cut another one: what is in the buffer belongs to it, and what comes from now on."""
+        self.distribute()
+        excerpt = Excerpt(window, clients, begin)
+        self._excerpts.append(excerpt)
+        for lane in self._buffer:
+            if excerpt.wants(lane):
+                self._watch(lane, excerpt)
+                excerpt.waiting.extend((lane, sample) for sample in lane.samples)
+        return excerpt
+
+    def stop(self, excerpt: Excerpt) -> None:
+        """There is nothing more to come of it."""
+        self._excerpts.remove(excerpt)
+        for lane in [lane for lane, watchers in self._watchers.items() if excerpt in watchers]:
+            self._watchers[lane].remove(excerpt)
+            if not self._watchers[lane]:
+                del self._watchers[lane]
+                lane.record(None)
+
+    def _added(self, lane: Lane) -> None:
+        """A lane is new in the buffer."""
+        for excerpt in self._excerpts:
+            if excerpt.wants(lane):
+                self._watch(lane, excerpt)
+
+    def _watch(self, lane: Lane, excerpt: Excerpt) -> None:
+        watchers = self._watchers.setdefault(lane, [])
+        if not watchers:
+            lane.record([])
+        watchers.append(excerpt)
+
+    def distribute(self) -> None:
+        """Give each excerpt what came since the last time."""
+        for lane, came in self._came():
+            for excerpt in self._watchers[lane]:
+                excerpt.waiting.extend((lane, sample) for sample in came)
+
+    def _came(self) -> Iterator[tuple[Lane, list[Sample]]]:
+        """What was put into the lanes since the last look."""
+        for lane in self._watchers:
+            came = lane.came
+            if came:
+                lane.record([])
+                yield lane, came

@@ -1,0 +1,36 @@
+"""What actions are told of an episode beside its values: their templates, rendered over the rule's variables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from wayside.api.base import JsonValue
+from wayside.expressions import InterpolationError
+from wayside.rules import CompiledAction
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """An action's templates by name: what became of them, and why of others nothing did."""
+
+    values: Mapping[str, JsonValue] = field(default_factory=dict)
+    problems: Mapping[str, str] = field(default_factory=dict)
+
+
+def render(action: CompiledAction, variables: Mapping[str, Any] | None) -> Rendered:
+    """Each template by itself; `variables` is None where the episode was taken up after a restart."""
+    values: dict[str, JsonValue] = {}
+    problems: dict[str, str] = {}
+    for name, template in action.templates.items():
+        if variables is None:
+            problems[name] = "what it needs is of before the detector's restart"
+            continue
+        try:
+            rendered = template.render(variables)
+        except InterpolationError as error:
+            problems[name] = str(error)
+        else:
+            values |= rendered if isinstance(rendered, dict) else {}  # null drops what it is of
+    return Rendered(values, problems)
