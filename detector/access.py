@@ -84,6 +84,11 @@ def login(access: Access, field: str) -> Login | None:
     return Login(_text(folder / "username", at), _text(folder / "password", at))
 
 
+def secret_text(name: str, key: str, field: str) -> str:
+    """What a Secret holds under a key; a newline at its end does not count. Raises AccessError."""
+    return _text(_secret(name, field) / key, field)
+
+
 def _secret(name: str, field: str) -> Path:
     folder = Path(os.environ.get(SECRETS_VARIABLE, SECRETS_FOLDER)) / name
     if not folder.is_dir():

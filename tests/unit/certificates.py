@@ -27,15 +27,13 @@ class Authority:
         )
         self.ca.write_bytes(certificate.sign(self._key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
 
-    def sign(self, name: str) -> tuple[Path, Path]:
-        """The files of a certificate and its key, for localhost and 127.0.0.1, to be used by either side."""
+    def sign(self, name: str, host: str = "localhost") -> tuple[Path, Path]:
+        """The files of a certificate and its key, for a host and 127.0.0.1, to be used by either side."""
         key = ec.generate_private_key(ec.SECP256R1())
         builder = (
             self._builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)]), key.public_key())
             .add_extension(
-                x509.SubjectAlternativeName(
-                    [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
-                ),
+                x509.SubjectAlternativeName([x509.DNSName(host), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]),
                 critical=False,
             )
             .add_extension(

@@ -1,0 +1,84 @@
+"""What an endpoint's answer means: done, try again, or never."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from enum import Enum
+
+_AGAIN = frozenset({408, 425, 429})
+"""Refusals that are about the moment, not about the request (RFC 9110, RFC 8470, RFC 6585)."""
+
+_BUSY = frozenset({429, 502, 503, 504})
+"""Answers that say of the endpoint that it cannot just now, whatever it is sent."""
+
+
+class Verdict(Enum):
+    """What follows from an answer."""
+
+    DONE = "done"
+    AGAIN = "again"
+    """Worth another attempt."""
+    FINAL = "final"
+    """The same request would be refused again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What an endpoint answered."""
+
+    status: int
+    body: bytes = b""
+    """As much as was asked for at most."""
+    whole: bool = True
+    """Whether the body ended as announced, within what was asked for."""
+    headers: Mapping[str, str] | None = None
+    """By lower-case name."""
+    excerpt: str = ""
+    """Of a refusal, its first words, with secrets of the request struck out."""
+
+    @property
+    def retry_after(self) -> str:
+        """The header of that name, or nothing."""
+        return (self.headers or {}).get("retry-after", "")
+
+    @property
+    def busy(self) -> bool:
+        """Whether the endpoint as a whole wants to be left alone for a while."""
+        return self.status in _BUSY
+
+
+def judge(answer: Answer) -> tuple[Verdict, str]:
+    """What follows, and why, for people."""
+    if 200 <= answer.status < 300:
+        return Verdict.DONE, f"answered {answer.status}"
+    said = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")
+    if 300 <= answer.status < 400:
+        return Verdict.FINAL, f"{said}: redirects are not followed, give the place where it is now"
+    if answer.status in _AGAIN or answer.status >= 500:
+        return Verdict.AGAIN, said
+    return Verdict.FINAL, said
+
+
+def wait_asked(retry_after: str, now: float) -> float:
+    """The seconds that a Retry-After header asks for, in either of its forms (RFC 9110, section 10.2.3).
+
+    Args:
+        retry_after: the header's value, perhaps empty.
+        now: seconds since the epoch.
+
+    Returns:
+        0 where it says nothing that can be understood.
+    """
+    text = retry_after.strip()
+    if text.isascii() and text.isdigit():
+        return float(min(int(text[:9]), 86_400))
+    try:
+        when = parsedate_to_datetime(text)
+    except (ValueError, IndexError, TypeError):
+        return 0.0
+    if when.tzinfo is None:
+        when = when.replace(tzinfo=UTC)
+    return min(max(0.0, (when - datetime.fromtimestamp(now, UTC)).total_seconds()), 86_400.0)

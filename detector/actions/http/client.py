@@ -1,0 +1,210 @@
+"""One HTTP request and its answer, in the calling thread, with a deadline that holds whatever the other side does.
+
+An endpoint may hang, send a byte a second, announce more than it sends, or send without end. aiohttp runs the exchange
+as a task of an event loop that lives as long as the request: a task can be ended at any moment, which a blocking socket
+cannot. Each request has a connection of its own, nothing of it stays, and no more is read than is asked for.
+
+What is told of a failure names the endpoint's scheme, host and port only: paths and queries may hold secrets.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import aiohttp
+from yarl import URL
+
+from detector.access import AccessError
+from detector.actions.http.access import Headers, TlsContexts, read_headers
+from detector.actions.http.answer import Answer
+from detector.actions.http.resolving import Resolver
+from wayside.api.actions.http import HttpAccess
+
+_REFUSAL = 4096
+"""Bytes that are read of a refusal, for its excerpt."""
+_REFUSAL_TIME = 1.0
+"""Seconds that are spent on it."""
+_EXCERPT = 200
+"""Characters of it that are told."""
+_LOOK = 0.05
+"""Seconds between two looks at whether to give up."""
+
+
+class HttpError(Exception):
+    """A request that got no answer; the text says why, and holds no secret."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Exchange:
+    method: str
+    url: URL
+    headers: Headers
+    own_headers: Mapping[str, str]
+    body: bytes
+    tls: ssl.SSLContext | None
+    timeout: float
+    want: int
+
+    @property
+    def where(self) -> str:
+        return origin(self.url)
+
+
+class HttpClient:
+    """Sends requests to endpoints that are entered in one way. One request at a time."""
+
+    def __init__(self, access: HttpAccess, field: str) -> None:
+        """`field` is where `access` stands in the rule: texts of errors begin with it."""
+        self._access, self._field = access, field
+        self._tls = TlsContexts()
+
+    def send(
+        self,
+        method: str,
+        url: str,
+        headers: Mapping[str, str],
+        body: bytes,
+        *,
+        want: int = 0,
+        give_up: Callable[[], bool] = lambda: False,
+    ) -> Answer:
+        """Send a request and wait for its answer, at most as long as the access says.
+
+        Args:
+            method: e.g. POST.
+            url: http or https, as in the resource.
+            headers: of this request; those of the access come on top.
+            body: may be empty.
+            want: so many bytes of the body of a success are read; with 0, its status is enough. Of a refusal some
+                hundred bytes are read in any case.
+            give_up: asked twenty times a second; once it is true, nobody waits any more.
+
+        Raises:
+            HttpError: there was no answer, or a header or certificate is not where the resource says.
+        """
+        try:
+            target = URL(url, encoded=True)
+            exchange = _Exchange(
+                method,
+                target,
+                read_headers(self._access, self._field),
+                headers,
+                body,
+                self._tls.get(self._access, self._field) if target.scheme == "https" else None,
+                self._access.timeout.seconds,
+                want,
+            )
+        except (AccessError, OSError, ValueError) as error:
+            raise HttpError(str(error) if isinstance(error, AccessError) else type(error).__name__) from error
+        return asyncio.run(_watched(exchange, give_up))
+
+
+def origin(url: URL) -> str:
+    """What may be told of a URL: scheme, host and port."""
+    return f"{url.scheme}://{url.host}:{url.port}"
+
+
+async def _watched(exchange: _Exchange, give_up: Callable[[], bool]) -> Answer:
+    task = asyncio.create_task(_answer(exchange))
+    try:
+        while not task.done():
+            if give_up():
+                raise HttpError(f"{exchange.where}: given up before it answered, since the detector ends")
+            await asyncio.wait({task}, timeout=_LOOK)
+        return task.result()
+    finally:
+        task.cancel()
+
+
+async def _answer(exchange: _Exchange) -> Answer:
+    try:
+        async with asyncio.timeout(exchange.timeout):
+            return await _exchange(exchange)
+    except TimeoutError as error:
+        raise HttpError(f"{exchange.where}: no answer within {exchange.timeout:g} s") from error
+    except (aiohttp.ClientError, OSError, ValueError) as error:
+        raise HttpError(f"{exchange.where}: {_why(error)}") from error
+
+
+async def _exchange(exchange: _Exchange) -> Answer:
+    connector = aiohttp.TCPConnector(
+        ssl=exchange.tls or True, resolver=Resolver(), use_dns_cache=False, force_close=True
+    )
+    session = aiohttp.ClientSession(
+        connector=connector,
+        cookie_jar=aiohttp.DummyCookieJar(),
+        auto_decompress=False,
+        timeout=aiohttp.ClientTimeout(total=None),  # the deadline is around all of it
+        skip_auto_headers=("User-Agent", "Accept-Encoding", "Content-Type"),
+    )
+    headers = {"User-Agent": "wayside", "Accept-Encoding": "identity", **exchange.own_headers}
+    try:
+        response = await session.request(
+            exchange.method,
+            exchange.url,
+            headers={**headers, **exchange.headers.values},
+            data=exchange.body or None,
+            allow_redirects=False,
+        )
+        try:
+            return await _read(exchange, response)
+        finally:
+            response.close()
+    finally:
+        await connector.close(abort_ssl=True)
+        await session.close()
+
+
+async def _read(exchange: _Exchange, response: aiohttp.ClientResponse) -> Answer:
+    headers = {name.lower(): value for name, value in response.headers.items()}
+    if 200 <= response.status < 300:
+        body, whole = await _body(response, exchange.want) if exchange.want else (b"", True)
+        return Answer(response.status, body, whole, headers)
+    try:
+        async with asyncio.timeout(_REFUSAL_TIME):
+            body, whole = await _body(response, _REFUSAL)
+    except TimeoutError:
+        body, whole = b"", False
+    said = exchange.headers.strike_out(body.decode(errors="replace"))
+    printable = "".join(character if character.isprintable() else " " for character in said)
+    excerpt = " ".join(printable.split())[:_EXCERPT]
+    return Answer(response.status, body, whole, headers, excerpt)
+
+
+async def _body(response: aiohttp.ClientResponse, limit: int) -> tuple[bytes, bool]:
+    """At most so many bytes, and whether these were all."""
+    read = bytearray()
+    try:
+        while len(read) <= limit:
+            chunk = await response.content.read(limit + 1 - len(read))
+            if not chunk:
+                return bytes(read), True
+            read += chunk
+    except aiohttp.ClientError:  # less came than was announced
+        return bytes(read), False
+    return bytes(read[:limit]), False
+
+
+def _why(error: Exception) -> str:
+    """Without the URL, which aiohttp's texts may hold."""
+    match error:
+        case aiohttp.ClientConnectorCertificateError():
+            found = error.certificate_error
+            return f"its certificate is not accepted: {getattr(found, 'verify_message', '') or found}"
+        case aiohttp.ClientConnectorDNSError():
+            return f"the name cannot be looked up: {error.os_error.strerror or error.os_error}"
+        case aiohttp.ClientConnectorSSLError():
+            return f"TLS fails: {getattr(error.os_error, 'reason', None) or 'it speaks another protocol'}"
+        case aiohttp.ClientConnectorError():
+            return f"cannot be reached: {error.os_error.strerror or error.os_error}"
+        case aiohttp.ServerDisconnectedError():
+            return "it hung up without an answer"
+        case aiohttp.ClientResponseError():
+            return "its answer is no HTTP"
+        case OSError():
+            return f"the connection broke: {error.strerror or type(error).__name__}"
+        case _:
+            return type(error).__name__

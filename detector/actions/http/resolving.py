@@ -1,0 +1,58 @@
+"""Names to addresses, in threads that nobody waits for.
+
+The system's resolver cannot be interrupted. On a vehicle without a network it hangs for many seconds, and the threads
+of an executor are waited for when the process ends: these are not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+
+from aiohttp.abc import AbstractResolver, ResolveResult
+
+
+class Resolver(AbstractResolver):
+    """Asks the system, in a daemon thread for each question."""
+
+    async def resolve(
+        self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_UNSPEC
+    ) -> list[ResolveResult]:
+        """The host's addresses. Raises OSError where there are none."""
+        loop = asyncio.get_running_loop()
+        found: asyncio.Future[list[ResolveResult]] = loop.create_future()
+
+        def ask() -> None:
+            try:
+                answer: list[ResolveResult] | OSError = _addresses(host, port, family)
+            except (OSError, UnicodeError) as error:
+                answer = error if isinstance(error, OSError) else OSError(f"{host!r} is no host's name")
+            try:
+                loop.call_soon_threadsafe(_settle, found, answer)
+            except RuntimeError:  # the loop is closed: nobody waits any more
+                return
+
+        threading.Thread(target=ask, name=f"resolve {host}", daemon=True).start()
+        return await found
+
+    async def close(self) -> None:
+        """Nothing is kept."""
+
+
+def _addresses(host: str, port: int, family: socket.AddressFamily) -> list[ResolveResult]:
+    return [
+        ResolveResult(
+            hostname=host, host=str(address[0]), port=port, family=kind, proto=protocol, flags=socket.AI_NUMERICHOST
+        )
+        for kind, _, protocol, _, address in socket.getaddrinfo(host, port, family, socket.SOCK_STREAM)
+    ]
+
+
+def _settle(found: asyncio.Future[list[ResolveResult]], answer: list[ResolveResult] | OSError) -> None:
+    if found.done():
+        return
+    if isinstance(answer, OSError):
+        found.set_exception(answer)
+    else:
+        found.set_result(answer)

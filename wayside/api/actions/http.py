@@ -1,0 +1,112 @@
+"""How actions reach HTTP endpoints: headers, TLS and credentials, none of which stand in a rule where they are secret.
+
+Who writes rules is not always who runs the detector: a rule names Secrets that are mounted for it, and environment
+variables that are meant for rules, and no other files or variables.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated
+
+from pydantic import AfterValidator, Field, model_validator
+
+from wayside.api.access import Access, Tls
+from wayside.api.base import Model, ObjectName, PositiveDuration, validations
+
+_VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
+_TOKEN = r"^[A-Za-z0-9!#$%&'*+.^_`|~-]+$"  # noqa: S105  RFC 9110, section 5.6.2: what a header's name is made of
+_OURS = ("host", "content-length", "content-type", "transfer-encoding", "connection", "expect", "te", "upgrade")
+_TLS_ONCE = "give tls or tlsSecret, not both"
+_VALUE_ONCE = "give exactly one of value, variable and secret"
+
+
+def _url(text: str) -> str:
+    if not re.fullmatch(r"https?://[^\s/?#@\\]+([/?][^\s#]*)?", text):
+        raise ValueError(
+            "must be like https://host:port/path, without a user and password before the host (give "
+            "credentialsSecret) and without #"
+        )
+    return text
+
+
+HttpUrl = Annotated[
+    str, Field(min_length=8, max_length=2048, pattern=r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$"), AfterValidator(_url)
+]
+"""Where a request goes."""
+
+
+class SecretKey(Model):
+    """One value of a Secret that is mounted for the detector."""
+
+    name: ObjectName = Field(description="The Secret.")
+    key: str = Field(
+        min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="The key in it."
+    )
+
+
+class HttpHeader(Model):
+    """A header of each request, and its value or where it is."""
+
+    model_config = validations(
+        ("[has(self.value), has(self.variable), has(self.secret)].filter(given, given).size() == 1", _VALUE_ONCE)
+    )
+
+    name: str = Field(min_length=1, max_length=128, pattern=_TOKEN, description="E.g. Authorization.")
+    value: str | None = Field(
+        default=None, max_length=2048, pattern=r"^[^\r\n\x00]*$", description="What is no secret, as it is."
+    )
+    variable: str | None = Field(
+        default=None,
+        max_length=255,
+        pattern=_VARIABLE,
+        description="The environment variable of the detector that holds it; its name begins with WAYSIDE_.",
+    )
+    secret: SecretKey | None = Field(default=None, description="The Secret that holds it.")
+
+    @model_validator(mode="after")
+    def _coherent(self) -> HttpHeader:
+        if sum(given is not None for given in (self.value, self.variable, self.secret)) != 1:
+            raise ValueError(_VALUE_ONCE)
+        if self.name.lower() in _OURS or self.name.lower().startswith("ce-"):
+            raise ValueError(f"the header {self.name} is set by the detector: remove it")
+        return self
+
+
+class HttpAccess(Model):
+    """How an endpoint is entered. Its certificate is always checked; redirects are never followed."""
+
+    model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE))
+
+    headers: list[HttpHeader] = Field(
+        default_factory=list,
+        max_length=32,
+        description="Further headers.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    timeout: PositiveDuration = Field(
+        default=PositiveDuration("10s"),
+        description="How long one attempt may take in all, from looking up the name to the end of the answer.",
+    )
+    tls: Tls | None = Field(default=None, description="Certificates in files.")
+    tls_secret: ObjectName | None = Field(
+        default=None,
+        description="A Secret with ca.crt and, where the detector proves who it is, tls.crt and tls.key.",
+    )
+    credentials_secret: ObjectName | None = Field(
+        default=None, description="A Secret with username and password, for HTTP's Basic authentication."
+    )
+
+    @model_validator(mode="after")
+    def _given_once(self) -> HttpAccess:
+        if self.tls is not None and self.tls_secret is not None:
+            raise ValueError(_TLS_ONCE)
+        names = [header.name.lower() for header in self.headers]
+        if len(set(names)) < len(names):
+            raise ValueError("headers: each name only once; upper and lower case are the same")
+        return self
+
+    @property
+    def access(self) -> Access:
+        """The same, as everything else that enters networks has it."""
+        return Access(tls=self.tls, tls_secret=self.tls_secret, credentials_secret=self.credentials_secret)
