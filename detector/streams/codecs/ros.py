@@ -17,7 +17,7 @@ from detector.streams.codecs.definitions import Definition, DefinitionsError, ch
 HEADER = "std_msgs/msg/Header"
 TIME = "builtin_interfaces/msg/Time"
 
-_REGISTERING = threading.Lock()
+REGISTERING = threading.Lock()
 """rosbags makes the classes of new types in a module of one name."""
 
 
@@ -92,7 +92,7 @@ def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
     store.fielddefs.update({name: parts for name, parts in given.fielddefs.items() if name not in new})
     store.types.update({name: of_type for name, of_type in given.types.items() if name not in new})
     try:
-        with _REGISTERING:
+        with REGISTERING:
             store.register(new)
     except (TypesysError, SyntaxError, ValueError) as error:
         raise DefinitionsError([(definitions[0].name, f"the definitions cannot be used: {error}")]) from error

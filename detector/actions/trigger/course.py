@@ -1,0 +1,175 @@
+"""The course of one recording elsewhere: what has been confirmed, and what is to be asked next, and when.
+
+Level, not edge: as long as the episode lasts, the other system is to record, and afterwards it is not to. What is not
+confirmed is asked again, later and later, until it is given up. A start is asked for even where the episode is over
+meanwhile, since the other system may hold what led to it in its buffer.
+
+    START ─confirmed→ HOLD ─end or maximumDuration→ STOP ─confirmed→ AWAIT ─over→ FINISHED
+
+Pure: times are seconds of a clock that never steps back, given from outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from detector.actions.trigger.orders import Order, Progress, Report
+
+_FIRST_WAIT = 0.5
+_LONGEST_WAIT = 15.0
+_POLL = 1.0
+"""Seconds between two looks at a recording that is ending."""
+
+FOREVER = float("inf")
+
+
+class Step(Enum):
+    """What is to be asked."""
+
+    START = "start"
+    HOLD = "hold"
+    STOP = "stop"
+    AWAIT = "await"
+    FINISHED = "finished"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How long things may take, in seconds."""
+
+    maximum: float
+    """The recording, where the other system does not end it by itself."""
+    give_up: float
+    """A request that is not confirmed."""
+    renew: float | None
+    """Until a start is said again."""
+
+
+class Course:
+    """One recording elsewhere."""
+
+    def __init__(self, order: Order, limits: Limits, now: float, onset: float, *, resumed: bool = False) -> None:
+        """`onset` is when the condition began to hold; `resumed`: another run of the detector may have asked before."""
+        self.order = order
+        self._limits = limits
+        self.onset = onset
+        self.ended: float | None = None
+        """When the episode ended."""
+        self.step = Step.START
+        self.due = now
+        """When to ask next."""
+        self.failures = 0
+        """Requests in a row that were not confirmed."""
+        self.confirmed = resumed
+        """Whether the other system has confirmed that it records, or may have to an earlier run."""
+        self.unanswered = resumed
+        """Whether a start may have arrived that was not confirmed."""
+        self.problem = ""
+        """Why it did not go as it should; empty where it did."""
+        self.note = ""
+        """What else there is to say."""
+        self.report = Report(Progress.UNKNOWN)
+        """The last that was said of the recording."""
+        self.lost_stop = False
+        """Whether the stop was given up."""
+        self._since = now
+        self._limit = now + limits.maximum
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left to ask."""
+        return self.step is Step.FINISHED
+
+    def end(self, now: float) -> None:
+        """The episode has ended, or nobody wants the recording any more."""
+        if self.ended is None:
+            self.ended = now
+            if self.step is Step.HOLD:
+                self._to(Step.STOP, now)
+
+    def look(self, now: float) -> Step | None:
+        """What is to be asked now; None: nothing yet."""
+        if self.step is Step.HOLD and now >= self._limit:
+            self.note = "ended by its maximumDuration, before the episode did" if self.ended is None else self.note
+            self._to(Step.STOP, now)
+        return self.step if now >= self.due and not self.finished else None
+
+    def next_look(self) -> float:
+        """When `look` may have something, if nothing happens before."""
+        if self.finished:
+            return FOREVER
+        return min(self.due, self._limit) if self.step is Step.HOLD else self.due
+
+    def failed(self, now: float, why: str, *, silent: bool) -> None:
+        """The request was not confirmed; `silent`: nobody answered, so it may have arrived nevertheless."""
+        self.failures += 1
+        self.unanswered = self.unanswered or silent
+        self.due = now + min(_FIRST_WAIT * 2 ** min(self.failures - 1, 10), _LONGEST_WAIT)
+        if now - self._since < self._limits.give_up or self.step is Step.HOLD:
+            return
+        if self.step is Step.START:
+            self.problem = f"not started, and given up: {why}"
+            if self.unanswered:
+                self._to(Step.STOP, now)  # else it might record what nobody waits for
+            else:
+                self.step = Step.FINISHED
+        elif self.step is Step.STOP:
+            self.lost_stop = True
+            self.problem = self.problem or f"the stop was not confirmed, and is given up: {why}"
+            self.step = Step.FINISHED
+        else:
+            self.note = self.note or f"what became of it is not known: {why}"
+            self.step = Step.FINISHED
+
+    def answered(self, now: float, report: Report) -> None:
+        """The other system answered what `look` said to ask."""
+        if report.progress is Progress.REFUSED and self.step is Step.START:
+            self.failed(now, report.message, silent=False)
+            return
+        before = self.report
+        if report.progress is not Progress.UNKNOWN:
+            self.report = report
+        if self.step in (Step.START, Step.HOLD):
+            self._started(now, report)
+        elif report.progress is Progress.UNKNOWN:
+            if self.confirmed and not self.problem:
+                self.problem = "the other system knows nothing of it any more: it was restarted, its recording is cut"
+            self.step = Step.FINISHED
+        elif report.progress.over:
+            self._over(report)
+        elif self.step is Step.STOP:
+            self._to(Step.AWAIT, now)
+            self.due = now + _POLL
+        else:
+            if (report.samples, report.progress) != (before.samples, before.progress):
+                self._since = now  # it goes on
+            self.failures = 0
+            self.due = now + _POLL
+            if now - self._since >= self._limits.give_up:
+                self.failed(now, "it does not come to an end", silent=False)
+
+    def _started(self, now: float, report: Report) -> None:
+        if report.progress.over:
+            self._over(report)
+            return
+        self.failures, self._since = 0, now
+        self.confirmed, self.unanswered = True, False
+        if self.ended is not None:
+            self._to(Step.STOP, now)
+        else:
+            self.step = Step.HOLD
+            self.due = FOREVER if self._limits.renew is None else now + self._limits.renew
+
+    def _over(self, report: Report) -> None:
+        """It has ended there."""
+        if report.progress is not Progress.DONE:
+            self.problem = self.problem or report.message or "it failed there"
+        elif self.step in (Step.START, Step.HOLD):
+            self.note = report.message or "it ended there before the episode did"
+        else:
+            self.note = self.note or report.message
+        self.step = Step.FINISHED
+
+    def _to(self, step: Step, now: float) -> None:
+        self.step, self.due, self.failures, self._since = step, now, 0, now

@@ -1,0 +1,180 @@
+"""ROS 2 services: what their requests and responses are made of, as CDR and as plain maps.
+
+A `.srv` file holds two message definitions with a line of `---` between them. Known without one are the services of
+rosbag2's recorder and of std_srvs, as the release Jazzy has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.serde import SerdeError
+from rosbags.typesys import get_types_from_msg
+from rosbags.typesys.base import TypesysError
+from rosbags.typesys.store import Typestore
+
+from detector.actions.trigger.composing import ServiceError, message
+from detector.engine.samples.sample import DecodeError
+from detector.streams.codecs.cdr import CdrDecoder
+from detector.streams.codecs.ros import REGISTERING, RosTypes
+
+_EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
+
+_NOTHING = "---\n"
+_CODE = "---\nint32 return_code\nstring error_string\n"
+_SUCCESS = "---\nbool success\nstring message\n"
+
+KNOWN: Mapping[str, str] = {
+    "rosbag2_interfaces/srv/Snapshot": "---\nbool success\n",
+    "rosbag2_interfaces/srv/Pause": _NOTHING,
+    "rosbag2_interfaces/srv/Resume": _NOTHING,
+    "rosbag2_interfaces/srv/SplitBagfile": _NOTHING,
+    "rosbag2_interfaces/srv/Record": "string uri\n" + _CODE,
+    "rosbag2_interfaces/srv/Stop": _CODE,
+    "std_srvs/srv/Empty": _NOTHING,
+    "std_srvs/srv/Trigger": _SUCCESS,
+    "std_srvs/srv/SetBool": "bool data\n" + _SUCCESS,
+}
+"""The definitions that need not be given."""
+
+_PARSER = (TypesysError, ValueError, TypeError, KeyError, IndexError, AssertionError, AttributeError, RecursionError)
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A type of service, e.g. rosbag2_interfaces/srv/Snapshot."""
+
+    name: str
+    store: Typestore
+    """It has the service's messages and all that they refer to."""
+
+    @property
+    def type_hash(self) -> str:
+        """RIHS01_ and 64 hexadecimal digits: of the whole service, as REP 2016 defines it."""
+        return self.store.hash_rihs01(self.name)
+
+    def request(self, values: Mapping[str, Any]) -> bytes:
+        """A request as CDR with its encapsulation; fields that are not given are zero or empty.
+
+        Raises ServiceError where a value is of no field, or does not fit its field.
+        """
+        name = f"{self.name}_Request"
+        try:
+            return bytes(self.store.serialize_cdr(message(self.store, name, values, "request"), name))
+        except (SerdeError, OverflowError, ValueError, TypeError, AttributeError) as error:
+            if isinstance(error, ServiceError):
+                raise
+            raise ServiceError(f"the request does not fit {self.name}: {error}") from error
+
+    def response(self, payload: bytes) -> dict[str, Any]:
+        """A response as a map. Raises ServiceError where the bytes are none."""
+        try:
+            decoded: dict[str, Any] = CdrDecoder(f"{self.name}_Response", RosTypes(self.store)).decode(payload)
+        except DecodeError as error:
+            raise ServiceError(f"the answer is no response of {self.name}: {error}") from None
+        return decoded
+
+
+@lru_cache(maxsize=64)
+def service(name: str, definition: str | None, types: RosTypes) -> Service:
+    """The service of that type: with the definition where one is given, else as it is known.
+
+    Raises ServiceError.
+    """
+    text = KNOWN.get(name) if definition is None else definition
+    if text is None:
+        raise ServiceError(f"the service type {name} is not known: give its .srv file as definition")
+    made = _parsed(name, text)
+    store = Typestore()
+    store.fielddefs.update(types.store.fielddefs)
+    store.types.update(types.store.types)
+    made = {key: value for key, value in made.items() if key.startswith(f"{name}_") or key not in store.fielddefs}
+    for key, (_, fields) in made.items():
+        for field, desc in fields:
+            below = _named(desc)
+            if below is not None and below not in made and below not in store.fielddefs:
+                raise ServiceError(f"{key}: {field} is of {below}, which is not known: define it in spec.messages")
+    made |= _event(name)
+    try:
+        with REGISTERING:
+            store.fielddefs.pop(_EVENT_INFO, None)
+            store.types.pop(_EVENT_INFO, None)
+            store.register(made)
+    except _PARSER as error:
+        raise ServiceError(f"the definition of {name} cannot be used: {error}") from error
+    return Service(name, store)
+
+
+def _parsed(name: str, text: str) -> Typesdict:
+    """Request and response. Raises ServiceError."""
+    package, _, short = name.split("/")
+    lines = text.replace("\r\n", "\n").split("\n")
+    borders = [number for number, line in enumerate(lines) if line.strip() == "---"]
+    if len(borders) != 1:
+        raise ServiceError(
+            f"the definition of {name} has {len(borders)} lines of ---: one stands between request and response"
+        )
+    parts = {"Request": lines[: borders[0]], "Response": lines[borders[0] + 1 :]}
+    types: Typesdict = {}
+    for part, its_lines in parts.items():
+        try:
+            parsed = get_types_from_msg("\n".join(its_lines) + "\n", f"{package}/msg/{short}_{part}")
+        except _PARSER as error:
+            raise ServiceError(
+                f"the {part.lower()} in the definition of {name} cannot be read: write a type and a name on each line, "
+                f"as float64 x ({str(error)[:120]})"
+            ) from error
+        for key, value in parsed.items():
+            types[f"{name}_{part}" if key == f"{package}/msg/{short}_{part}" else key] = value
+    return types
+
+
+def _event(name: str) -> Typesdict:
+    """What belongs to every service's type beside request and response, and so to its hash."""
+
+    def named(of: str) -> FieldDesc:
+        return Nodetype.NAME, of
+
+    def at_most_one(of: str) -> FieldDesc:
+        return Nodetype.SEQUENCE, (named(of), 1)
+
+    request, response, event = (f"{name}_{part}" for part in ("Request", "Response", "Event"))
+    octets: FieldDesc = (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))
+    return {
+        # In ROS 2's own hashes its `char` is a uint8; rosbags has a number of its own for it.
+        _EVENT_INFO: (
+            [],
+            [
+                ("event_type", (Nodetype.BASE, ("uint8", 0))),
+                ("stamp", named("builtin_interfaces/msg/Time")),
+                ("client_gid", octets),
+                ("sequence_number", (Nodetype.BASE, ("int64", 0))),
+            ],
+        ),
+        event: (
+            [],
+            [("info", named(_EVENT_INFO)), ("request", at_most_one(request)), ("response", at_most_one(response))],
+        ),
+        name: (
+            [],
+            [
+                ("request_message", named(request)),
+                ("response_message", named(response)),
+                ("event_message", named(event)),
+            ],
+        ),
+    }
+
+
+def _named(desc: FieldDesc) -> str | None:
+    kind, detail = desc
+    if kind is Nodetype.NAME:
+        return str(detail)
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return _named(detail[0])  # type: ignore[arg-type]
+    return None
