@@ -33,9 +33,7 @@ class Messenger(Protocol):
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """Queue a message; never waits. With the queue full it is dropped and counted."""
 
-    def ask(
-        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
-    ) -> list[bytes]:
+    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
         """Send a query to all who answer it and wait for the answers, at most so many seconds.
 
         Raises ActionError where there is no session, nobody answers, or the answer is an error.

@@ -81,10 +81,10 @@ class Course:
         """Whether there is nothing left to ask."""
         return self.step is Step.FINISHED
 
-    def end(self, now: float) -> None:
-        """The episode has ended, or nobody wants the recording any more."""
+    def end(self, now: float, ended: float) -> None:
+        """The episode has `ended`, or nobody wants the recording any more."""
         if self.ended is None:
-            self.ended = now
+            self.ended = ended
             if self.step is Step.HOLD:
                 self._to(Step.STOP, now)
 
@@ -124,7 +124,7 @@ class Course:
 
     def answered(self, now: float, report: Report) -> None:
         """The other system answered what `look` said to ask."""
-        if report.progress is Progress.REFUSED and self.step is Step.START:
+        if report.progress is Progress.REFUSED and self.step in (Step.START, Step.STOP):
             self.failed(now, report.message, silent=False)
             return
         before = self.report

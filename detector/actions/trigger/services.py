@@ -141,7 +141,7 @@ def _event(name: str) -> Typesdict:
         return Nodetype.NAME, of
 
     def at_most_one(of: str) -> FieldDesc:
-        return Nodetype.SEQUENCE, (named(of), 1)
+        return Nodetype.SEQUENCE, (named(of), 1)  # type: ignore[return-value]
 
     request, response, event = (f"{name}_{part}" for part in ("Request", "Response", "Event"))
     octets: FieldDesc = (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))

@@ -1,0 +1,265 @@
+"""The action: one course for each episode, and one request after the other.
+
+Requests wait for the network, on the action's own thread. Where a system is silent, all that it is to be told waits a
+while, so that a dead one costs one timeout at a time and not one for each episode.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from detector.actions.base import Action, ActionError, Setting
+from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
+from detector.actions.trigger.course import FOREVER, Course, Limits, Step
+from detector.actions.trigger.detectors import OtherDetector
+from detector.actions.trigger.journal import Journal
+from detector.actions.trigger.orders import Order, Report, System
+from detector.actions.trigger.ros2 import Ros2Services
+from wayside.api.actions import trigger as api
+from wayside.api.detector import Clock
+from wayside.names import encode
+
+_log = logging.getLogger(__name__)
+
+_MOST = 1000
+"""So many recordings are under way at a time; those of further episodes are refused."""
+
+_SILENCES = (1.0, 2.0, 5.0, 10.0)
+"""Seconds that a silent system is left alone; the last one repeats."""
+
+_CLAIM = 10.0
+"""Seconds after the start in which an episode of the last run is resumed, if it is."""
+
+_LEAVE = 3.0
+"""Seconds at the end for what still is to be stopped."""
+
+
+class Trigger(Action[api.Trigger]):
+    """Has another system record as long as an episode lasts."""
+
+    Parameters = api.Trigger
+
+    def __init__(self, parameters: api.Trigger, setting: Setting) -> None:
+        super().__init__(parameters, setting)
+        self._system = self._make_system()
+        self._limits = Limits(
+            FOREVER if self._system.ends_by_itself else parameters.maximum_duration.seconds,
+            parameters.give_up_after.seconds,
+            self._system.renew,
+        )
+        self._courses: dict[str, Course] = {}
+        self._episodes: dict[str, Episode] = {}
+        self._said: dict[str, Outcome] = {}
+        self._silent: dict[str, tuple[int, float]] = {}
+        """Places that did not answer: how often in a row, and when to ask again."""
+        self._digest = _digest(parameters)
+        self._journal = self._make_journal()
+        self._left = {} if self._journal is None else self._journal.load()
+        """Of the last run: what no episode has claimed yet."""
+        self._claim = time.monotonic() + _CLAIM
+
+    def started(self, episode: Episode) -> None:
+        """Ask for a recording, or for its continuation."""
+        if len(self._courses) >= _MOST:
+            raise ActionError(f"{_MOST} recordings elsewhere are under way already: this one is not asked for")
+        identity = f"{self._prefix}.{encode(episode.id)}"
+        left = self._left.pop(identity, None)
+        order = Order(identity, self._rendered(episode) if left is None else left.rendered, episode.started)
+        self._system.place(order)
+        now = time.monotonic()
+        onset = now - (0.0 if episode.resumed else self._ago(episode.onset_time, episode.start_time))
+        self._courses[identity] = Course(order, self._limits, now, onset, resumed=episode.resumed)
+        self._episodes[identity] = episode
+        self._save()
+
+    def ended(self, episode: Episode) -> None:
+        """It is to stop."""
+        course = self._courses.get(f"{self._prefix}.{encode(episode.id)}")
+        if course is not None and episode.end_time is not None:
+            now = time.monotonic()
+            course.end(now, now - self._ago(episode.end_time, episode.end_time))
+
+    def completed(self, episode: Episode, completion: Completion) -> None:
+        """Where the episode has not ended, the recording goes on for as long as the next run may take it up."""
+        identity = f"{self._prefix}.{encode(episode.id)}"
+        course = self._courses.get(identity)
+        if course is None or course.ended is not None:
+            return
+        if self.setting.closing.is_set() and self._outlives():
+            del self._courses[identity], self._episodes[identity]  # but not in the journal
+            message = "it goes on: the episode is taken up again after the restart, or its maximumDuration ends it"
+            self.setting.report(episode, self._outcome(OutcomeState.DONE, course, message))
+        else:
+            now = time.monotonic()
+            course.end(now, now)
+
+    def wake(self) -> float | None:
+        """Send what is due, one request at a time."""
+        now = time.monotonic()
+        if self._left and now >= self._claim:
+            self._stop_left(now)
+        due: list[tuple[float, Course, Step]] = []
+        for course in self._courses.values():
+            step = course.look(now)
+            if step is not None and self._asked_again(course.order) <= now:
+                due.append((course.due, course, step))
+        if due:
+            self._ask(*min(due, key=lambda each: each[0])[1:])
+        self._forget_finished()
+        if len(due) > 1:
+            return 0.0
+        nexts = [max(each.next_look(), self._asked_again(each.order)) for each in self._courses.values()]
+        nexts += [self._claim] if self._left else []
+        soonest = min(nexts, default=FOREVER)
+        return None if soonest == FOREVER else max(0.0, soonest - time.monotonic())
+
+    def close(self) -> None:
+        """Stop what nobody will stop later, as far as that goes quickly."""
+        end = time.monotonic() + _LEAVE
+        while time.monotonic() < end:
+            now = time.monotonic()
+            stops = [
+                course
+                for course in self._courses.values()
+                if course.look(max(now, course.due)) is Step.STOP and self._asked_again(course.order) <= now
+            ]
+            if not stops:
+                break
+            self._ask(stops[0], Step.STOP)
+            self._forget_finished()
+        if self._journal is None:
+            for course in self._courses.values():
+                if course.step in (Step.START, Step.STOP):
+                    self._lose(course, "the detector ends")
+        self._courses = {identity: each for identity, each in self._courses.items() if not each.finished}
+        for identity, course in self._courses.items():
+            problem = course.problem or f"the detector ended before its {course.step.value} was confirmed"
+            state = OutcomeState.DONE if course.step is Step.AWAIT else OutcomeState.FAILED
+            self._report(identity, self._outcome(state, course, problem if state is OutcomeState.FAILED else ""))
+
+    @property
+    def _prefix(self) -> str:
+        """Ids begin so. With other parameters it is another action: the one that it replaces stops its recordings."""
+        return f"{encode(self.setting.holder)}.{self.setting.rule.name}.{self.setting.action}.{self._digest}"
+
+    def _make_system(self) -> System:
+        if self.parameters.detector is not None:
+            return OtherDetector(self.parameters, self.setting.messenger)
+        return Ros2Services(self.parameters, self.setting.messenger, lambda: self.setting.surroundings().types)
+
+    def _make_journal(self) -> Journal | None:
+        state = self.setting.surroundings().detector.spec.state
+        if state is None:
+            return None
+        return Journal(Path(state.path) / "triggers" / f"{self._prefix}.json")
+
+    def _rendered(self, episode: Episode) -> Mapping[str, Any]:
+        """The templates; of an episode that is resumed, those that need nothing of its start."""
+        if not episode.unrendered:
+            return episode.rendered
+        templates = self.parameters.templates
+        if episode.resumed and "${" not in json.dumps(templates):
+            return templates
+        name, why = next(iter(episode.unrendered.items()))
+        raise ActionError(f"{name}: {why}")
+
+    def _ago(self, then: int, reached: int) -> float:
+        """Seconds since `then`; with clock Data, until `reached`, since that time is not ours."""
+        if self.setting.surroundings().detector.spec.clock is Clock.WALL:
+            reached = time.time_ns()
+        return max(0.0, (reached - then) / 1e9)
+
+    def _outlives(self) -> bool:
+        """Whether the episode is known after a restart."""
+        by_task = any(action.deploy is not None for action in self.setting.rule.spec.actions)
+        return by_task or self.setting.surroundings().detector.spec.state is not None
+
+    def _asked_again(self, order: Order) -> float:
+        return self._silent.get(self._system.place(order), (0, 0.0))[1]
+
+    def _ask(self, course: Course, step: Step) -> None:
+        order, begin = course.order, time.monotonic()
+        place = self._system.place(order)
+        try:
+            report = self._asked(course, step, begin)
+        except ActionError as error:
+            now = time.monotonic()
+            times = self._silent.get(place, (0, 0.0))[0] + 1
+            self._silent[place] = times, now + _SILENCES[min(times, len(_SILENCES)) - 1]
+            course.failed(now, str(error), silent=True)
+            self._say(course, f"{step.value} is not confirmed yet: {error}")
+        else:
+            self._silent.pop(place, None)
+            course.answered(time.monotonic(), report)
+            waits = f": {report.message}" if report.message else ""
+            self._say(course, f"at {place}: {report.progress.value}{waits}")
+
+    def _asked(self, course: Course, step: Step, now: float) -> Report:
+        order = course.order
+        if step is Step.AWAIT:
+            return self._system.status(order)
+        if step is Step.STOP:
+            return self._system.stop(order, 0.0 if course.ended is None else now - course.ended)
+        return self._system.start(order, now - course.onset, again=course.confirmed)
+
+    def _stop_left(self, now: float) -> None:
+        """The last run did not get to stop these: their episodes ended, or are not known any more."""
+        for identity, order in self._left.items():
+            course = Course(order, self._limits, now, now, resumed=True)
+            course.confirmed = False  # that it is not known there any more is as good as stopped
+            course.step = Step.STOP
+            course.end(now, now)
+            self._courses[identity] = course
+            _log.info("recording %s was not stopped before the restart: stopping it", identity)
+        self._left = {}
+
+    def _forget_finished(self) -> None:
+        finished = [identity for identity, course in self._courses.items() if course.finished]
+        for identity in finished:
+            course = self._courses[identity]
+            if course.lost_stop:
+                self._lose(course, course.problem)
+            elif course.problem:
+                self.setting.lose("recordings elsewhere that failed", 1, f"{identity}: {course.problem}")
+            state = OutcomeState.FAILED if course.problem else OutcomeState.DONE
+            self._report(identity, self._outcome(state, course, course.problem or course.note))
+            del self._courses[identity]
+            self._episodes.pop(identity, None)
+            self._said.pop(identity, None)
+        if finished:
+            self._save()
+
+    def _lose(self, course: Course, why: str) -> None:
+        what = "recordings elsewhere whose stop was not confirmed: they end by their maximumDuration"
+        self.setting.lose(what, 1, f"{course.order.id}: {why}")
+
+    def _say(self, course: Course, message: str) -> None:
+        if not course.finished:
+            self._report(course.order.id, self._outcome(OutcomeState.RUNNING, course, message))
+
+    def _outcome(self, state: OutcomeState, course: Course, message: str) -> Outcome:
+        said = course.report
+        return Outcome(
+            state, message, said.samples, said.bytes, said.missing, said.files, {"recording": course.order.id}
+        )
+
+    def _report(self, identity: str, outcome: Outcome) -> None:
+        episode = self._episodes.get(identity)
+        if episode is not None and self._said.get(identity) != outcome:
+            self._said[identity] = outcome
+            self.setting.report(episode, outcome)
+
+    def _save(self) -> None:
+        if self._journal is not None:
+            self._journal.save([*self._left.values(), *(course.order for course in self._courses.values())])
+
+
+def _digest(parameters: api.Trigger) -> str:
+    """Eight hexadecimal digits that tell one text of the action from another."""
+    return hashlib.sha256(json.dumps(parameters.to_json(), sort_keys=True).encode()).hexdigest()[:8]

@@ -1,0 +1,89 @@
+"""Another detector that records: it is told by queries of `wayside/detectors/<name>/recordings`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from detector.actions.base import ActionError, Messenger
+from detector.actions.trigger.orders import Order, Report
+from detector.actions.trigger.requests import (
+    RECORDINGS,
+    RecordingRequest,
+    duration,
+    read_report,
+    write_request,
+)
+from detector.streams.answering import status_key
+from wayside.api.actions.trigger import Trigger
+from wayside.api.actions.window import WindowClients
+from wayside.api.base import Duration
+
+_RENEW = 10.0
+"""Seconds: a detector that was restarted knows nothing of what it recorded, and goes on with the next start."""
+
+_HOLDER = re.compile(r"[A-Za-z0-9_.-]{1,253}")
+
+
+class OtherDetector:
+    """Asks another detector to record."""
+
+    renew: float | None = _RENEW
+    ends_by_itself = True
+
+    def __init__(self, parameters: Trigger, messenger: Messenger) -> None:
+        assert parameters.detector is not None  # noqa: S101  that is what it is made for
+        self._wanted = parameters.detector
+        self._maximum = parameters.maximum_duration
+        self._timeout = parameters.timeout.seconds
+        self._messenger = messenger
+
+    def place(self, order: Order) -> str:
+        """The other detector's holder."""
+        name = _member(order.rendered, "detector", "name")
+        if not isinstance(name, str) or not _HOLDER.fullmatch(name):
+            raise ActionError(f"detector.name: {name!r} is no detector's name: it has letters, digits, _, . and - only")
+        return name
+
+    def start(self, order: Order, ago: float, *, again: bool) -> Report:
+        """Record; where it was confirmed before, nothing that was earlier."""
+        wanted = self._wanted
+        subjects = _member(order.event, "data", "subjects")
+        clients = None
+        if wanted.clients is WindowClients.SUBJECTS and subjects:
+            clients = sorted({*subjects, *wanted.with_clients})
+        request = RecordingRequest(
+            do="start",
+            id=order.id,
+            streams=wanted.streams,
+            clients=clients,
+            before=Duration("0s") if again else wanted.before,
+            ago=Duration("0s") if again else duration(ago),
+            maximum_duration=self._maximum,
+            event=dict(order.event),
+        )
+        return self._ask(order, request)
+
+    def stop(self, order: Order, ago: float) -> Report:
+        """End it, `after` later."""
+        return self._ask(order, RecordingRequest(do="stop", id=order.id, after=self._wanted.after, ago=duration(ago)))
+
+    def status(self, order: Order) -> Report:
+        """How far it is."""
+        return self._ask(order, RecordingRequest(id=order.id))
+
+    def _ask(self, order: Order, request: RecordingRequest) -> Report:
+        name = self.place(order)
+        answers = self._messenger.ask(status_key(name, RECORDINGS), write_request(request), self._timeout)
+        try:
+            said = read_report(answers[0])
+        except (IndexError, ValueError) as error:
+            raise ActionError(f"detector {name} answered something else: {error}") from error
+        return Report(said.state, said.message, said.samples, said.bytes, said.missing, tuple(said.files))
+
+
+def _member(value: Any, *names: str) -> Any:
+    for name in names:
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value

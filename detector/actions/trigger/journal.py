@@ -1,0 +1,72 @@
+"""Which recordings elsewhere have been asked for and not yet stopped: kept on the state volume, for the next start.
+
+Without it, a recording whose episode ended just when the detector was killed would go on until its maximumDuration. The
+file is small and replaced in one step; it is written by the action's own thread.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from detector.actions.trigger.orders import Order
+
+_log = logging.getLogger(__name__)
+
+_VERSION = 1
+
+
+class Journal:
+    """The orders of one action that are not finished."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises nothing: a journal that cannot be read or written is said, and done without."""
+        self._path = path
+        self._written: list[str] | None = None
+        self.failures = 0
+        """Times that it could not be written."""
+
+    def load(self) -> dict[str, Order]:
+        """What the last run of the detector left, by id."""
+        try:
+            document: Any = json.loads(self._path.read_bytes())
+            if document["version"] != _VERSION:
+                raise ValueError(f"it is of version {document['version']}, not {_VERSION}")
+            return {each["id"]: Order(each["id"], each["rendered"], each["event"]) for each in document["orders"]}
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            _log.error("%s cannot be read, nothing is stopped because of it: %s", self._path, error)
+            return {}
+
+    def save(self, orders: Iterable[Order]) -> None:
+        """These are not finished; writes only where that is new."""
+        wanted = {order.id: order for order in orders}
+        if list(wanted) == self._written or (self._written is None and not wanted):
+            return
+        try:
+            self._write(wanted)
+        except OSError as error:
+            self.failures += 1
+            _log.error("%s cannot be written, a restart may not know what to stop: %s", self._path, error)
+        self._written = list(wanted)
+
+    def _write(self, orders: Mapping[str, Order]) -> None:
+        if not orders:
+            self._path.unlink(missing_ok=True)
+            return
+        document = {
+            "version": _VERSION,
+            "orders": [{"id": each.id, "rendered": each.rendered, "event": each.event} for each in orders.values()],
+        }
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        draft = self._path.with_suffix(".new")
+        with draft.open("w", encoding="utf-8") as file:
+            file.write(json.dumps(document, separators=(",", ":")))
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(self._path)

@@ -1,0 +1,71 @@
+"""Services of ROS 2: type hashes as ROS computes them, requests and responses as CDR."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from detector.actions.trigger.composing import ServiceError
+from detector.actions.trigger.services import KNOWN, service
+from detector.streams.codecs.definitions import Definition
+from detector.streams.codecs.ros import standard, types_with
+
+
+def test_type_hashes_are_those_that_ros_computes() -> None:
+    """Those of example_interfaces and std_srvs as their nodes announce them (rmw_zenoh's design, a foreign client)."""
+    add = service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b\n---\nint64 sum\n", standard())
+    assert add.type_hash == "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
+    trigger = service("std_srvs/srv/Trigger", None, standard())
+    assert trigger.type_hash == "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_every_known_service_has_an_empty_request_and_reads_its_response(name: str) -> None:
+    known = service(name, None, standard())
+    request = known.request({})
+    assert request[:2] == b"\x00\x01"
+    read = known.store.deserialize_cdr(request, f"{name}_Request")
+    assert bytes(known.store.serialize_cdr(read, f"{name}_Request")) == request
+
+
+def test_a_request_carries_values_of_every_kind() -> None:
+    definition = "float64[] x\nbuiltin_interfaces/Time t\nuint8[3] q\nstring[] n\nbool b\nint8 i\n---\nstring s\n"
+    made = service("a/srv/B", definition, standard())
+    values = {"x": [1, 2.5], "t": {"sec": 5.0}, "q": [1, 2, 255], "n": ["a", "ü"], "b": True, "i": -128}
+    read: Any = made.store.deserialize_cdr(made.request(values), "a/srv/B_Request")
+    assert (read.x.tolist(), read.t.sec, read.t.nanosec, read.q.tolist()) == ([1.0, 2.5], 5, 0, [1, 2, 255])
+    assert (read.n, read.b, read.i) == (["a", "ü"], True, -128)
+    assert made.response(b"\x00\x01\x00\x00\x03\x00\x00\x00ok\x00") == {"s": "ok"}
+
+
+def test_a_definition_may_use_messages_of_the_detector() -> None:
+    types = types_with((Definition("my/msg/Place", "string name\n"),))
+    made = service("my/srv/Go", "Place where\n---\n", types)
+    read: Any = made.store.deserialize_cdr(made.request({"where": {"name": "x"}}), "my/srv/Go_Request")
+    assert read.where.name == "x"
+
+
+@pytest.mark.parametrize(
+    ("definition", "request_", "told"),
+    [
+        ("int8 x\n---\n", {"x": 300}, "request.x is 300, but int8 goes from -128 to 127"),
+        ("int8 x\n---\n", {"y": 3}, "request.y is no field of a/srv/B_Request: it has x"),
+        ("int8 x\n---\n", {"x": 0.5}, "request.x is 0.5, but must be of type int8"),
+        ("string s\n---\n", {"s": 4}, "request.s is 4, but must be of type string"),
+        ("uint8[2] s\n---\n", {"s": [4]}, r"request.s is \[4\], but must be a list of 2"),
+        ("builtin_interfaces/Time t\n---\n", {"t": 4}, "request.t is 4, but builtin_interfaces/msg/Time is a map"),
+        ("int8 x\n", {}, "has 0 lines of ---: one stands between request and response"),
+        ("int8\n---\n", {}, "the request in the definition of a/srv/B cannot be read: write a type and a name"),
+        ("foo/Bar x\n---\n", {}, "x is of foo/msg/Bar, which is not known: define it in spec.messages"),
+        (None, {}, "service type a/srv/B is not known: give its .srv file as definition"),
+    ],
+)
+def test_what_does_not_fit_is_told_with_its_place(definition: str | None, request_: dict[str, Any], told: str) -> None:
+    with pytest.raises(ServiceError, match=told):
+        service("a/srv/B", definition, standard()).request(request_)
+
+
+def test_bytes_that_are_no_response_are_told() -> None:
+    with pytest.raises(ServiceError, match="the answer is no response of std_srvs/srv/Trigger"):
+        service("std_srvs/srv/Trigger", None, standard()).response(b"\x00\x01\x00\x00\x01\xff\xff")
