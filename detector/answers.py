@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from itertools import islice
 from typing import TypeVar
 
 import msgspec
@@ -16,13 +17,16 @@ from detector.engine.episodes.demands import plain
 from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
 from detector.sources.supervision import SourceThread
-from detector.status.model import Drops, Explanation, SourceStatus, Status, to_json
+from detector.status.model import ActionStatus, Drops, Explanation, SourceStatus, Status, to_json
 from wayside.times import format_time
 
 Result = TypeVar("Result")
 
 _PATIENCE = 5.0
 """Seconds in which the evaluation should have time for a question."""
+
+_RUNS = 20
+"""Of so many episodes it is told what an action last said."""
 
 _SILENT = 30.0
 """Seconds without a look after which the evaluation is taken for dead; one that is merely slow says so itself."""
@@ -63,8 +67,20 @@ class Answers:
             SourceStatus(each.source.name, each.source.plugin, each.state.value, each.messages, each.last_error)
             for each in self._sources()
         ]
+        actions = [
+            ActionStatus(
+                which.rule, which.action, tally.kind, tally.running, tally.done, tally.failed, tally.samples,
+                tally.missing, tally.bytes, tally.files, tally.last_file, tally.last_failure,
+                dict(islice(tally.current.items(), _RUNS)),
+            )
+            for which, tally in outlet.actions.outcomes.tallies().items()
+        ]  # fmt: skip
         return msgspec.structs.replace(
-            latest, connected=outlet.network.connected, drops=[*latest.drops, *dropped], sources=sources
+            latest,
+            connected=outlet.network.connected,
+            drops=[*latest.drops, *dropped],
+            sources=sources,
+            actions=actions,
         )
 
     def healthy(self) -> tuple[bool, bytes]:

@@ -160,6 +160,11 @@ class RuleBook:
     def __init__(self) -> None:
         self._good: dict[str, EventRule] = {}
 
+    @property
+    def good(self) -> list[EventRule]:
+        """The rules as they are evaluated: of one that is refused, its last good version."""
+        return list(self._good.values())
+
     def compile(
         self, rules: Sequence[EventRule], detector: Detector, fields: Mapping[str, Fields]
     ) -> tuple[list[CompiledRule], list[Refusal]]:

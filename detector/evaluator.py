@@ -14,7 +14,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, Protocol, TypeVar
 
+from detector.actions.base import Surroundings
 from detector.assembly import RuleBook, inlets
+from detector.engine.consequences.consequences import Consequence
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.events import Event
@@ -29,6 +31,7 @@ from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from detector.streams.codecs.ros import RosTypes
+from wayside.api import EventRule
 from wayside.api.stream import Stream
 
 _log = logging.getLogger(__name__)
@@ -63,6 +66,12 @@ class Outlet(Protocol):
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
         """What is open may have changed; `episodes` tells what is, and is to be called at once or not at all."""
+
+    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+        """These rules are evaluated from now on."""
+
+    def consequences(self, consequences: Sequence[Consequence]) -> None:
+        """What actions other than deploy are told, in order."""
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
@@ -105,6 +114,7 @@ class Evaluator:
         self.losses = Losses(engine, intake)
         self.status = StatusKeeper(engine, self.losses, now)
         engine.stopwatch = time.perf_counter_ns
+        engine.consequences.wanted = True
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
     def start(self, rule_set: RuleSet, restored: Restored) -> None:
@@ -186,6 +196,7 @@ class Evaluator:
                 self.status.looked()
                 self.losses.say()
             self._record(self._engine.now, {"kind": "end"})
+            self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
         except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
             self._on_failure(error)
         finally:
@@ -280,12 +291,15 @@ class Evaluator:
         for refusal in refused:
             _log.error("%s", refusal)
         self.status.refused(refused)
+        self._outlet.follow(self._rule_book.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
         return self._engine.set_rules(compiled)
 
     def _hand_over(self, events: Sequence[Event]) -> None:
         if events:
             self._outlet.events(events)
             self._outlet.open_episodes(self._engine.open_episodes)
+        if consequences := self._engine.consequences.take(self._engine.now):
+            self._outlet.consequences(consequences)
         version = self._engine.demands_version
         if version != self._version:
             self._version = version

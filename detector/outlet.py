@@ -1,17 +1,21 @@
-"""Where events and demands of a running detector go: Zenoh, a file, the reconciler of tasks."""
+"""Where a running detector's events, demands and consequences go: Zenoh, a file, the reconciler of tasks, actions."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 
+from detector.actions.base import ActionError, Surroundings
 from detector.actions.deploy.reconciler import DemandReconciler
+from detector.actions.host import ActionHost
+from detector.engine.consequences.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.event_log import EventLog
 from detector.state import StateFile
-from detector.streams.zenoh import Network, NetworkError
+from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
+from wayside.api import EventRule
 
 _log = logging.getLogger(__name__)
 
@@ -20,10 +24,11 @@ class LiveOutlet:
     """Events go to Zenoh and into the log, demands to the reconciler; nothing here waits."""
 
     def __init__(
-        self, network: Network, log: EventLog | None, reconciler: DemandReconciler, state: StateFile | None
+        self, network: Network, holder: str, log: EventLog | None, reconciler: DemandReconciler, state: StateFile | None
     ) -> None:
         self._state = state
         self.network = network
+        self.actions = ActionHost(holder, self)
         self._log = log
         self._reconciler = reconciler
 
@@ -36,7 +41,7 @@ class LiveOutlet:
         """Publish and log what started and ended."""
         for event in events:
             line = event.to_json()
-            self.network.publish(event.key, line.encode())
+            self.network.publish(event.key, line.encode(), EVENT_ENCODING)
             if self._log is not None:
                 self._log.write(line)
             _log.info(
@@ -62,6 +67,25 @@ class LiveOutlet:
         """Have what is open written to the state volume, where there is one."""
         if self._state is not None:
             self._state.save(episodes())
+
+    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+        """Have the rules' actions at work."""
+        self.actions.follow(rules, surroundings)
+
+    def consequences(self, consequences: Sequence[Consequence]) -> None:
+        """Tell the actions."""
+        self.actions.tell(consequences)
+
+    def publish(self, key: str, payload: bytes, encoding: str) -> None:
+        """See `Messenger`: for the actions, which need not know that the network may be another tomorrow."""
+        self.network.publish(key, payload, encoding)
+
+    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+        """See `Messenger`."""
+        try:
+            return self.network.ask(selector, payload, timeout, attachment)
+        except NetworkError as error:
+            raise ActionError(str(error)) from error
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """Hand the demands over."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import re
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -12,6 +13,7 @@ from itertools import chain, count
 from pathlib import Path
 
 from detector.actions.deploy.reconciler import DemandReconciler
+from detector.actions.outcomes import Outcomes
 from detector.answers import Answers
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.samples.intake import Intake
@@ -65,7 +67,7 @@ class Running:
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
         self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams, entries.types)
         self._log = None if output is None else EventLog(output / "events.jsonl")
-        self._outlet = LiveOutlet(self._network(detector), self._log, reconciler, state)
+        self._outlet = LiveOutlet(self._network(detector), holder, self._log, reconciler, state)
         self._state = state
         self._reconciler = reconciler
         self._evaluator = Evaluator(
@@ -81,6 +83,7 @@ class Running:
         self._server = None if metrics_port is None else _server(metrics_port, self.answers)
 
         self._evaluator.losses.watch(self._tally)
+        self._evaluator.losses.watch_also(lambda: _of_actions(self._outlet.actions.outcomes))
         if state is not None:
             self._evaluator.losses.watch_also(lambda: _of_state(state))
         self._sources = Sources(self._intake.putter, self._tally)
@@ -108,6 +111,7 @@ class Running:
             self._server.close()
         self._evaluator.stop()
         self._plugins.close()
+        self._outlet.actions.close()
         if self._state is not None:
             self._state.close()
         self._outlet.network.close()
@@ -190,6 +194,14 @@ def _of_state(state: StateFile) -> Iterator[Loss]:
     unwritten = "times the state volume could not be written, and was tried again"
     yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
     yield Loss("files of the state volume set aside, being unreadable", state.set_aside, cause="state_unreadable")
+
+
+def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:
+    """What actions say that they lost."""
+    for lost in outcomes.lost():
+        cause = "action_" + re.sub(r"[^a-z]+", "_", lost.what.lower()).strip("_")
+        what = f"{lost.what} (action {lost.which.action} of EventRule {lost.which.rule})"
+        yield Loss(what, lost.count, lost.last, cause=cause, rule=lost.which.rule)
 
 
 def tune_garbage_collection() -> None:

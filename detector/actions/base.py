@@ -18,9 +18,14 @@ from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome
 from detector.engine.samples.sample import Decoder
 from detector.streams.codecs.ros import RosTypes
 from wayside.api import Detector, EventRule
+from wayside.api.base import Model
 
 P = TypeVar("P", bound=BaseModel)
 """The model of an action's parameters."""
+
+
+class ActionParameters(Model):
+    """Base of the parameters of an action from elsewhere: camelCase in YAML, and a misspelt field is an error."""
 
 
 class ActionError(Exception):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from detector.status.model import Histogram, RuleState, RuleStatus, Status, StreamStatus
+from detector.status.model import ActionStatus, Histogram, RuleState, RuleStatus, Status, StreamStatus
 
 _PREFIX = "wayside_detector_"
 
@@ -54,6 +54,17 @@ RULE: tuple[tuple[str, type, str, Callable[[RuleStatus], float | None]], ...] = 
 )
 """By rule."""
 
+ACTION: tuple[tuple[str, type, str, Callable[[ActionStatus], float | None]], ...] = (
+    ("action_running", GaugeMetricFamily, "Episodes that an action works on", lambda a: a.running),
+    ("action_done", CounterMetricFamily, "Episodes that an action has done its work for", lambda a: a.done),
+    ("action_failed", CounterMetricFamily, "Episodes that an action failed with", lambda a: a.failed),
+    ("action_samples", CounterMetricFamily, "Samples that are recorded or stored", lambda a: a.samples),
+    ("action_bytes", CounterMetricFamily, "Bytes that are recorded, stored or sent", lambda a: a.bytes),
+    ("action_files", CounterMetricFamily, "Files that were written", lambda a: a.files),
+    ("action_missing", CounterMetricFamily, "Samples, messages or the like lost on the way", lambda a: a.missing),
+)
+"""By rule, action and kind."""
+
 Family = GaugeMetricFamily | CounterMetricFamily
 
 
@@ -94,6 +105,8 @@ class Metrics(Collector):
             "rule",
             [(rule.name, rule.latency) for rule in status.rules if rule.latency is not None],
         )
+        acting = [((each.rule, each.action, each.kind), each) for each in status.actions]
+        yield from _families(ACTION, ("rule", "action", "kind"), acting)
         losses = CounterMetricFamily(
             f"{_PREFIX}losses", "What was lost or could not be used, by cause", labels=("cause", "stream", "rule")
         )
@@ -105,7 +118,7 @@ class Metrics(Collector):
 def _families(
     table: Iterable[tuple[str, type, str, Callable[[Any], float | None]]],
     labels: tuple[str, ...],
-    items: list[tuple[tuple[str, ...], Any]],
+    items: Sequence[tuple[tuple[str, ...], Any]],
 ) -> Iterator[Metric]:
     for name, kind, text, value_of in table:
         family: Family = kind(f"{_PREFIX}{name}", text, labels=labels)

@@ -153,6 +153,28 @@ class SourceStatus(msgspec.Struct, frozen=True, rename="camel"):
     last_error: str = ""
 
 
+class ActionStatus(msgspec.Struct, frozen=True, rename="camel"):
+    """An action of a rule, other than deploy: what became of its work for episodes."""
+
+    rule: str
+    action: str
+    kind: str
+    """What acts: record, database, trigger, notify, or a plugin."""
+    running: int
+    done: int
+    failed: int
+    samples: int
+    """Of runs that are done or failed, as are missing, bytes and files."""
+    missing: int
+    """Lost on the way."""
+    bytes: int
+    files: int
+    last_file: str = ""
+    last_failure: str = ""
+    current: dict[str, str] = {}
+    """By episode, what was last said of those that run, of at most 20."""
+
+
 class Status(msgspec.Struct, frozen=True, rename="camel"):
     """All that a detector says of itself."""
 
@@ -183,6 +205,7 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     connected: bool = False
     """Whether a router, a peer or a client is connected."""
     sources: list[SourceStatus] = []
+    actions: list[ActionStatus] = []
 
 
 def to_json(value: msgspec.Struct) -> bytes:

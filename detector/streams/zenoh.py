@@ -63,7 +63,7 @@ class Network:
         self._put_token = putter(LIVELINESS)
         self._tokens: TokenWatch | None = None
         self._capacity = capacity
-        self._events: deque[tuple[str, bytes]] = deque()
+        self._events: deque[tuple[str, bytes, str]] = deque()
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._session: zenoh.Session | None = None
@@ -81,14 +81,40 @@ class Network:
             self._join(open_session(self._config))
         self._thread.start()
 
-    def publish(self, key: str, payload: bytes) -> None:
-        """Queues an event, given as CloudEvents JSON; never waits. With the queue full it is dropped and counted."""
+    def publish(self, key: str, payload: bytes, encoding: str = EVENT_ENCODING) -> None:
+        """Queues an event, or what an action tells; never waits. With the queue full it is dropped and counted."""
         with self._changed:
             if len(self._events) >= self._capacity or self._stop.is_set():
                 self.dropped_events += 1
                 return
-            self._events.append((key, payload))
+            self._events.append((key, payload, encoding))
             self._changed.notify()
+
+    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+        """Sends a query to all who answer it, and waits for their answers, at most so many seconds.
+
+        Raises NetworkError where there is no session, nobody answers in time, or an answer is an error.
+        """
+        session = self._session
+        if session is None:
+            raise NetworkError("there is no Zenoh session yet")
+        try:
+            replies = session.get(
+                selector, payload=payload, attachment=attachment, timeout=timeout, target=zenoh.QueryTarget.ALL
+            )
+            answers, errors = [], []
+            for reply in replies:
+                if reply.ok is not None:
+                    answers.append(reply.ok.payload.to_bytes())
+                elif reply.err is not None:
+                    errors.append(reply.err.payload.to_bytes().decode(errors="replace"))
+        except zenoh.ZError as error:
+            raise NetworkError(f"{selector}: {error}") from error
+        if errors:
+            raise NetworkError(f"{selector}: {errors[0]}")
+        if not answers:
+            raise NetworkError(f"{selector}: nobody answered within {timeout:g} s")
+        return answers
 
     @property
     def joined(self) -> bool:
@@ -163,13 +189,13 @@ class Network:
         while (event := self._next()) is not None:
             self._send(*event)
 
-    def _next(self) -> tuple[str, bytes] | None:
+    def _next(self) -> tuple[str, bytes, str] | None:
         """The next event; None once closing and nothing waits."""
         with self._changed:
             self._changed.wait_for(lambda: self._events or self._stop.is_set())
             return self._events.popleft() if self._events else None
 
-    def _send(self, key: str, payload: bytes) -> None:
+    def _send(self, key: str, payload: bytes, encoding: str) -> None:
         if (session := self._session) is None:  # closed meanwhile, the time for what still waited being over
             self.dropped_events += 1
             return
@@ -178,7 +204,7 @@ class Network:
             session.put(
                 key,
                 payload,
-                encoding=EVENT_ENCODING,
+                encoding=encoding,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 express=True,
             )

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from detector.engine.consequences.consequences import REPLACED, Begun, Completed, Consequence, Over, Run, Sampled
 from detector.engine.engine import Engine
 from detector.engine.samples.sample import Arrival
-from tests.unit.driving import START, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
+from tests.unit.driving import START, a_detector, a_rule, a_stream, arrival, at, compiled
+from tests.unit.driving import an_engine as a_deaf_engine
 from wayside.api import Detector, EventRule
 from wayside.rules import RuleError
 
@@ -22,6 +23,12 @@ STREAMS = (a_stream("speed", stamp="msg.t"), a_stream("load", stamp="msg.t"), a_
 BUFFER = {"duration": "3s"}
 WALL = a_detector(*STREAMS, buffer=BUFFER, clientTimeout="60s")
 DATA = a_detector(*STREAMS, buffer=BUFFER, clientTimeout="60s", clock="Data", lateness="500ms", maxAhead="1h")
+
+
+def an_engine(detector: Detector, *rules: EventRule) -> Engine:
+    engine = a_deaf_engine(detector, *rules)
+    engine.consequences.wanted = True
+    return engine
 
 
 def an_action(name: str = "keep", **window: Any) -> dict[str, Any]:

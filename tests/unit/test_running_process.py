@@ -4,111 +4,29 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
-import time
-import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-import zenoh
-from prometheus_client.parser import text_string_to_metric_families
 
-from detector.status.model import RuleState, Status, read_status
+from detector.status.model import RuleState, read_status
 from detector.streams.asking import NoAnswerError, ask
-from tests.unit.driving import a_detector, a_rule, a_stream
-from wayside.api import Kind
-from wayside.api.zenoh import Zenoh, ZenohMode
+from tests.unit.driving import a_rule, a_stream
+from tests.unit.running import Process
 
-PATIENCE = 20.0
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "8s"}
 FAST = a_rule("fast", signals=[SPEED], when="v > 10", evaluation={"every": "100ms"})
-
-
-def free_port() -> int:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-class Process:
-    """`detector run` with files of its own, and a vehicle that is connected to it."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        self.port = free_port()
-        self.network = Zenoh(mode=ZenohMode.CLIENT, connect=[self.endpoint])
-        self.write(FAST)
-
-    def write(self, *rules: Kind, streams: tuple[dict[str, Any], ...] = (), **spec: Any) -> None:
-        detector = a_detector(*streams, zenoh={"listen": [self.endpoint]}, **spec)
-        (self.folder / "detector.yaml").write_text(json.dumps(detector.to_json()))
-        (self.folder / "rules.yaml").write_text("\n---\n".join(json.dumps(rule.to_json()) for rule in rules))
-
-    def start(self) -> None:
-        files = ["--detector", "detector.yaml", "--rules", "rules.yaml", "--metrics-port", str(self.port)]
-        log = (self.folder / "log").open("w")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "detector.cli", "run", *files], cwd=self.folder, stderr=log
-        )
-        self.status_when(lambda status: bool(status.rules))
-        config = zenoh.Config()
-        for key, value in (
-            ("mode", '"client"'),
-            ("connect/endpoints", json.dumps([self.endpoint])),
-            ("scouting/multicast/enabled", "false"),
-        ):
-            config.insert_json5(key, value)
-        self.vehicle = zenoh.open(config)
-
-    def send(self, client: str, value: Any, stream: str = "speed") -> None:
-        self.vehicle.put(
-            f"vehicles/{client}/{stream}",
-            json.dumps(value) if not isinstance(value, bytes) else value,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
-
-    def status_when(self, true: Callable[[Status], bool]) -> Status:
-        """The status once it is as wanted."""
-        end, status = time.monotonic() + PATIENCE, None
-        while time.monotonic() < end:
-            try:
-                (answer,) = ask(self.network, "d", "status", {}, 1)
-            except (NoAnswerError, ValueError):  # it is just starting
-                continue
-            status = read_status(answer.payload)
-            if true(status):
-                return status
-            time.sleep(0.05)
-        raise AssertionError(f"not within {PATIENCE} s: {status}\n{(self.folder / 'log').read_text()}")
-
-    def page(self, path: str) -> str:
-        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}") as answer:
-            return str(answer.read().decode())
-
-    def change(self, *rules: Kind, **spec: Any) -> None:
-        self.write(*rules, **spec)
-        self.process.send_signal(signal.SIGHUP)
-
-    @property
-    def events(self) -> list[str]:
-        lines = (self.folder / "out" / "events.jsonl").read_text().splitlines()
-        return [f"{(event := json.loads(line))['data']['rule']} {event['type'].rsplit('.', 1)[-1]}" for line in lines]
 
 
 @pytest.fixture
 def process(tmp_path: Path) -> Iterator[Process]:
     process = Process(tmp_path)
+    process.write(FAST)
     process.start()
     yield process
-    process.vehicle.close()
-    process.process.terminate()
-    assert process.process.wait(10) == 0
+    assert process.stop() == 0
 
 
 def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
@@ -124,11 +42,7 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
         ("unnamed", "speed"): 1,
     }
     assert [client.name for client in status.clients] == ["car1", "car2"]
-    metrics = {
-        (sample.name.removeprefix("wayside_detector_"), *sample.labels.values()): sample.value
-        for family in text_string_to_metric_families(process.page("/metrics"))
-        for sample in family.samples
-    }
+    metrics = process.metrics()
     assert metrics["stream_samples_total", "speed"] == 101
     (answer,) = ask(process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "2"}, 5)
     told = read_status(answer.payload).explanation

@@ -71,6 +71,8 @@ class Consequences:
     """The runs of all actions other than deploy."""
 
     def __init__(self, buffer: Buffer) -> None:
+        self.wanted = False
+        """Whether anybody takes what is noted; else nothing is, as in a replay."""
         self._excerpts = Excerpts(buffer)
         self._running: dict[Run, Excerpt | None] = {}
         """With the excerpt, where the action has a window."""
@@ -86,7 +88,7 @@ class Consequences:
 
     def begin(self, actions: Iterable[CompiledAction], rule: CompiledRule, event: Event, *, resumed: bool) -> None:
         """These actions of the rule have the episode from now on."""
-        if rule.dry_run:
+        if rule.dry_run or not self.wanted:
             return
         for action in actions:
             run = Run(rule.name, action.name, event.episode)

@@ -1,0 +1,155 @@
+"""Has the actions of all rules at work, follows changes of the rules, and ends in good order.
+
+engine ─▶ consequences ─▶ host ─▶ a worker for each action of each rule, with a thread of its own
+                                      └▶ outcomes: status, follow-ups on Zenoh
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from detector.actions.base import Action, Messenger, Setting, Surroundings
+from detector.actions.outcomes import Outcomes, Which
+from detector.actions.registry import DEPLOY, prepare
+from detector.actions.worker import MAXIMUM_BYTES, Worker
+from detector.engine.consequences.consequences import Begun, Consequence, Run
+from wayside.api import EventRule
+from wayside.api.actions import action as api
+
+_log = logging.getLogger(__name__)
+
+_GRACE = 5.0
+"""Seconds that actions have at the end."""
+
+
+@dataclass(slots=True)
+class _Employed:
+    """A worker, and what it was employed for."""
+
+    rule: EventRule
+    action: api.Action
+    worker: Worker
+
+
+class ActionHost:
+    """The workers. `follow` and `tell` are called by one thread, the evaluation's, and never wait."""
+
+    def __init__(
+        self,
+        holder: str,
+        messenger: Messenger,
+        *,
+        now: Callable[[], int] = time.time_ns,
+        maximum_bytes: int = MAXIMUM_BYTES,
+    ) -> None:
+        """`maximum_bytes` of samples wait for each action; `now` gives nanoseconds since the epoch."""
+        self._holder = holder
+        self._messenger = messenger
+        self._maximum = maximum_bytes
+        self._surroundings: Surroundings | None = None
+        self._closing = threading.Event()
+        self._employed: dict[Which, _Employed] = {}
+        self._at_work: dict[Run, Worker] = {}
+        self._leaving: list[Worker] = []
+        """Workers whose action was changed or removed; each ends when it has completed its runs."""
+        self.outcomes = Outcomes(holder, messenger.publish, now)
+
+    def follow(self, rules: Iterable[EventRule], surroundings: Surroundings) -> None:
+        """The rules are these from now on. An action that is as before goes on; others finish what they have."""
+        self._surroundings = surroundings
+        wanted = {
+            Which(rule.name, action.name): (rule, action)
+            for rule in rules
+            for action in rule.spec.actions
+            if action.field != DEPLOY
+        }
+        for which, employed in list(self._employed.items()):
+            if which not in wanted or not _same(employed, *wanted[which]):
+                del self._employed[which]
+                self._leaving.append(employed.worker)
+        for which, (rule, action) in wanted.items():
+            if which not in self._employed:
+                self.outcomes.know(which, action.kind)
+                worker = Worker(which, self._maker(rule, action), self.outcomes, self._maximum)
+                self._employed[which] = _Employed(rule, action, worker)
+        self._dismiss()
+
+    def tell(self, consequences: Sequence[Consequence]) -> None:
+        """Pass on what happened, in order."""
+        for each in consequences:
+            if isinstance(each, Begun):
+                employed = self._employed.get(Which(each.run.rule, each.run.action))
+                if employed is None:
+                    continue
+                self._at_work[each.run] = employed.worker
+            worker = self._at_work.get(each.run)
+            if worker is not None:
+                worker.tell(each)
+                if each.run not in worker.open:
+                    del self._at_work[each.run]
+        if consequences:
+            self._dismiss()
+
+    def close(self, grace: float = _GRACE) -> None:
+        """End all workers; returns when they have, or after so many seconds, and says who did not."""
+        self._closing.set()
+        workers = [*(each.worker for each in self._employed.values()), *self._leaving]
+        for worker in workers:
+            worker.tell_to_close()
+        deadline = time.monotonic() + grace
+        for worker in workers:
+            if not worker.join(max(0.0, deadline - time.monotonic())):
+                rule, action = worker.which
+                _log.error(
+                    "action %s of EventRule %s does not end within %g s, and is left behind", action, rule, grace
+                )
+                self.outcomes.lose(worker.which, "times the action did not end and was left behind", 1, "")
+
+    def _dismiss(self) -> None:
+        """Let those go who have nothing left to do."""
+        for worker in self._leaving:
+            if not worker.open:
+                worker.tell_to_close()
+        self._leaving = [worker for worker in self._leaving if not worker.ended]
+
+    def _maker(self, rule: EventRule, action: api.Action) -> Callable[[], Action[Any]]:
+        which = Which(rule.name, action.name)
+        setting = Setting(
+            rule=rule,
+            action=action.name,
+            holder=self._holder,
+            surroundings=self._around,
+            messenger=self._messenger,
+            report=partial(self.outcomes.report, which),
+            lose=partial(self.outcomes.lose, which),
+            closing=self._closing,
+        )
+
+        def make() -> Action[Any]:
+            offered, parameters = prepare(action)
+            return offered(parameters, setting)
+
+        return make
+
+    def _around(self) -> Surroundings:
+        if self._surroundings is None:
+            raise RuntimeError("no rule has been followed yet")
+        return self._surroundings
+
+
+def _same(employed: _Employed, rule: EventRule, action: api.Action) -> bool:
+    """Whether the action is to be as it is. What its rule says of itself goes into recordings, so it counts."""
+    before = employed.rule
+    return (
+        employed.action == action
+        and before.metadata.generation == rule.metadata.generation
+        and before.metadata.labels == rule.metadata.labels
+        and before.spec.classification == rule.spec.classification
+        and before.spec.description == rule.spec.description
+    )

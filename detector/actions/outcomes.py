@@ -1,0 +1,183 @@
+"""What became of the actions' work: kept by action for the status, and told as follow-ups on Zenoh.
+
+    wayside/actions/<holder>/<rule>/<episode>/<action>
+
+A follow-up is a CloudEvent, as events are: dev.wayside.action.running, .done or .failed.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from detector.actions.episode import Episode, Outcome, OutcomeState
+from detector.engine.episodes.demands import plain
+from wayside.times import format_time
+
+ENCODING = "application/cloudevents+json"
+_MESSAGE_LIMIT = 2000
+_FILES_LIMIT = 100
+
+
+class Which(NamedTuple):
+    """An action of a rule."""
+
+    rule: str
+    action: str
+
+
+@dataclass(slots=True)
+class Tally:
+    """What an action has done since the detector's start, or since it was last changed to be of another kind."""
+
+    kind: str
+    running: int = 0
+    done: int = 0
+    failed: int = 0
+    samples: int = 0
+    """Of runs that are done or failed, as are bytes, missing and files."""
+    bytes: int = 0
+    missing: int = 0
+    files: int = 0
+    last_failure: str = ""
+    last_file: str = ""
+    current: dict[str, str] = field(default_factory=dict)
+    """By episode, what was said last of those that run, if anything was."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """What an action lost."""
+
+    which: Which
+    what: str
+    count: int
+    last: str
+
+
+class Outcomes:
+    """Keeps and tells outcomes; thread-safe."""
+
+    def __init__(self, holder: str, publish: Callable[[str, bytes, str], None], now: Callable[[], int]) -> None:
+        """`publish` takes key, payload and encoding and never waits; `now` gives nanoseconds since the epoch."""
+        self._holder = holder
+        self._publish = publish
+        self._now = now
+        self._lock = threading.Lock()
+        self._tallies: dict[Which, Tally] = {}
+        self._said: dict[tuple[Which, str], Outcome | None] = {}
+        """The runs that are neither done nor failed, with what was said last."""
+        self._lost: Counter[tuple[Which, str]] = Counter()
+        self._reasons: dict[tuple[Which, str], str] = {}
+
+    def know(self, which: Which, kind: str) -> None:
+        """There is this action, whether or not it is ever needed."""
+        with self._lock:
+            if which not in self._tallies or self._tallies[which].kind != kind:
+                self._tallies[which] = Tally(kind)
+
+    def begin(self, which: Which, episode: Episode) -> None:
+        """The action has the episode."""
+        with self._lock:
+            if (which, episode.id) not in self._said:
+                self._said[which, episode.id] = None
+                self._tallies[which].running += 1
+
+    def report(self, which: Which, episode: Episode, outcome: Outcome) -> None:
+        """See `Setting.report`. After DONE or FAILED nothing more counts, nor what is said twice."""
+        with self._lock:
+            known = (which, episode.id)
+            if known not in self._said or self._said[known] == outcome:
+                return
+            tally = self._tallies[which]
+            if outcome.state is OutcomeState.RUNNING:
+                self._said[known] = outcome
+                tally.current[episode.id] = outcome.message
+            else:
+                del self._said[known]
+                tally.current.pop(episode.id, None)
+                _count(tally, outcome)
+        document = follow_up(self._holder, which, episode, outcome, self._now())
+        key = f"wayside/actions/{self._holder}/{which.rule}/{episode.id}/{which.action}"
+        self._publish(key, json.dumps(document, separators=(",", ":"), allow_nan=False).encode(), ENCODING)
+
+    def is_open(self, which: Which, episode: str) -> bool:
+        """Whether the run is neither done nor failed."""
+        with self._lock:
+            return (which, episode) in self._said
+
+    def lose(self, which: Which, what: str, count: int, last: str) -> None:
+        """See `Setting.lose`."""
+        with self._lock:
+            self._lost[which, what] += count
+            self._reasons[which, what] = last
+
+    def tallies(self) -> dict[Which, Tally]:
+        """A copy of what is kept of each action."""
+        with self._lock:
+            return {which: _copied(tally) for which, tally in sorted(self._tallies.items())}
+
+    def lost(self) -> list[Lost]:
+        """All that was lost."""
+        with self._lock:
+            return [
+                Lost(which, what, count, self._reasons[which, what])
+                for (which, what), count in sorted(self._lost.items())
+            ]
+
+
+def follow_up(holder: str, which: Which, episode: Episode, outcome: Outcome, now: int) -> dict[str, Any]:
+    """The CloudEvent that tells an outcome; `now` is nanoseconds since the epoch."""
+    data: dict[str, Any] = {
+        "rule": which.rule,
+        "action": which.action,
+        "episode": episode.id,
+        "subjects": list(episode.clients),
+        "state": outcome.state.value,
+        **_given("message", outcome.message[:_MESSAGE_LIMIT]),
+        **_given("samples", outcome.samples),
+        **_given("bytes", outcome.bytes),
+        **_given("missing", outcome.missing),
+        **_given("files", list(outcome.files[:_FILES_LIMIT])),
+        **_given("details", plain(outcome.details)),
+    }
+    return {
+        "specversion": "1.0",
+        "id": f"{episode.id}.{which.action}.{now}",
+        "source": f"/detectors/{holder}",
+        "type": f"dev.wayside.action.{outcome.state.value.lower()}",
+        "subject": episode.subject,
+        "time": format_time(now),
+        "datacontenttype": "application/json",
+        "data": data,
+    }
+
+
+def _given(name: str, value: Any) -> Mapping[str, Any]:
+    return {name: value} if value else {}
+
+
+def _count(tally: Tally, outcome: Outcome) -> None:
+    tally.running -= 1
+    tally.samples += outcome.samples
+    tally.bytes += outcome.bytes
+    tally.missing += outcome.missing
+    tally.files += len(outcome.files)
+    if outcome.files:
+        tally.last_file = outcome.files[-1]
+    if outcome.state is OutcomeState.DONE:
+        tally.done += 1
+    else:
+        tally.failed += 1
+        tally.last_failure = outcome.message
+
+
+def _copied(tally: Tally) -> Tally:
+    return Tally(
+        tally.kind, tally.running, tally.done, tally.failed, tally.samples, tally.bytes, tally.missing, tally.files,
+        tally.last_failure, tally.last_file, dict(tally.current),
+    )  # fmt: skip

@@ -1,0 +1,214 @@
+"""One action of one rule at work: its thread, and the bounded queue of what it is told.
+
+Samples wait up to so many bytes; what finds the queue full is left out of that run, counted, and told at its end. What
+tells of episodes always gets through. What the action raises ends its work for that episode and no other.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from detector.actions.base import Action, ActionError
+from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
+from detector.actions.outcomes import Outcomes, Which
+from detector.engine.consequences.consequences import Begun, Completed, Consequence, Over, Run, Sampled
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import SAMPLE_OVERHEAD
+
+_log = logging.getLogger(__name__)
+
+MAXIMUM_BYTES = 256 * 2**20
+"""So many bytes of samples wait for an action at most, overhead included."""
+
+_AGAIN = 1.0
+"""Seconds after which `wake` is called again when it failed."""
+
+Make = Callable[[], Action[Any]]
+"""Makes the action; on its thread, since that may take time, and raises what it likes."""
+
+
+class Worker:
+    """Tells an action of its episodes. `tell` from one thread at a time, and never waits."""
+
+    def __init__(self, which: Which, make: Make, outcomes: Outcomes, maximum_bytes: int = MAXIMUM_BYTES) -> None:
+        self.which = which
+        self._make = make
+        self._outcomes = outcomes
+        self._maximum = maximum_bytes
+        self._inbox: deque[tuple[Consequence, int]] = deque()
+        """With the bytes of the samples."""
+        self._waiting = 0
+        self._missing: dict[Run, int] = {}
+        self._changed = threading.Condition()
+        self._closing = False
+        self._episodes: dict[Run, Episode] = {}
+        """Of the runs that the action works on."""
+        self.open: set[Run] = set()
+        """The runs that are not completed, as the one who tells sees it."""
+        self._thread = threading.Thread(target=self._work, name=f"action {which.rule}/{which.action}", daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Of samples that wait for the action."""
+        return self._waiting
+
+    def tell(self, consequence: Consequence) -> None:
+        """Pass on what happened."""
+        match consequence:
+            case Begun(run=run):
+                self.open.add(run)
+            case Completed(run=run):
+                self.open.discard(run)
+        size = 0
+        if isinstance(consequence, Sampled):
+            size = sum(len(sample.payload) + SAMPLE_OVERHEAD for sample in consequence.samples)
+        with self._changed:
+            if size and self._waiting + size > self._maximum:
+                count = len(consequence.samples) if isinstance(consequence, Sampled) else 0
+                self._missing[consequence.run] = self._missing.get(consequence.run, 0) + count
+                self._outcomes.lose(self.which, "samples left out, the action being too slow", count, "")
+                return
+            self._waiting += size
+            self._inbox.append((consequence, size))
+            self._changed.notify()
+
+    def tell_to_close(self) -> None:
+        """Nothing more is told; returns at once."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the action's end, at most so many seconds; whether it has ended."""
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the thread has ended."""
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        action, problem = self._made()
+        due: float | None = 0.0  # at once: it may have something left of a run before
+        while True:
+            with self._changed:
+                if not self._inbox and not self._closing:
+                    self._changed.wait(None if due is None else max(0.0, due - time.monotonic()))
+                news = list(self._inbox)
+                self._inbox.clear()
+                closing = self._closing
+            for consequence, size in news:
+                self._pass_on(action, problem, consequence)
+                with self._changed:
+                    self._waiting -= size
+            if action is not None and (news or closing or due is None or time.monotonic() >= due):
+                due = self._woken(action)
+            if closing and not news:
+                break
+        if action is not None:
+            try:
+                action.close()
+            except Exception as error:  # noqa: BLE001  somebody else's code, at its very end
+                self._failed_in(action, "close", error)
+
+    def _made(self) -> tuple[Action[Any] | None, str]:
+        try:
+            return self._make(), ""
+        except Exception as error:  # noqa: BLE001  somebody else's code: its episodes fail, and nothing else does
+            problem = f"the action cannot be had: {_text(error)}"
+            _log.error("action %s of EventRule %s: %s", self.which.action, self.which.rule, problem)
+            return None, problem
+
+    def _pass_on(self, action: Action[Any] | None, problem: str, consequence: Consequence) -> None:
+        run = consequence.run
+        if isinstance(consequence, Begun):
+            episode = _episode(consequence)
+            self._episodes[run] = episode
+            self._outcomes.begin(self.which, episode)
+            if action is None:
+                self._fail(run, problem)
+        if action is None or run not in self._episodes:
+            return
+        try:
+            self._call(action, consequence)
+        except Exception as error:  # noqa: BLE001  whatever it raises is the failure of this run alone
+            if not isinstance(error, ActionError):
+                _log.debug("action %s of EventRule %s", self.which.action, self.which.rule, exc_info=error)
+            self._fail(run, _text(error))
+        if isinstance(consequence, Completed):
+            self._episodes.pop(run, None)
+
+    def _call(self, action: Action[Any], consequence: Consequence) -> None:
+        run = consequence.run
+        episode = self._episodes[run]
+        match consequence:
+            case Begun():
+                action.started(episode)
+            case Sampled(samples=samples):
+                action.samples(episode, samples)
+            case Over(event=event):
+                reason = None if event.reason is None else event.reason.value
+                ended = replace(episode, end_time=event.end_time, reason=reason, ended=event.cloud_event())
+                self._episodes[run] = ended
+                action.ended(ended)
+            case Completed(cut=cut):
+                with self._changed:
+                    missing = self._missing.pop(run, 0)
+                action.completed(episode, Completion(cut, missing))
+
+    def _fail(self, run: Run, why: str) -> None:
+        """The action has failed with the run, and is not told of it any more."""
+        episode = self._episodes.pop(run)
+        if self._outcomes.is_open(self.which, episode.id):
+            _log.error("action %s of EventRule %s failed for %s: %s", self.which.action, run.rule, episode.subject, why)
+            with self._changed:
+                missing = self._missing.pop(run, 0)
+            self._outcomes.report(self.which, episode, Outcome(OutcomeState.FAILED, why, missing=missing))
+
+    def _woken(self, action: Action[Any]) -> float | None:
+        """When to call it again; seconds of the monotonic clock."""
+        try:
+            pause = action.wake()
+        except Exception as error:  # noqa: BLE001  somebody else's code, which must not end the thread
+            self._failed_in(action, "wake", error)
+            pause = _AGAIN
+        return None if pause is None else time.monotonic() + max(0.0, pause)
+
+    def _failed_in(self, action: Action[Any], where: str, error: Exception) -> None:
+        what = f"times {type(action).__name__}.{where} failed"
+        self._outcomes.lose(self.which, what, 1, _text(error))
+        _log.error("action %s of EventRule %s: %s: %s", self.which.action, self.which.rule, where, _text(error))
+        _log.debug("in %s", where, exc_info=error)
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, ActionError):
+        return str(error)
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def _episode(begun: Begun) -> Episode:
+    event: Event = begun.event
+    return Episode(
+        id=event.episode,
+        rule=event.rule,
+        subject=event.subject,
+        clients=event.subjects,
+        element=event.element,
+        onset_time=event.onset_time,
+        start_time=event.start_time,
+        values=event.values,
+        classification=event.classification,
+        rendered=begun.rendered.values,
+        unrendered=begun.rendered.problems,
+        started=event.cloud_event(),
+        resumed=begun.resumed,
+    )

@@ -1,0 +1,116 @@
+"""A `detector run` process over real Zenoh, for tests: its files, a vehicle that is connected to it, what it says."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from prometheus_client.parser import text_string_to_metric_families
+
+from detector.status.model import Status, read_status
+from detector.streams.asking import NoAnswerError, ask
+from tests.unit.driving import a_detector
+from wayside.api import Kind
+from wayside.api.zenoh import Zenoh, ZenohMode
+
+PATIENCE = 60.0
+"""Seconds: a loaded machine takes long to start a process."""
+
+
+def free_port() -> int:
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Process:
+    """`detector run` with files of its own, and a vehicle that is connected to it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.port = free_port()
+        self.network = Zenoh(mode=ZenohMode.CLIENT, connect=[self.endpoint])
+        self.name = "d"
+
+    def write(self, *rules: Kind, streams: tuple[dict[str, Any], ...] = (), **spec: Any) -> None:
+        detector = a_detector(*streams, zenoh={"listen": [self.endpoint]}, **spec)
+        (self.folder / "detector.yaml").write_text(json.dumps(detector.to_json()))
+        (self.folder / "rules.yaml").write_text("\n---\n".join(json.dumps(rule.to_json()) for rule in rules))
+
+    def start(self) -> None:
+        files = ["--detector", "detector.yaml", "--rules", "rules.yaml", "--metrics-port", str(self.port)]
+        log = (self.folder / "log").open("w")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "detector.cli", "run", *files], cwd=self.folder, stderr=log
+        )
+        self.status_when(lambda status: bool(status.rules))
+        config = zenoh.Config()
+        for key, value in (
+            ("mode", '"client"'),
+            ("connect/endpoints", json.dumps([self.endpoint])),
+            ("scouting/multicast/enabled", "false"),
+        ):
+            config.insert_json5(key, value)
+        self.vehicle = zenoh.open(config)
+
+    def send(self, client: str, value: Any, stream: str = "speed") -> None:
+        self.vehicle.put(
+            f"vehicles/{client}/{stream}",
+            json.dumps(value) if not isinstance(value, bytes) else value,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+
+    def status_when(self, true: Callable[[Status], bool]) -> Status:
+        """The status once it is as wanted."""
+        end, status = time.monotonic() + PATIENCE, None
+        while time.monotonic() < end:
+            try:
+                (answer,) = ask(self.network, self.name, "status", {}, 1)
+            except (NoAnswerError, ValueError):  # it is just starting
+                continue
+            status = read_status(answer.payload)
+            if true(status):
+                return status
+            time.sleep(0.05)
+        raise AssertionError(f"not within {PATIENCE} s: {status}\n{(self.folder / 'log').read_text()}")
+
+    def page(self, path: str) -> str:
+        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}") as answer:
+            return str(answer.read().decode())
+
+    def metrics(self) -> dict[tuple[str, ...], float]:
+        """By name without prefix, and the values of the labels in the order of their names."""
+        return {
+            (
+                sample.name.removeprefix("wayside_detector_"),
+                *(sample.labels[name] for name in sorted(sample.labels)),
+            ): sample.value
+            for family in text_string_to_metric_families(self.page("/metrics"))
+            for sample in family.samples
+        }
+
+    def stop(self) -> int:
+        """End it as Kubernetes does; gives its exit code."""
+        self.vehicle.close()  # type: ignore[no-untyped-call]
+        self.process.terminate()
+        return self.process.wait(PATIENCE)
+
+    def change(self, *rules: Kind, **spec: Any) -> None:
+        self.write(*rules, **spec)
+        self.process.send_signal(signal.SIGHUP)
+
+    @property
+    def events(self) -> list[str]:
+        lines = (self.folder / "out" / "events.jsonl").read_text().splitlines()
+        return [f"{(event := json.loads(line))['data']['rule']} {event['type'].rsplit('.', 1)[-1]}" for line in lines]
