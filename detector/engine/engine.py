@@ -8,12 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
-from detector.engine.buffering.buffer import Buffer
-from detector.engine.buffering.clients import Clients
-from detector.engine.buffering.inflow import Inflow
-from detector.engine.buffering.lanes import lane_makers
-from detector.engine.buffering.messages import KeyReader, Messages
-from detector.engine.buffering.naming import MessageClients
+from detector.engine.buffering.messages import KeyReader
 from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
 from detector.engine.episodes.demands import Demand
@@ -22,25 +17,19 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import Answer, Identity, RuleRun, same_semantics
+from detector.engine.knowledge import Knowledge
 from detector.engine.queries.queries import BufferQueries
-from detector.engine.queries.transforms import Transforms, TransformStream
 from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals
-from detector.engine.scoping.positions import Positions
-from detector.engine.scoping.scopes import Views
-from detector.engine.signals.signals import Signals
 from detector.engine.signals.starts import Starts
 from detector.engine.timing.schedule import Only, Schedule
 from detector.engine.timing.ticks import Ticks
 from detector.engine.timing.timeline import DataTimeline, Gap, Insert, Step, Tick, Timeline, WallTimeline
 from wayside.api import Detector
 from wayside.api.detector import Clock
-from wayside.api.stream import Encoding, Stream
-from wayside.rules import CompiledRule, compile_stream, in_order
+from wayside.rules import CompiledRule, in_order
 
 __all__ = ["Engine", "KeyReader"]
-
-_SAMPLE = frozenset({"sample"})
 
 
 class NoAnswerError(ValueError):
@@ -74,17 +63,13 @@ class Engine:
         self._ticks = Ticks()
         self.schedule = Schedule(self._ticks)
         self._starts = Starts()
-        self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
-        self.clients = Clients({}, detector.spec.client_timeout.ns)
+        self._known = Knowledge(detector, decoders, read_key, start, self.counters, self._starts)
+        self.buffer, self.clients = self._known.buffer, self._known.clients
         self.stopwatch: Callable[[], int] = int
         """Gives nanoseconds of any clock; the shell sets one that runs. What it says is counted and decides nothing."""
-        self._floor: int | None = None
-        """Windows do not reach back further than the last gap; nanoseconds."""
         self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
-        self._inflow = Inflow(self.buffer, self.clients, self.counters)
         self.consequences = Consequences(self.buffer)
         """What the actions other than deploy are told."""
-        self._configure(detector, decoders, read_key, start)
         self._timeline = self._make_timeline(start)
 
     def set_detector(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
@@ -97,19 +82,7 @@ class Engine:
             RuleError: an expression of one of the Detector's streams does not compile; nothing has changed then.
         """
         before = self.detector.spec
-        self._configure(detector, decoders, read_key, self._timeline.now)
-        defined_alike = (detector.spec.messages, detector.spec.asn1) == (before.messages, before.asn1)
-        kept = {
-            stream.name
-            for stream in detector.spec.streams
-            if _reads_like(stream, before.stream(stream.name)) and (defined_alike or stream.encoding not in _DEFINED)
-        }
-        self.buffer.keep(kept)
-        if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
-            for client in self.clients.tokens.forget():
-                self.clients.still_heard(client, self._timeline.now)
-        for lane in self.buffer:
-            self._lane_makers[lane.stream].limit(lane)
+        self._known.follow(detector, decoders, read_key, self._timeline.now)
         if isinstance(self._timeline, DataTimeline):
             self._timeline.max_behind = _longest(detector)
             self._timeline.latched = _latched(detector)
@@ -122,25 +95,10 @@ class Engine:
             self._timeline = self._make_timeline(now)
             self._gap(now, backwards=detector.spec.clock is not before.clock)
 
-    def _configure(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader, now: int) -> None:
-        spec = detector.spec
-        compiled = {stream.name: compile_stream(stream, index) for index, stream in enumerate(spec.streams)}
-        self.detector = detector
-        self.buffer.maximum_bytes = spec.buffer.bytes.bytes
-        self.clients.configure(
-            {client.name: client.labels for client in spec.clients},
-            spec.client_timeout.ns,
-            {client.name for client in spec.clients if client.expected},
-            now,
-        )
-        self._lane_makers = lane_makers(detector, decoders)
-        names = MessageClients(decoders, compiled, self.counters)
-        self._inflow.configure(detector, read_key, self._lane_makers, names)
-        self._messages = Messages(decoders, compiled, read_key, self.counters)
-        self._transforms = Transforms(_transform_streams(detector), self.buffer, self._messages, self.counters)
-        self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
-        self._signals = Signals(self.buffer, self.clients, self._messages, self._stale_after, self._starts, self._floor)
-        self._positions = Positions(self.buffer, self._messages, self._stale_after, self._floor)
+    @property
+    def detector(self) -> Detector:
+        """As it is followed now."""
+        return self._known.detector
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later."""
@@ -176,7 +134,7 @@ class Engine:
         for name in sorted(self._starts.configure(rules, self.detector.spec.buffer.duration.ns)):
             for event in runs[name].open_starts() if name in runs else ():
                 self._starts.started(event)
-        self._signals.forget(lambda rule, client: rule in kept)
+        self._known.forget_rules(kept)
         self._plugins.configure(rules, kept)
         self.schedule.set_rules([run.rule for run in self._runs.values()])
         self._wake_anew(now)
@@ -250,10 +208,9 @@ class Engine:
             raise NoAnswerError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
         if not run.rule.enabled or name in self.schedule.paused:
             raise NoAnswerError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
-        events, answers = run.answer(self.now, self._views(run, self.now), self.clients, self._plugins)
+        events, answers = run.answer(self.now, self._known.views(run, self.now), self.clients, self._plugins)
         self._noted(run, events)
-        self._messages.forget()
-        self._transforms.forget(self.now)
+        self._known.looked(self.now)
         return events, answers
 
     def demands(self) -> dict[str, Demand]:
@@ -291,9 +248,7 @@ class Engine:
 
     def latency(self, sample: Sample, stream: str) -> float | None:
         """Seconds from the sample's stamp to its receipt; None where it carries no stamp. Counts nothing."""
-        values = self._messages.values(stream, sample, _SAMPLE, {})
-        latency = None if values is None else values["sample"].get("latency")
-        return latency if isinstance(latency, float) else None
+        return self._known.latency(sample, stream)
 
     @property
     def rules(self) -> Mapping[str, RuleRun]:
@@ -302,16 +257,14 @@ class Engine:
 
     def queries(self) -> BufferQueries:
         """What is in the buffer now."""
-        return BufferQueries(
-            self.now, self._floor, self.buffer, self.clients, self._messages, self._stale_after, self._transforms
-        )
+        return self._known.queries(self.now)
 
     def _run(self, steps: Iterable[Step]) -> list[Event]:
         events: list[Event] = []
         for step in steps:
             match step:
                 case Insert(arrivals, times):
-                    self._inflow.insert(arrivals, times)
+                    self._known.inflow.insert(arrivals, times)
                 case Tick():
                     events += self._tick(step)
                 case Gap(time, backwards):
@@ -323,13 +276,12 @@ class Engine:
         if regular:  # else it is there for a single sample or subject, and must cost no look at all the others
             self._keep_house(time)
         events: list[Event] = []
-        sampled = self._sampled(tick.sampled)
+        sampled = self._known.sampled(tick.sampled)
         for name, run in self._runs.items():
             if not run.rule.enabled or name in self.schedule.paused:
                 continue
             events += self._noted(run, self._turn(run, time, sampled, regular))
-        self._messages.forget()
-        self._transforms.forget(self.now)
+        self._known.looked(self.now)
         return events
 
     def _turn(self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool) -> list[Event]:
@@ -362,43 +314,17 @@ class Engine:
 
     def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
         begin = self.stopwatch()
-        events = run.tick(time, self._views(run, time), self.clients, self._plugins, only)
+        events = run.tick(time, self._known.views(run, time), self.clients, self._plugins, only)
         run.counters.timed(time, self.stopwatch() - begin)
         return events
 
     def _keep_house(self, time: int) -> None:
         """Forget old samples and lost clients."""
-        self.buffer.expire(time)
+        lost = self._known.age(time)
         self._starts.buffer.expire(time)
-        for client, latest in self.buffer.latest():
-            self.clients.still_heard(client, latest)
-        lost = self.clients.lose(time)
         if lost:
-            self._inflow.lose(set(lost))
             self._starts.lose(lost)
             self._plugins.lose(lost)
-            self._signals.forget(lambda rule, client: client in self.clients)
-
-    def _views(self, run: RuleRun, time: int) -> Views:
-        return Views(
-            run.rule,
-            time,
-            self.clients,
-            self.buffer,
-            self._signals,
-            self._positions,
-            self._stale_after,
-            run.counters,
-        )
-
-    def _sampled(self, arrivals: Sequence[Arrival]) -> Mapping[str, frozenset[str]]:
-        """By stream, the known clients of which these samples are."""
-        found: dict[str, set[str]] = {}
-        for arrival in arrivals:
-            client = self._inflow.client_of(arrival)
-            if client is not None and client in self.clients:
-                found.setdefault(arrival.stream, set()).add(client)
-        return {stream: frozenset(clients) for stream, clients in found.items()}
 
     def _wake(self, run: RuleRun, time: int, subjects: Iterable[Subject]) -> None:
         for subject, at in run.wakes(time, subjects):
@@ -412,13 +338,9 @@ class Engine:
 
     def _gap(self, time: int, backwards: bool) -> None:
         if backwards:
-            self.buffer.step_back(time)
             self._starts.buffer.step_back(time)
-        self._floor = time
-        self._signals.gap(time)
+        self._known.gap(time, backwards)
         self._plugins.gap()
-        self._positions.gap(time)
-        self.clients.gap(time)
         for run in self._runs.values():
             run.gap(time)
         self._wake_anew(time)
@@ -435,10 +357,8 @@ class Engine:
             max_behind=_longest(self.detector),
             alone_after=spec.client_timeout.ns,
             maximum_bytes=spec.buffer.bytes.bytes,
-            stamp_of=lambda arrival: self._messages.time(
-                arrival.stream, arrival.key, arrival.received, arrival.payload
-            ),
-            client_of=self._inflow.client_of,
+            stamp_of=self._known.stamp_of,
+            client_of=self._known.inflow.client_of,
             latched=_latched(self.detector),
         )
 
@@ -448,29 +368,6 @@ def _longest(detector: Detector) -> int:
     return max(detector.spec.buffer_duration_ns(stream) for stream in detector.spec.streams)
 
 
-def _transform_streams(detector: Detector) -> list[TransformStream]:
-    return [
-        TransformStream(stream.name, stream.latched, stream.frame_prefix or "")
-        for stream in detector.spec.streams
-        if stream.carries_transforms
-    ]
-
-
 def _latched(detector: Detector) -> frozenset[str]:
     """The streams whose samples hold until they are said anew."""
     return frozenset(stream.name for stream in detector.spec.streams if stream.latched)
-
-
-_DEFINED = (Encoding.CDR, Encoding.UPER)
-"""Encodings that are read by definitions."""
-
-
-def _reads_like(stream: Stream, before: Stream | None) -> bool:
-    """Whether samples taken in before can be read as ones of the stream."""
-    return before is not None and (stream.key, stream.client, stream.encoding, stream.type, stream.latched) == (
-        before.key,
-        before.client,
-        before.encoding,
-        before.type,
-        before.latched,
-    )

@@ -1,0 +1,186 @@
+"""What the engine knows of its clients: their samples, how these are read, and what is computed from them.
+
+It follows the Detector. Time comes in with each call; rules and episodes are not its business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+from detector.engine.buffering.buffer import Buffer
+from detector.engine.buffering.clients import Clients
+from detector.engine.buffering.inflow import Inflow
+from detector.engine.buffering.lanes import lane_makers
+from detector.engine.buffering.messages import KeyReader, Messages
+from detector.engine.buffering.naming import MessageClients
+from detector.engine.counters import Counters
+from detector.engine.evaluation import RuleRun
+from detector.engine.queries.queries import BufferQueries
+from detector.engine.queries.transforms import Transforms, TransformStream
+from detector.engine.samples.sample import Arrival, Decoder, Sample
+from detector.engine.scoping.positions import Positions
+from detector.engine.scoping.scopes import Views
+from detector.engine.signals.signals import Signals
+from detector.engine.signals.starts import Starts
+from wayside.api import Detector
+from wayside.api.stream import Encoding, Stream
+from wayside.rules import compile_stream
+
+_SAMPLE = frozenset({"sample"})
+
+_DEFINED = (Encoding.CDR, Encoding.UPER)
+"""Encodings that are read by definitions."""
+
+
+class Knowledge:
+    """The buffer, the clients, and the signals and positions that rules ask for."""
+
+    def __init__(
+        self,
+        detector: Detector,
+        decoders: Mapping[str, Decoder],
+        read_key: KeyReader,
+        start: int,
+        counters: Counters,
+        starts: Starts,
+    ) -> None:
+        """`starts` are the episode starts that signals over rules look at.
+
+        Raises:
+            RuleError: an expression of one of the Detector's streams does not compile.
+        """
+        self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
+        self.clients = Clients({}, detector.spec.client_timeout.ns)
+        self.inflow = Inflow(self.buffer, self.clients, counters)
+        self._counters = counters
+        self._starts = starts
+        self._floor: int | None = None
+        """Windows do not reach back further than the last gap; nanoseconds."""
+        self._configure(detector, decoders, read_key, start)
+
+    def follow(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader, now: int) -> None:
+        """Go on with a changed Detector. Samples of streams that are read as before stay.
+
+        Raises:
+            RuleError: an expression of one of its streams does not compile; nothing has changed then.
+        """
+        before = self.detector.spec
+        self._configure(detector, decoders, read_key, now)
+        defined_alike = (detector.spec.messages, detector.spec.asn1) == (before.messages, before.asn1)
+        kept = {
+            stream.name
+            for stream in detector.spec.streams
+            if _reads_like(stream, before.stream(stream.name)) and (defined_alike or stream.encoding not in _DEFINED)
+        }
+        self.buffer.keep(kept)
+        if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
+            for client in self.clients.tokens.forget():
+                self.clients.still_heard(client, now)
+        for lane in self.buffer:
+            self._lane_makers[lane.stream].limit(lane)
+
+    def _configure(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader, now: int) -> None:
+        spec = detector.spec
+        compiled = {stream.name: compile_stream(stream, index) for index, stream in enumerate(spec.streams)}
+        self.detector = detector
+        self.buffer.maximum_bytes = spec.buffer.bytes.bytes
+        self.clients.configure(
+            {client.name: client.labels for client in spec.clients},
+            spec.client_timeout.ns,
+            {client.name for client in spec.clients if client.expected},
+            now,
+        )
+        self._lane_makers = lane_makers(detector, decoders)
+        names = MessageClients(decoders, compiled, self._counters)
+        self.inflow.configure(detector, read_key, self._lane_makers, names)
+        self.messages = Messages(decoders, compiled, read_key, self._counters)
+        self.transforms = Transforms(_transform_streams(detector), self.buffer, self.messages, self._counters)
+        self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
+        self.signals = Signals(self.buffer, self.clients, self.messages, self._stale_after, self._starts, self._floor)
+        self._positions = Positions(self.buffer, self.messages, self._stale_after, self._floor)
+
+    def age(self, time: int) -> list[str]:
+        """Forget old samples and lost clients; returns who is lost."""
+        self.buffer.expire(time)
+        for client, latest in self.buffer.latest():
+            self.clients.still_heard(client, latest)
+        lost = self.clients.lose(time)
+        if lost:
+            self.inflow.lose(set(lost))
+            self.signals.forget(lambda rule, client: client in self.clients)
+        return lost
+
+    def gap(self, time: int, backwards: bool) -> None:
+        """Time went on from here without us, or (backwards) begins anew: windows do not reach back further."""
+        if backwards:
+            self.buffer.step_back(time)
+        self._floor = time
+        self.signals.gap(time)
+        self._positions.gap(time)
+        self.clients.gap(time)
+
+    def looked(self, now: int) -> None:
+        """The tick is over: what was decoded for it is not needed any more."""
+        self.messages.forget()
+        self.transforms.forget(now)
+
+    def stamp_of(self, arrival: Arrival) -> int | None:
+        """The arrival's time with clock Data; None where it cannot be read, which is counted."""
+        return self.messages.time(arrival.stream, arrival.key, arrival.received, arrival.payload)
+
+    def sampled(self, arrivals: Sequence[Arrival]) -> Mapping[str, frozenset[str]]:
+        """By stream, the known clients of which these samples are."""
+        found: dict[str, set[str]] = {}
+        for arrival in arrivals:
+            client = self.inflow.client_of(arrival)
+            if client is not None and client in self.clients:
+                found.setdefault(arrival.stream, set()).add(client)
+        return {stream: frozenset(clients) for stream, clients in found.items()}
+
+    def latency(self, sample: Sample, stream: str) -> float | None:
+        """Seconds from the sample's stamp to its receipt; None where it carries no stamp. Counts nothing."""
+        values = self.messages.values(stream, sample, _SAMPLE, {})
+        latency = None if values is None else values["sample"].get("latency")
+        return latency if isinstance(latency, float) else None
+
+    def views(self, run: RuleRun, time: int) -> Views:
+        """What a rule sees at a time."""
+        return Views(
+            run.rule,
+            time,
+            self.clients,
+            self.buffer,
+            self.signals,
+            self._positions,
+            self._stale_after,
+            run.counters,
+        )
+
+    def queries(self, now: int) -> BufferQueries:
+        """What is in the buffer."""
+        return BufferQueries(
+            now, self._floor, self.buffer, self.clients, self.messages, self._stale_after, self.transforms
+        )
+
+    def forget_rules(self, kept: Collection[str]) -> None:
+        """Signals of other rules than these are not asked for any more."""
+        self.signals.forget(lambda rule, client: rule in kept)
+
+
+def _transform_streams(detector: Detector) -> list[TransformStream]:
+    return [
+        TransformStream(stream.name, stream.latched, stream.frame_prefix or "")
+        for stream in detector.spec.streams
+        if stream.carries_transforms
+    ]
+
+
+def _reads_like(stream: Stream, before: Stream | None) -> bool:
+    """Whether samples taken in before can be read as ones of the stream."""
+    return before is not None and (stream.key, stream.client, stream.encoding, stream.type, stream.latched) == (
+        before.key,
+        before.client,
+        before.encoding,
+        before.type,
+        before.latched,
+    )
