@@ -20,6 +20,7 @@ from wayside.api.base import (
     conditions_field,
 )
 from wayside.api.constants import Constants
+from wayside.api.recordings import Recordings
 from wayside.api.source import DataSource
 from wayside.api.stream import (
     MessageDefinition,
@@ -144,6 +145,9 @@ class DetectorSpec(Model):
     state: State | None = Field(
         default=None,
         description="Where open episodes are kept. Without it, a restart takes up only those that have a live task.",
+    )
+    recordings: Recordings | None = Field(
+        default=None, description="Where the recordings of record actions go. Rules that record need it."
     )
     rules: RuleSelector = Field(default=RuleSelector(), description="Which EventRules of the namespace are evaluated.")
 

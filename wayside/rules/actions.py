@@ -51,6 +51,12 @@ def canonical(value: object) -> str:
 
 
 def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: Environment) -> CompiledAction:
+    if action.record is not None and compiler.detector.spec.recordings is None:
+        compiler.problem(
+            (*at, "record"),
+            f"Detector {compiler.detector.name} does not say where recordings go: give its spec.recordings, "
+            "e.g. {path: /var/lib/wayside/recordings}",
+        )
     below, values = action.templates
     rendered = {
         name: compiler.template((*at, *below), {name: value}, environment) for name, value in values.items()

@@ -9,10 +9,11 @@ from pydantic import Field, model_validator
 
 from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.plugin import ActionPlugin
+from wayside.api.actions.record import Record
 from wayside.api.actions.window import Window
 from wayside.api.base import JsonValue, Model, ObjectName, validations
 
-_KINDS = ("deploy", "plugin")
+_KINDS = ("deploy", "record", "plugin")
 _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
@@ -27,6 +28,7 @@ class Action(Model):
     deploy: Deploy | None = Field(
         default=None, description="Emit an ApplicationTask that holds while the episode lasts."
     )
+    record: Record | None = Field(default=None, description="Record its samples as rosbag2 with MCAP files.")
     plugin: ActionPlugin | None = Field(default=None, description="What an installed package does about it.")
 
     @model_validator(mode="after")

@@ -1,0 +1,98 @@
+"""How the samples of a stream stand in a recording: topic, encoding, schema, and what ROS wants to know of a topic.
+
+Schemas are written for ROS 2 messages only. JSON, CBOR, ETSI ITS and raw messages have none (MCAP's schema 0), their
+encoding says how they read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from detector.streams.codecs.ros import RosTypes
+from wayside.api.stream import Encoding, Stream
+from wayside.keys import KeyPattern
+
+_FOREVER = {"sec": 9223372036, "nsec": 854775807}
+"""How rosbag2 writes a time that is not limited."""
+_HISTORY = 100
+"""A latched topic may have so many publishers: what each said last is played again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How the messages of a stream read. Where it changes, the stream goes on in another channel."""
+
+    encoding: str
+    """As MCAP names it."""
+    type: str | None
+    """The ROS 2 message type."""
+    definition: str | None
+    """Of the type, with all that it refers to."""
+    digest: str
+    """The type's hash, as ROS 2 has it."""
+    latched: bool
+
+    @property
+    def metadata(self) -> Mapping[str, str]:
+        """What rosbag2 wants to know of a topic; empty for what is no ROS topic."""
+        if self.type is None:
+            return {}
+        return {"offered_qos_profiles": yaml.safe_dump(qos(self.latched)).strip(), "topic_type_hash": self.digest}
+
+
+def reading(stream: Stream, types: RosTypes) -> Reading:
+    """How the stream's messages read."""
+    if stream.encoding is not Encoding.CDR or stream.type is None or not types.known(stream.type):
+        return Reading(stream.encoding.value, None, None, "", stream.latched)
+    digest = types.store.hash_rihs01(stream.type)
+    return Reading("cdr", stream.type, types.definition(stream.type), digest, stream.latched)
+
+
+def qos(latched: bool) -> list[dict[str, Any]]:
+    """The quality of service with which rosbag2 is to play a topic, in the notation that every ROS 2 reads."""
+    return [
+        {
+            "history": 1,  # keep last
+            "depth": _HISTORY if latched else 10,
+            "reliability": 1,  # reliable
+            "durability": 1 if latched else 2,  # transient local, volatile
+            "deadline": dict(_FOREVER),
+            "lifespan": dict(_FOREVER),
+            "liveliness": 1,  # automatic
+            "liveliness_lease_duration": dict(_FOREVER),
+            "avoid_ros_namespace_conventions": False,
+        }
+    ]
+
+
+class Owners:
+    """Tells, of streams that share a key, whose samples are recorded: each message came once, and is written once."""
+
+    def __init__(self, streams: Mapping[str, Stream]) -> None:
+        """The streams of the window, in the Detector's order."""
+        self._streams = [(stream, KeyPattern.parse(stream.key)) for stream in streams.values()]
+        self._owners: dict[tuple[str, str], str] = {}
+
+    def owns(self, stream: str, key: str) -> bool:
+        """Whether samples on the key are recorded as the stream's."""
+        owner = self._owners.get((stream, key))
+        if owner is None:
+            owner = self._owners[stream, key] = self._owner(stream, key)
+        return owner == stream
+
+    def _owner(self, name: str, key: str) -> str:
+        """The first that can read the messages; else the first."""
+        mine = next((_origin(stream) for stream, _ in self._streams if stream.name == name), None)
+        same = [stream for stream, pattern in self._streams if _origin(stream) == mine and pattern.match(key)]
+        if mine is None or not same:
+            return name
+        return next((stream for stream in same if stream.encoding is not Encoding.RAW), same[0]).name
+
+
+def _origin(stream: Stream) -> Hashable:
+    """Streams of the same key get the same messages where this is equal."""
+    return stream.source, stream.layout, stream.domain, stream.client

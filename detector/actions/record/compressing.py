@@ -1,0 +1,42 @@
+"""How the chunks of a recording are compressed. Compressing runs beside other threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import lz4.frame
+import zstandard
+
+from wayside.api.actions.record import Compression
+
+Pieces = Sequence[bytes | bytearray]
+"""A chunk, not joined."""
+Compress = Callable[[Pieces], tuple[str, Pieces]]
+"""Makes of a chunk its compressed form; and gives the name that MCAP has for it."""
+
+
+def compressor(compression: Compression) -> Compress:
+    """What compresses the chunks of one recording; for one thread."""
+    match compression:
+        case Compression.NONE:
+            return lambda pieces: ("", pieces)
+        case Compression.LZ4:
+            return lambda pieces: ("lz4", (lz4.frame.compress(b"".join(pieces)),))
+        case Compression.ZSTD:
+            zstd = zstandard.ZstdCompressor(level=1)  # near lz4's speed, and much smaller
+            return lambda pieces: ("zstd", (zstd.compress(b"".join(pieces)),))
+
+
+def decompress(name: str, data: bytes, size: int) -> bytes:
+    """The chunk of so many bytes. Raises ValueError where it cannot be read."""
+    try:
+        match name:
+            case "":
+                return data
+            case "lz4":
+                return bytes(lz4.frame.decompress(data))
+            case "zstd":
+                return zstandard.decompress(data, max_output_size=size)
+    except (RuntimeError, zstandard.ZstdError) as error:
+        raise ValueError(str(error)) from error
+    raise ValueError(f"no compression of recordings is called {name!r}")

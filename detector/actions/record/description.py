@@ -1,0 +1,108 @@
+"""What a recording says of itself: its name, and the records that tell of its episode. Pure."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from detector.actions.episode import Episode
+from wayside.api.base import JsonValue
+from wayside.names import encode
+from wayside.times import format_time
+
+FORMAT = "wayside recording 1"
+"""Under `format`, in the description: by this a recording is known as one. The number is the version."""
+DESCRIPTION = "recording.json"
+"""The description's file, in the recording's folder."""
+METADATA = "wayside"
+"""The MCAP metadata record that tells of the episode, at the start of each file."""
+METADATA_END = "wayside/end"
+"""The one that tells how it ended, at the end of each file."""
+METADATA_CUT = "cut"
+"""The one that says why the file is not whole."""
+METADATA_USER = "metadata"
+"""The one with what the rule gives as `metadata`."""
+
+_SUBJECT = 60
+"""A longer subject is shortened in names: they have 255 characters at most. The episode's id tells them apart."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """An episode, and what records it."""
+
+    holder: str
+    detector: str
+    rule: str
+    generation: int
+    """Of the EventRule; 0 where it comes from a file."""
+    action: str
+    episode: Episode
+    continued: bool = False
+    """An earlier recording of the episode ended before its time; this one begins where the detector took it up."""
+
+    @property
+    def name(self) -> str:
+        """Of the folder, with nothing about how it ended."""
+        start = re.sub("[:.]", "-", format_time(self.episode.start_time)[:23]) + "Z"
+        parts = [start, self.rule, self.episode.subject[:_SUBJECT], self.action, encode(self.episode.id)[:16]]
+        return "_".join([*parts, "continued"] if self.continued else parts)
+
+    def told(self) -> dict[str, Any]:
+        """All of it, as the description's file and the metadata have it."""
+        episode = self.episode
+        told: dict[str, Any] = {
+            "format": FORMAT,
+            "holder": self.holder,
+            "detector": self.detector,
+            "rule": self.rule,
+            "generation": self.generation,
+            "action": self.action,
+            "episode": episode.id,
+            "subject": episode.subject,
+            "subjects": list(episode.clients),
+            "element": episode.element,
+            "onsetTime": format_time(episode.onset_time),
+            "startTime": format_time(episode.start_time),
+            "endTime": None if episode.end_time is None else format_time(episode.end_time),
+            "reason": episode.reason,
+            "classification": None if episode.classification is None else dict(episode.classification),
+            "values": dict(episode.values),
+            "metadata": dict(episode.rendered) or None,
+            "unrendered": dict(episode.unrendered) or None,
+            "continued": self.continued or None,
+        }
+        return {name: value for name, value in told.items() if value is not None}
+
+
+def with_ending(told: Mapping[str, Any], **changes: JsonValue) -> dict[str, Any]:
+    """The same, with other values; None takes one out."""
+    return {name: value for name, value in {**told, **changes}.items() if value is not None}
+
+
+_BEGINNING = (
+    *("format", "holder", "detector", "rule", "generation", "action", "episode", "subject", "subjects", "element"),
+    *("onsetTime", "startTime", "classification", "values", "continued"),
+)
+
+
+def beginning(told: Mapping[str, Any]) -> dict[str, str]:
+    """What is known at the start of a file, as MCAP's metadata have it: text, and JSON where it is more."""
+    return as_text({name: value for name, value in told.items() if name in _BEGINNING})
+
+
+def ending(told: Mapping[str, Any]) -> dict[str, str]:
+    """What is known at the end."""
+    names = ("rule", "episode", "endTime", "reason", "samples", "missing", "cut")
+    return as_text({name: told[name] for name in names if name in told})
+
+
+def as_text(values: Mapping[str, JsonValue]) -> dict[str, str]:
+    """Values as metadata have them."""
+    return {
+        name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        for name, value in values.items()
+    }

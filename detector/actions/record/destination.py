@@ -1,0 +1,210 @@
+"""The folder of all recordings: how much room they take together, and what gives way for new ones.
+
+There is one object for a folder in a process, shared by all actions. Bytes are claimed before they are written, so the
+limits hold at any time, over all recordings in progress; those that stand under their final name are known from the
+folder itself. A recording in progress stands under a hidden name, and is never dropped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from detector.actions.record.description import DESCRIPTION, FORMAT
+from wayside.api.recordings import Recordings, WhenFull
+
+PARTIAL = ".partial"
+"""The ending of the hidden folder of a recording in progress."""
+DROPPED = ".dropped"
+"""The ending of the hidden folder of a recording that is being deleted."""
+
+_SCAN_SECONDS = 2.0
+"""So often at most, the folder is looked at anew where there is no room."""
+
+
+class NoRoomError(Exception):
+    """A recording that finds no room; the text names the limit and the remedy."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Kept:
+    """A recording under its final name."""
+
+    ended: float
+    """Seconds since the epoch."""
+    path: Path
+    bytes: int
+    files: int
+
+
+class Destination:
+    """The room for recordings in one folder. Thread-safe."""
+
+    def __init__(self, limits: Recordings) -> None:
+        """Raises OSError where the folder cannot be made or read."""
+        self.path = Path(limits.path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._lock = threading.Lock()
+        self._limits = limits
+        self._bytes = self._files = 0
+        self._ahead = 0
+        self._kept: list[Kept] = []
+        self._left = [*hidden(self.path, PARTIAL)]
+        self._scan()
+
+    def take_left(self) -> list[Path]:
+        """The hidden folders that were there before this process recorded here; empty from the second call on."""
+        with self._lock:
+            left, self._left = self._left, []
+            return left
+
+    def limit(self, limits: Recordings) -> None:
+        """From now on these are the limits."""
+        with self._lock:
+            self._limits = limits
+
+    @property
+    def used(self) -> int:
+        """Bytes of all recordings, with what those in progress have claimed."""
+        with self._lock:
+            return self._total
+
+    def claim(self, now: int, later: int, files: int = 0, *, forced: bool = False) -> list[Kept]:
+        """Room for so many bytes that are written now, and for more that complete the recording later.
+
+        Negative numbers give room back; forced, no limit counts. Returns what was dropped for it. Raises NoRoomError,
+        OSError.
+        """
+        with self._lock:
+            needed = now + later
+            dropped: list[Kept] = []
+            while not forced and (needed > 0 or files > 0) and (short := self._short(needed, files)):
+                if time.monotonic() - self._scanned > _SCAN_SECONDS:  # somebody may have tidied up
+                    self._scan()
+                    continue
+                if self._limits.when_full is WhenFull.STOP:
+                    raise NoRoomError(f"{short}; whenFull is Stop: make room in {self.path}, or raise the limit")
+                if not self._kept:
+                    raise NoRoomError(f"{short}; there is no finished recording left to drop: raise the limit")
+                dropped.append(self._drop(self._kept[0]))
+            self._bytes += needed
+            self._files += files
+            self._ahead += later
+            return dropped
+
+    def settle(self, claimed: tuple[int, int, int], kept: Kept | None) -> None:
+        """A recording is no longer in progress: what it had claimed in all is what it takes, or nothing."""
+        now, later, files = claimed
+        with self._lock:
+            self._bytes -= now + later
+            self._ahead -= later
+            self._files -= files
+            if kept is not None and all(each.path != kept.path for each in self._kept):
+                self._kept.append(kept)
+                self._kept.sort()
+
+    def expire(self) -> list[Kept]:
+        """Drops what is older than it may be. Returns it. Raises OSError."""
+        with self._lock:
+            age = self._limits.age
+            if age is None:
+                return []
+            horizon = time.time() - age.seconds
+            return [self._drop(each) for each in [*self._kept] if each.ended < horizon]
+
+    @property
+    def _total(self) -> int:
+        return self._bytes + sum(each.bytes for each in self._kept)
+
+    def _short(self, size: int, files: int) -> str:
+        """Which limit there is no room under, for so much more; empty where there is room."""
+        limits = self._limits
+        if size > 0 and self._total + size > limits.bytes.bytes:
+            return f"the recordings would take more than spec.recordings.bytes ({limits.bytes})"
+        total = self._files + sum(each.files for each in self._kept) + files
+        if files > 0 and limits.files is not None and total > limits.files:
+            return f"there would be more than {limits.files} files (spec.recordings.files)"
+        if size > 0 and self._free() - self._ahead - size < limits.reserve.bytes:
+            return f"less than spec.recordings.reserve ({limits.reserve}) of the disk would be free"
+        return ""
+
+    def _free(self) -> int:
+        stat = os.statvfs(self.path)
+        return stat.f_bavail * stat.f_frsize
+
+    def _drop(self, kept: Kept) -> Kept:
+        """Delete a recording; in between it has no name under which it looks whole."""
+        self._kept.remove(kept)
+        hidden = hidden_path(kept.path, DROPPED)
+        try:
+            kept.path.rename(hidden)
+        except FileNotFoundError:
+            return kept  # somebody else did
+        shutil.rmtree(hidden)
+        return kept
+
+    def _scan(self) -> None:
+        self._kept = sorted(finished(self.path))
+        self._scanned = time.monotonic()
+
+
+def hidden_path(path: Path, ending: str) -> Path:
+    """Where a recording stands that is to have this final path, or had it."""
+    return path.with_name(f".{path.name}{ending}")
+
+
+def finished(path: Path) -> Iterator[Kept]:
+    """The recordings in a folder that have their final names. What is not of our making is left alone."""
+    for rule in _folders(path):
+        for folder in _folders(rule):
+            if not folder.name.startswith(".") and (kept := _kept(folder)) is not None:
+                yield kept
+
+
+def hidden(path: Path, ending: str) -> Iterator[Path]:
+    """The folders in the making, or being deleted."""
+    for rule in _folders(path):
+        yield from (each for each in _folders(rule) if each.name.startswith(".") and each.name.endswith(ending))
+
+
+def _folders(path: Path) -> list[Path]:
+    try:
+        return [Path(each.path) for each in os.scandir(path) if each.is_dir(follow_symlinks=False)]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _kept(folder: Path) -> Kept | None:
+    description = folder / DESCRIPTION
+    try:
+        told = json.loads(description.read_bytes())
+        if not isinstance(told, dict) or told.get("format") != FORMAT:
+            return None
+        stats = {each.name: each.stat() for each in folder.iterdir()}
+    except (OSError, ValueError):
+        return None
+    files = sum(name.endswith(".mcap") for name in stats)
+    return Kept(stats[DESCRIPTION].st_mtime, folder, sum(stat.st_size for stat in stats.values()), files)
+
+
+_PLACES: dict[str, Destination] = {}
+_PLACES_LOCK = threading.Lock()
+
+
+def destination(limits: Recordings) -> Destination:
+    """The one object for that folder in this process, from now on with these limits. Raises OSError."""
+    with _PLACES_LOCK:
+        name = os.path.realpath(limits.path)
+        place = _PLACES.get(name)
+        if place is None:
+            place = _PLACES[name] = Destination(limits)
+        else:
+            place.limit(limits)
+            place.path.mkdir(parents=True, exist_ok=True)
+        return place

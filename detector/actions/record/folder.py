@@ -1,0 +1,152 @@
+"""The folder of a recording in the making: hidden and locked, until it gets its final name in one step.
+
+The lock tells a recording in progress from one that a process left behind when it was killed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from detector.actions.record.bag import Part, metadata_yaml
+from detector.actions.record.description import DESCRIPTION, as_text
+from detector.actions.record.destination import PARTIAL, Destination, Kept, hidden_path
+
+CUT = "_cut"
+"""What the names of recordings end in of whose window something is missing."""
+_ROOM = ".room"
+"""A file that keeps room on the disk for what completes the recording."""
+_ROOM_BYTES = 64 * 1024
+
+Dropped = Callable[[Sequence[Kept]], None]
+"""Told of recordings that were deleted to make room."""
+
+
+class Folder:
+    """A hidden folder, locked by this process. Counts what it claims of the destination."""
+
+    def __init__(
+        self, destination: Destination, path: Path, name: str, dropped: Dropped, *, forced: bool = False
+    ) -> None:
+        """Locks the folder. `forced`: whatever it claims, it gets.
+
+        Raises BlockingIOError where another process has it, and other OSErrors.
+        """
+        self.path = path
+        self.name = name
+        """Its final name, but for what tells how it ended."""
+        self._destination = destination
+        self._dropped = dropped
+        self._forced = forced
+        self._claimed = (0, 0, 0)
+        self._lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            raise
+
+    @classmethod
+    def create(cls, destination: Destination, rule: str, name: str, dropped: Dropped) -> Folder:
+        """A new one. A number is added to the name where there is one already. Raises NoRoomError, OSError."""
+        parent = destination.path / rule
+        parent.mkdir(exist_ok=True)
+        number, chosen = 1, name
+        while any((parent / f"{chosen}{end}").exists() for end in ("", CUT)) or not _made(parent / chosen):
+            number += 1
+            chosen = f"{name}_{number}"
+        folder = cls(destination, hidden_path(parent / chosen, PARTIAL), chosen, dropped)
+        try:
+            folder.claim(_ROOM_BYTES, 0)
+            _keep_room(folder.path / _ROOM)
+        except BaseException:
+            folder.remove()
+            raise
+        return folder
+
+    def claim(self, now: int, later: int, files: int = 0) -> None:
+        """See Destination.claim. Raises NoRoomError, OSError."""
+        gone = self._destination.claim(now, later, files, forced=self._forced)
+        before = self._claimed
+        self._claimed = before[0] + now, before[1] + later, before[2] + files
+        if gone:
+            self._dropped(gone)
+
+    def describe(self, told: Mapping[str, Any]) -> None:
+        """Writes the description. Raises OSError."""
+        _write(self.path / DESCRIPTION, json.dumps(told, ensure_ascii=False, indent=1))
+
+    def described(self) -> dict[str, Any] | None:
+        """The description that is there; None where there is none that can be read."""
+        try:
+            told = json.loads((self.path / DESCRIPTION).read_bytes())
+        except (OSError, ValueError):
+            return None
+        return told if isinstance(told, dict) else None
+
+    def publish(self, parts: Sequence[Part], told: Mapping[str, Any]) -> Kept:
+        """Gives the folder its final name, once the disk has everything. Raises OSError: then it is as it was."""
+        (self.path / _ROOM).unlink(missing_ok=True)
+        _write(self.path / "metadata.yaml", metadata_yaml(parts, as_text(told)))
+        self.describe(told)
+        os.fsync(self._lock)
+        final = self.path.with_name(self.name + (CUT if "cut" in told else ""))
+        self.path.rename(final)
+        _sync(final.parent)
+        size = sum(each.stat().st_size for each in final.iterdir())
+        kept = Kept(time.time(), final, size, len(parts))
+        self._settle(kept)
+        return kept
+
+    def remove(self) -> None:
+        """Nothing of it is worth keeping. Raises OSError."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        self._settle(None)
+
+    def leave(self) -> None:
+        """It stays as it is, for the next start of the detector; its room stays claimed."""
+        os.close(self._lock)
+
+    def _settle(self, kept: Kept | None) -> None:
+        self._destination.settle(self._claimed, kept)
+        os.close(self._lock)
+
+
+def _made(final: Path) -> bool:
+    try:
+        hidden_path(final, PARTIAL).mkdir()
+    except FileExistsError:
+        return False
+    return True
+
+
+def _keep_room(path: Path) -> None:
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        os.posix_fallocate(fd, 0, _ROOM_BYTES)
+    finally:
+        os.close(fd)
+
+
+def _write(path: Path, text: str) -> None:
+    """The whole file or none of it."""
+    beside = path.with_name(f".{path.name}")
+    with beside.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
+
+
+def _sync(folder: Path) -> None:
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,291 @@
+"""The recording of one episode: its samples, in one file or in several of which each can be read alone.
+
+Where something goes wrong (no room, a disk that fails) the recording ends there: what was written is completed, marked
+as cut and kept. If even that fails, its hidden folder stays, and the next start of the detector tries again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from detector.actions.base import Surroundings
+from detector.actions.episode import EpisodeSample
+from detector.actions.record.bag import Part
+from detector.actions.record.channels import Owners, Reading, reading
+from detector.actions.record.compressing import compressor
+from detector.actions.record.description import (
+    METADATA,
+    METADATA_CUT,
+    METADATA_END,
+    METADATA_USER,
+    as_text,
+    beginning,
+    ending,
+    with_ending,
+)
+from detector.actions.record.destination import Kept, NoRoomError
+from detector.actions.record.folder import Folder
+from detector.actions.record.mcap_file import McapFile, SyncError
+from detector.actions.record.stamps import Stamps
+from detector.engine.buffering.lanes import latched_topics
+from wayside.api.actions.record import Record
+
+_MAXIMUM_CHANNELS = 60_000
+"""MCAP numbers channels with 16 bits: samples on more keys than this are left out."""
+
+Place = tuple[str, str, str]
+"""A stream, a key and a client: what has a channel of its own."""
+
+
+class _Latched(NamedTuple):
+    """What was said last on a latched stream: the files that follow begin with it."""
+
+    sample: EpisodeSample
+    number: int
+
+
+class Recording:
+    """Takes the samples of an episode's window, from one thread."""
+
+    def __init__(
+        self,
+        folder: Folder,
+        told: Mapping[str, Any],
+        parameters: Record,
+        surroundings: Surroundings,
+        *,
+        start: int | None,
+    ) -> None:
+        """`told` describes it; `start` is the window's, in nanoseconds, where it is known.
+
+        Raises NoRoomError, OSError: nothing of it is left then.
+        """
+        self._folder = folder
+        self._told = told
+        self._parameters = parameters
+        self._start = start
+        self._parts: list[Part] = []
+        self._latched: dict[tuple[str, Hashable], _Latched] = {}
+        self._numbers: Counter[Place] = Counter()
+        self._held: list[EpisodeSample] = []
+        self._readings: dict[str, Reading] = {}
+        self._channels: dict[Place, int] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._first: int | None = None  # the earliest time in the file, but for latched streams
+        self._file: McapFile | None = None
+        self._closed_bytes = self._taken = self._lost = 0
+        self.given = 0
+        """Samples that it got, each message counted once."""
+        self.follow(surroundings)
+        try:
+            folder.describe(told)
+            self._open()
+        except BaseException:
+            folder.remove()
+            raise
+
+    def follow(self, surroundings: Surroundings) -> None:
+        """From here on the Detector is this one: a stream that reads otherwise goes on in another channel."""
+        spec, wanted = surroundings.detector.spec, self._parameters.streams
+        streams = {s.name: s for s in spec.streams if wanted is None or s.latched or s.name in wanted}
+        self._surroundings = surroundings
+        self._stamps = Stamps(surroundings)
+        self._owners = Owners(streams)
+        self._topics = latched_topics(surroundings.detector, surroundings.decoders)
+        old, self._readings = self._readings, {}
+        for name, stream in streams.items():
+            self._readings[name] = reading(stream, surroundings.types)
+        same = {name for name, each in self._readings.items() if old.get(name) == each}
+        self._channels = {place: number for place, number in self._channels.items() if place[0] in same}
+
+    def take(self, samples: Sequence[EpisodeSample], surroundings: Surroundings) -> None:
+        """The next samples. Raises NoRoomError, OSError: then it takes no more, and `finish` keeps what there is."""
+        if surroundings.detector is not self._surroundings.detector:
+            self.follow(surroundings)
+        mine = [sample for sample in samples if self._owners.owns(sample.stream, sample.key)]
+        self.given += len(mine)
+        for sample in mine:
+            if self._start is None:
+                if sample.stream in self._topics:
+                    self._held.append(sample)  # the window begins with the first sample of another stream
+                    continue
+                self._start = sample.time
+                self._release()
+            self._take(sample)
+
+    def flush(self) -> None:
+        """Hands to the kernel what waits: it then outlives the process. Raises NoRoomError, OSError."""
+        if self._file is not None:
+            self._file.flush()
+
+    @property
+    def bytes(self) -> int:
+        """Written so far."""
+        return self._closed_bytes + (0 if self._file is None else self._file.end)
+
+    @property
+    def written(self) -> int:
+        """Samples that are in the files, each counted once."""
+        return self._taken - self._lost - (0 if self._file is None else self._file.lost)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether there is something to flush."""
+        return self._file is not None and self._file.waiting > 0
+
+    def finish(self, told: Mapping[str, Any], cut: str, missing: int) -> tuple[Kept | None, dict[str, Any]]:
+        """Completes the recording under its final name; also gives the last description of it.
+
+        Args:
+            told: describes it, now that the episode ended.
+            cut: why something of the window is missing; empty where nothing is.
+            missing: samples of the window that never came here.
+
+        Returns None for a cut recording of which nothing is worth keeping. Raises OSError where it could not be
+        completed, and waits for the next start of the detector.
+        """
+        try:
+            self._release()
+            self.flush()
+        except (NoRoomError, OSError) as error:
+            cut = cut or reason(error)
+        try:
+            while self._file is not None:
+                cut = self._complete(self._file, told, cut, missing)
+            told = self._ending(told, cut, missing)
+            if "cut" in told and not self.written:
+                self._folder.remove()
+                return None, told
+            return self._folder.publish(self._parts, told), told
+        except OSError:
+            self._folder.leave()
+            raise
+
+    def _complete(self, file: McapFile, told: Mapping[str, Any], cut: str, missing: int) -> str:
+        """Tries to complete the last file, or makes room for the next try; says why the recording is cut, if it is."""
+        told = self._ending(told, cut, missing)
+        try:
+            if "cut" in told:
+                file.add_metadata(METADATA_CUT, {"reason": told["cut"]})
+            file.add_metadata(METADATA_END, ending(told))
+            file.finish()
+        except SyncError:
+            file.give_up()
+            raise
+        except (NoRoomError, OSError) as error:
+            if not file.drop_last_chunk():  # nothing is left of it
+                self._close(file)
+                self._parts.pop()
+                file.path.unlink()
+            return cut or reason(error)
+        self._close(file)
+        return cut
+
+    def _close(self, file: McapFile) -> None:
+        file.give_up()
+        self._file = None
+        self._parts.append(Part(file.path.name, file.contents))
+        self._closed_bytes += file.end
+        self._lost += file.lost
+
+    def _ending(self, told: Mapping[str, Any], cut: str, missing: int) -> dict[str, Any]:
+        missing += self.given - self.written
+        if missing and not cut:
+            cut = f"{missing} samples of the window are missing"
+        names = [part.name for part in self._parts] + ([] if self._file is None else [self._file.path.name])
+        return with_ending(told, samples=self.written, missing=missing or None, cut=cut or None, files=names)
+
+    def _release(self) -> None:
+        """What was said on latched streams before the window's start is written, at its start."""
+        held, self._held = self._held, []
+        for sample in held:
+            self._take(sample)
+
+    def _take(self, sample: EpisodeSample) -> None:
+        place = sample.stream, sample.key, sample.client
+        log_time = sample.time
+        latched = sample.stream in self._topics
+        if latched:
+            log_time = log_time if self._start is None else max(log_time, self._start)
+        else:
+            self._split(log_time, len(sample.payload))
+            self._first = log_time if self._first is None else min(self._first, log_time)
+        channel = self._channel(place)
+        if channel is None:
+            return
+        self._numbers[place] += 1
+        number = self._numbers[place]
+        if latched:
+            about = sample.stream, self._topics[sample.stream](sample.key, sample.payload)
+            known = self._latched.get(about)
+            if known is None or known.sample.time <= sample.time:
+                self._latched[about] = _Latched(sample, number)
+        self._taken += 1
+        self._add(channel, number, log_time, sample)
+
+    def _add(self, channel: int, number: int, log_time: int, sample: EpisodeSample) -> None:
+        publish_time = self._stamps.publish_time(sample)
+        self._writer.add(channel, number & 0xFFFFFFFF, log_time, publish_time, sample.payload)
+
+    @property
+    def _writer(self) -> McapFile:
+        if self._file is None:
+            raise OSError("the recording has ended")
+        return self._file
+
+    def _split(self, time: int, size: int) -> None:
+        """Goes on in another file where it is time for it; that begins with what was last said on latched streams."""
+        split, first, file = self._parameters.split, self._first, self._writer
+        if first is None:
+            return
+        too_large = split.bytes is not None and file.size + size > split.bytes.bytes
+        too_long = split.duration is not None and time - first >= split.duration.ns
+        if not (too_large or too_long):
+            return
+        file.finish()
+        self._close(file)
+        self._open()
+        for latched in sorted(self._latched.values(), key=lambda each: each.sample.time):
+            sample = latched.sample
+            channel = self._channel((sample.stream, sample.key, sample.client))
+            if channel is not None:
+                self._add(channel, latched.number, time, sample)
+
+    def _open(self) -> None:
+        ros = any(each.type is not None for each in self._readings.values())
+        name = f"{self._folder.name}_{len(self._parts)}.mcap"
+        self._folder.claim(0, 0, 1)
+        self._file = McapFile.create(
+            self._folder.path / name,
+            "ros2" if ros else "",
+            compressor(self._parameters.compression),
+            self._folder.claim,
+        )
+        self._channels, self._schemas, self._first = {}, {}, None
+        self._file.add_metadata(METADATA, {**beginning(self._told), "file": str(len(self._parts))})
+        if self._told.get("metadata"):
+            self._file.add_metadata(METADATA_USER, as_text(self._told["metadata"]))
+
+    def _channel(self, place: Place) -> int | None:
+        """The channel's number in this file; None where there are too many."""
+        number = self._channels.get(place)
+        if number is None and len(self._writer.contents.channels) < _MAXIMUM_CHANNELS:
+            number = self._channels[place] = self._new_channel(*place)
+        return number
+
+    def _new_channel(self, stream: str, key: str, client: str) -> int:
+        known = self._readings.get(stream) or Reading("raw", None, None, "", False)
+        schema = 0
+        if known.type is not None and known.definition is not None:
+            about = known.type, known.definition
+            schema = self._schemas.get(about) or self._writer.schema(known.type, "ros2msg", known.definition.encode())
+            self._schemas[about] = schema
+        metadata = {"client": client, "stream": stream, **({"latched": "true"} if known.latched else {})}
+        return self._writer.channel(f"/{key}", known.encoding, schema, {**metadata, **known.metadata})
+
+
+def reason(error: Exception) -> str:
+    """Why a recording ended, for people."""
+    return str(error) if isinstance(error, NoRoomError) else f"writing failed: {error}"

@@ -1,0 +1,82 @@
+"""Recordings that a killed process left behind: at the next start they are completed, marked as cut, and named."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from detector.actions.record.bag import Part
+from detector.actions.record.description import METADATA_CUT, METADATA_END, ending, with_ending
+from detector.actions.record.destination import DROPPED, PARTIAL, Destination, Kept, hidden
+from detector.actions.record.folder import Folder
+from detector.actions.record.salvage import contents_of, salvage
+
+log = logging.getLogger(__name__)
+
+REASON = "the detector was killed while it recorded"
+"""Why such recordings are cut."""
+
+
+def recover(destination: Destination, left: Iterable[Path]) -> list[Kept]:
+    """Completes what these hidden folders hold; one that another process has locked is in progress and left alone.
+
+    What cannot be completed stays as it is, and is logged.
+    """
+    for path in hidden(destination.path, DROPPED):
+        shutil.rmtree(path, ignore_errors=True)
+    kept = []
+    for path in left:
+        try:
+            recording = _recovered(destination, path)
+        except BlockingIOError:
+            continue
+        except OSError as error:
+            log.error("%s: the recording that was left behind cannot be completed: %s", path, error)
+            continue
+        if recording is not None:
+            log.warning("%s: %s; what there is of it was completed", recording.path, REASON)
+            kept.append(recording)
+    return kept
+
+
+def _recovered(destination: Destination, path: Path) -> Kept | None:
+    name = path.name.removeprefix(".").removesuffix(PARTIAL)
+    folder = Folder(destination, path, name, lambda dropped: None, forced=True)
+    files = sorted(path.glob("*.mcap"), key=lambda each: int(each.stem.rpartition("_")[2]))
+    folder.claim(sum(each.stat().st_size for each in path.iterdir()), 0, len(files))
+    told = folder.described()
+    try:
+        parts = [] if told is None else [part for file in files if (part := _part(file, folder, told)) is not None]
+        samples = sum(part.contents.messages for part in parts)
+        if told is None or not samples:
+            folder.remove()
+            return None
+        return folder.publish(
+            parts, with_ending(told, cut=REASON, samples=samples, files=[part.name for part in parts])
+        )
+    except OSError:
+        folder.leave()
+        raise
+
+
+def _part(path: Path, folder: Folder, told: dict[str, Any]) -> Part | None:
+    """The file, completed; None where nothing of it can be read: it is deleted."""
+    contents = contents_of(path)
+    if contents is None:
+        file = salvage(path, folder.claim)
+        if file is None or not file.contents.messages:
+            if file is not None:
+                file.give_up()
+            path.unlink()
+            return None
+        try:
+            file.add_metadata(METADATA_CUT, {"reason": REASON})
+            file.add_metadata(METADATA_END, ending(with_ending(told, cut=REASON, samples=file.contents.messages)))
+            file.finish()
+        finally:
+            file.give_up()
+        contents = file.contents
+    return Part(path.name, contents)
