@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Generic, Protocol, TypeVar
 
@@ -19,6 +19,7 @@ from detector.engine.samples.sample import Decoder
 from detector.streams.codecs.ros import RosTypes
 from wayside.api import Detector, EventRule
 from wayside.api.base import Model
+from wayside.api.wording import FieldPath
 
 P = TypeVar("P", bound=BaseModel)
 """The model of an action's parameters."""
@@ -90,6 +91,14 @@ class Action(ABC, Generic[P]):
 
     Parameters: ClassVar[type[BaseModel]]
     """The model of its parameters; what it refuses, `detector check` reports with its place."""
+
+    @classmethod
+    def problems(cls, parameters: P, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
+        """What is wrong with parameters that their model cannot see, each with its place among them.
+
+        `detector check` tells it, and a rule with such an action is refused.
+        """
+        return ()
 
     def __init__(self, parameters: P, setting: Setting) -> None:
         self.parameters = parameters

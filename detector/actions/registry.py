@@ -50,8 +50,13 @@ def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem
     streams = [stream.name for stream in detector.spec.streams]
     for index, action in enumerate(rule.spec.actions):
         if action.field != DEPLOY:
+            at = ("spec", "actions", index)
             try:
-                prepare(action, streams)
+                offered, parameters = prepare(action, streams)
             except PluginError as error:
                 for path, text in error.problems:
-                    yield RuleProblem(("spec", "actions", index, *path), text)
+                    yield RuleProblem((*at, *path), text)
+            else:
+                below = (action.field,) if action.plugin is None else ("plugin", "parameters")
+                for path, text in offered.problems(parameters, detector):
+                    yield RuleProblem((*at, *below, *path), text)

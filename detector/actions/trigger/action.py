@@ -10,7 +10,7 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,11 @@ from detector.actions.trigger.course import FOREVER, Course, Limits, Step
 from detector.actions.trigger.detectors import OtherDetector
 from detector.actions.trigger.journal import Journal
 from detector.actions.trigger.orders import Order, Report, System
-from detector.actions.trigger.ros2 import Ros2Services
+from detector.actions.trigger.ros2 import Ros2Services, problems
+from wayside.api import Detector
 from wayside.api.actions import trigger as api
 from wayside.api.detector import Clock
+from wayside.api.wording import FieldPath
 from wayside.names import encode
 
 _log = logging.getLogger(__name__)
@@ -36,7 +38,7 @@ _SILENCES = (1.0, 2.0, 5.0, 10.0)
 _CLAIM = 10.0
 """Seconds after the start in which an episode of the last run is resumed, if it is."""
 
-_LEAVE = 3.0
+_LEAVE = 2.0
 """Seconds at the end for what still is to be stopped."""
 
 
@@ -44,6 +46,11 @@ class Trigger(Action[api.Trigger]):
     """Has another system record as long as an episode lasts."""
 
     Parameters = api.Trigger
+
+    @classmethod
+    def problems(cls, parameters: api.Trigger, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
+        """Services that are not known, and requests that do not fit."""
+        return problems(parameters, detector)
 
     def __init__(self, parameters: api.Trigger, setting: Setting) -> None:
         super().__init__(parameters, setting)
@@ -122,6 +129,7 @@ class Trigger(Action[api.Trigger]):
     def close(self) -> None:
         """Stop what nobody will stop later, as far as that goes quickly."""
         end = time.monotonic() + _LEAVE
+        self._system.timeout = min(self._system.timeout, 1.0)
         while time.monotonic() < end:
             now = time.monotonic()
             stops = [
@@ -225,8 +233,6 @@ class Trigger(Action[api.Trigger]):
             course = self._courses[identity]
             if course.lost_stop:
                 self._lose(course, course.problem)
-            elif course.problem:
-                self.setting.lose("recordings elsewhere that failed", 1, f"{identity}: {course.problem}")
             state = OutcomeState.FAILED if course.problem else OutcomeState.DONE
             self._report(identity, self._outcome(state, course, course.problem or course.note))
             del self._courses[identity]

@@ -36,7 +36,7 @@ class OtherDetector:
         assert parameters.detector is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.detector
         self._maximum = parameters.maximum_duration
-        self._timeout = parameters.timeout.seconds
+        self.timeout = parameters.timeout.seconds
         self._messenger = messenger
 
     def place(self, order: Order) -> str:
@@ -75,7 +75,7 @@ class OtherDetector:
 
     def _ask(self, order: Order, request: RecordingRequest) -> Report:
         name = self.place(order)
-        answers = self._messenger.ask(status_key(name, RECORDINGS), write_request(request), self._timeout)
+        answers = self._messenger.ask(status_key(name, RECORDINGS), write_request(request), self.timeout)
         try:
             said = read_report(answers[0])
         except (IndexError, ValueError) as error:

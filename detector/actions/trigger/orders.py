@@ -58,6 +58,8 @@ class System(Protocol):
 
     renew: float | None
     """Seconds after which a start is said again, so that a system that was restarted goes on; None: never."""
+    timeout: float
+    """Seconds to wait for an answer."""
     ends_by_itself: bool
     """Whether it ends a recording after maximumDuration without being told."""
 

@@ -11,10 +11,11 @@ recording.
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from typing import Any
 
@@ -22,9 +23,12 @@ from detector.actions.base import ActionError, Messenger
 from detector.actions.trigger.composing import ServiceError
 from detector.actions.trigger.orders import Order, Progress, Report
 from detector.actions.trigger.services import service
-from detector.streams.codecs.ros import RosTypes
+from detector.streams.codecs.definitions import Definition, DefinitionsError
+from detector.streams.codecs.ros import RosTypes, types_with
+from wayside.api import Detector
 from wayside.api.actions.trigger import ServiceCall, Trigger
 from wayside.api.stream import Layout
+from wayside.api.wording import FieldPath
 
 
 class Ros2Services:
@@ -36,7 +40,7 @@ class Ros2Services:
     def __init__(self, parameters: Trigger, messenger: Messenger, types: Callable[[], RosTypes]) -> None:
         assert parameters.ros2 is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.ros2
-        self._timeout = parameters.timeout.seconds
+        self.timeout = parameters.timeout.seconds
         self._messenger = messenger
         self._types = types
         self._asker = os.urandom(16)
@@ -91,7 +95,7 @@ class Ros2Services:
             topic = f"{self._wanted.domain or 0}/{topic}/{package}::srv::dds_::{short}_/{of_type.type_hash}"
             attachment = struct.pack("<qqB", next(self._numbers), time.time_ns(), len(self._asker)) + self._asker
         try:
-            answers = self._messenger.ask(topic, request, self._timeout, attachment)
+            answers = self._messenger.ask(topic, request, self.timeout, attachment)
             response = of_type.response(answers[0])
         except ActionError as error:
             self._unanswered.add(key)
@@ -120,3 +124,23 @@ def _refusal(response: Mapping[str, Any]) -> str | None:
         return None
     why = response.get("error_string") or response.get("message")
     return str(why or f"return code {response.get('return_code', 'none')}, success {response.get('success', 'none')}")
+
+
+def problems(parameters: Trigger, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
+    """What is wrong with the calls, as far as that can be told without an episode."""
+    if parameters.ros2 is None:
+        return
+    try:
+        types = types_with(tuple(Definition(each.name, each.definition) for each in detector.spec.messages))
+    except DefinitionsError:  # the Detector's problem, and told there
+        return
+    for name, call in parameters.ros2.calls.items():
+        field = "definition"
+        try:
+            of_type = service(call.type, call.definition, types)
+            field = "request"
+            of_type.request({key: value for key, value in call.request.items() if "${" not in json.dumps(value)})
+        except ServiceError as error:
+            if call.definition is None and field == "definition":
+                field = "type"
+            yield ("ros2", name, field), str(error)

@@ -10,10 +10,11 @@ from pydantic import Field, model_validator
 from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.plugin import ActionPlugin
 from wayside.api.actions.record import Record
+from wayside.api.actions.trigger import Trigger
 from wayside.api.actions.window import Window
 from wayside.api.base import JsonValue, Model, ObjectName, validations
 
-_KINDS = ("deploy", "record", "plugin")
+_KINDS = ("deploy", "record", "trigger", "plugin")
 _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
@@ -29,6 +30,7 @@ class Action(Model):
         default=None, description="Emit an ApplicationTask that holds while the episode lasts."
     )
     record: Record | None = Field(default=None, description="Record its samples as rosbag2 with MCAP files.")
+    trigger: Trigger | None = Field(default=None, description="Have another system record while the episode lasts.")
     plugin: ActionPlugin | None = Field(default=None, description="What an installed package does about it.")
 
     @model_validator(mode="after")
