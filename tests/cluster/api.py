@@ -18,12 +18,12 @@ import urllib3
 from kubernetes.client import ApiClient, Configuration
 from kubernetes.config import load_kube_config
 
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 
 Object = dict[str, Any]  # a Kubernetes object, as JSON
 Objects = list[Object]
 FIELD_MANAGER = "test"
-REQUEST_TIMEOUT = 20.0  # s
+REQUEST_TIMEOUT = 60.0  # s
 
 MERGE_PATCH = "application/merge-patch+json"
 JSON_PATCH = "application/json-patch+json"
@@ -150,7 +150,7 @@ class Api:
         name: str,
         holds: Callable[[Object], bool],
         *,
-        timeout: float = 40,
+        timeout: float = PATIENCE,
         what: str,
         namespace: str = "",
     ) -> Object:
@@ -168,7 +168,7 @@ class Api:
         )
         return cast("Object", found)
 
-    def wait_gone(self, kind: str, name: str, *, timeout: float = 40, namespace: str = "") -> None:
+    def wait_gone(self, kind: str, name: str, *, timeout: float = PATIENCE, namespace: str = "") -> None:
         """Wait until there is no such object.
 
         Raises:
@@ -187,7 +187,7 @@ class Api:
         kind: str,
         holds: Callable[[Objects], bool],
         *,
-        timeout: float = 40,
+        timeout: float = PATIENCE,
         what: str,
         labels: str = "",
         namespace: str = "",

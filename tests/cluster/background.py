@@ -12,10 +12,9 @@ from typing import TypeVar
 
 from detector.cluster.api import Api
 from detector.cluster.connection import connect
+from tests.cluster.waiting import PATIENCE
 
 Result = TypeVar("Result")
-
-PATIENCE = 20.0  # s
 
 
 class Background:

@@ -27,7 +27,6 @@ NEAR, BETWEEN, FAR = 100.0, 175.0, 250.0
 """Metres: starts an episode; keeps an open one and starts none; ends it."""
 
 HOLDER = "town"
-LINGER = 2.0  # s
 PERIOD = 0.1  # s between two poses of a vehicle
 
 Pair = tuple[str, str]
@@ -136,11 +135,9 @@ class Chain:
         assert len(found) < 2, f"one demand has several tasks: {found}"
         return found[0] if found else None
 
-    def wait_task(self, pair: Pair, *, timeout: float = 30) -> Object:
+    def wait_task(self, pair: Pair) -> Object:
         """Wait for the pair's task."""
-        found = wait_until(
-            lambda: self.task(pair), lambda task: task is not None, timeout=timeout, what=f"{pair} has a task"
-        )
+        found = wait_until(lambda: self.task(pair), lambda task: task is not None, what=f"{pair} has a task")
         assert found is not None
         return found
 
@@ -150,19 +147,15 @@ class Chain:
         assert len(found) < 2, f"{pair} has several Deployments"
         return found[0] if found else None
 
-    def wait_deployed(self, pair: Pair, *, timeout: float = 30) -> Object:
+    def wait_deployed(self, pair: Pair) -> Object:
         """Wait for the pair's Deployment."""
-        found = wait_until(
-            lambda: self.deployment(pair), lambda it: it is not None, timeout=timeout, what=f"{pair} has a Deployment"
-        )
+        found = wait_until(lambda: self.deployment(pair), lambda it: it is not None, what=f"{pair} has a Deployment")
         assert found is not None
         return found
 
-    def wait_removed(self, pair: Pair, *, timeout: float = 30) -> None:
+    def wait_removed(self, pair: Pair) -> None:
         """Wait until the pair's Deployment is gone."""
-        wait_until(
-            lambda: self.deployment(pair), lambda it: it is None, timeout=timeout, what=f"{pair} has no Deployment"
-        )
+        wait_until(lambda: self.deployment(pair), lambda it: it is None, what=f"{pair} has no Deployment")
 
     def live(self) -> set[str]:
         """The subjects of all tasks that are in force."""
@@ -174,12 +167,11 @@ class Chain:
         lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
         return [event for event in map(json.loads, lines) if event["subject"] == "+".join(subject)]
 
-    def wait_events(self, pair: Pair, *kinds: str, timeout: float = 30) -> list[Object]:
+    def wait_events(self, pair: Pair, *kinds: str) -> list[Object]:
         """Wait until the pair's events are of these kinds (`started`, or the reason of an end)."""
         return wait_until(
             lambda: self.events(*pair),
             lambda events: [kind_of(event) for event in events] == list(kinds),
-            timeout=timeout,
             what=f"the events of {pair} are {kinds}",
         )
 
@@ -196,11 +188,13 @@ class Chain:
 
 
 def detector(endpoint: str, **spec: Any) -> Object:
+    """The Detector. However slowly all goes, it loses no client and ends no episode for being long unknown."""
     pose = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "staleAfter": "2s"}
     full = {
         "zenoh": {"mode": "peer", "listen": [endpoint]},
         "streams": [pose],
         "rules": {"matchLabels": {"site": HOLDER}},
+        "clientTimeout": "10m",
         **spec,
     }
     return _object("Detector", HOLDER, full)
@@ -237,7 +231,14 @@ def recording(**parameters: Any) -> list[Object]:
     return [{"name": "record", "deploy": {"template": "recorder", "parameters": given}}]
 
 
-def template() -> Object:
+def template(*, linger: str = "1s", after: str = "10m") -> Object:
+    """The template `recorder`.
+
+    Args:
+        linger: how long the application outlives its demand.
+        after: how long the demands of a holder outlive its Lease of 15 s. By default a restart on a slow machine, too,
+            is in time.
+    """
     labels = {"pair": "${parameters.vehicles[0]}-${parameters.vehicles[1]}"}
     container = {"name": "main", "image": "app:1", "args": ["--rate=${parameters.rate}"]}
     deployment = {
@@ -256,7 +257,7 @@ def template() -> Object:
             "rate": {"type": "number", "default": 1, "minimum": 1, "maximum": 50, "merge": "Max"},
         },
         "key": "${parameters.vehicles}",
-        "lifecycle": {"linger": f"{LINGER:g}s", "onDetectorLoss": {"policy": "Release", "after": "1s"}},
+        "lifecycle": {"linger": linger, "onDetectorLoss": {"policy": "Release", "after": after}},
         "manifests": [deployment],
     }
     return _object("ApplicationTemplate", "recorder", spec)

@@ -8,12 +8,12 @@ from pathlib import Path
 import yaml
 
 from tests.cluster.api import Api, ApiError, Object
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 
 CRDS = Path(__file__).parents[2] / "crds"
 
 
-def apply_crds(api: Api, folder: Path = CRDS, timeout: float = 40) -> Mapping[str, ApiError]:
+def apply_crds(api: Api, folder: Path = CRDS, timeout: float = PATIENCE) -> Mapping[str, ApiError]:
     """Apply each CRD in the folder's YAML files and wait until it is served; return the refusals by file name.
 
     One that is refused holds up no other: its own test fails, and those that need its kind, but not all.

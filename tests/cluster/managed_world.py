@@ -20,7 +20,7 @@ from application_manager.core.rendering import Renderer, RenderError
 from application_manager.core.status import task_status
 from tests.cluster.api import Api, Object
 from tests.cluster.processes import Process, Processes
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 
 KINDS = ("Deployment", "ConfigMap", "Service")  # those that the tests' templates make
@@ -36,7 +36,7 @@ def start_manager(processes: Processes, namespace: str | None = None, *options: 
 
 
 def wait_settled(
-    api: Api, *, timeout: float = 60, lost: Mapping[str, LeaseView] | None = None, refused: Collection[str] = ()
+    api: Api, *, timeout: float = PATIENCE, lost: Mapping[str, LeaseView] | None = None, refused: Collection[str] = ()
 ) -> None:
     """Wait until the namespace is as what is live in it demands.
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tests.cluster.children import Child
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 
 BIN = Path(sys.executable).parent
 
@@ -47,7 +47,7 @@ class Process:
         """The exit code of the present run, negative for a signal; None while it goes on."""
         return self._child.returncode
 
-    def terminate(self, patience: float = 10) -> int:
+    def terminate(self, patience: float = 30) -> int:
         """Send SIGTERM, wait for the end, return the exit code; TimeoutError (and SIGKILL) after `patience` seconds."""
         return self._child.terminate(patience)
 
@@ -55,7 +55,7 @@ class Process:
         """Send SIGKILL to it and to all that it started."""
         self._child.kill9()
 
-    def wait(self, timeout: float = 40) -> int:
+    def wait(self, timeout: float = PATIENCE) -> int:
         """Wait until it ends by itself and return the exit code; TimeoutError with its log after `timeout` seconds."""
         return self._child.wait(timeout)
 
@@ -75,7 +75,7 @@ class Process:
             log.seek(self._seen_from)
             return log.read().decode(errors="replace")
 
-    def wait_for_output(self, pattern: str, timeout: float = 40) -> re.Match[str]:
+    def wait_for_output(self, pattern: str, timeout: float = PATIENCE) -> re.Match[str]:
         """Wait until the output of the present run matches; return the match.
 
         Raises:

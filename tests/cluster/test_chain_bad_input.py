@@ -261,7 +261,7 @@ def test_a_detector_that_is_not_in_the_cluster_is_waited_for_and_that_is_said(ch
     running.wait_for_output(f"there is no Detector '{HOLDER}' in namespace {chain.namespace}: create it")
     chain.apply(rule(), detector(chain.endpoint))
     running.wait_for_output(f"Detector {HOLDER} runs with 1 rules")
-    assert running.terminate(patience=15) == 0
+    assert running.terminate() == 0
 
 
 def command(*arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:

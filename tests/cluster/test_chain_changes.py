@@ -46,6 +46,7 @@ def vehicles(chain: Chain) -> Iterator[Vehicles]:
 
 
 def test_a_rule_that_means_something_else_ends_its_episodes_and_begins_anew(chain: Chain, vehicles: Vehicles) -> None:
+    chain.apply(template(linger="8s"))
     chain.start()
     vehicles.place(CARS, NEAR)
     vehicles.place(VANS, 140.0)
@@ -113,7 +114,7 @@ def test_a_detector_is_changed_while_it_runs(chain: Chain, vehicles: Vehicles) -
             vehicles.send("vehicles/car1/mood", message)  # again and again: the detector may just be subscribing
             return [kind_of(event) for event in chain.events("car1")]
 
-        wait_until(heard, kinds.__eq__, timeout=20, what="the new stream is followed")
+        wait_until(heard, kinds.__eq__, what="the new stream is followed")
     assert untouched(deployed, chain.deployment(CARS))
     assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
     chain.wait_events(CARS, "started")
@@ -139,7 +140,7 @@ def test_a_detector_that_is_changed_to_a_wrong_one_goes_on_as_before(chain: Chai
         running.wait_for_output(rf"Detector {HOLDER} is not followed.*spec\.streams\[0\]\.{field}: ")
     vehicles.place(VANS, NEAR)
     chain.wait_deployed(VANS)
-    chain.apply(detector(chain.endpoint, clientTimeout="20s"))
+    chain.apply(detector(chain.endpoint, clientTimeout="20m"))
     vehicles.place(BUSES, NEAR)
     chain.wait_deployed(BUSES)
     assert untouched(deployed, chain.deployment(CARS))

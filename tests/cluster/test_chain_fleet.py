@@ -90,7 +90,9 @@ def test_sources_that_come_and_go_reach_the_instance_of_each_site_without_a_rest
     api: Api, namespace: str, processes: Processes, tmp_path: Path
 ) -> None:
     chain = Chain(api, namespace, processes, tmp_path / "out")
-    chain.apply(fusion(), seen_at_a_site(), detector(chain.endpoint))
+    unhurried = detector(chain.endpoint)
+    unhurried["spec"]["streams"][0]["staleAfter"] = "Never"  # a vehicle that pauses would leave, and come back
+    chain.apply(fusion(), seen_at_a_site(), unhurried)
     chain.start()
     with Vehicles(chain.endpoint) as vehicles:
         vehicles.place(CARS, NEAR)

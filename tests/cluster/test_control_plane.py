@@ -7,6 +7,7 @@ import pytest
 from tests.cluster.api import Api, ApiError, Object, Unreachable
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.pods import mark_pods_ready
+from tests.cluster.waiting import wait_until
 
 
 def deployment(name: str, replicas: int = 2) -> Object:
@@ -110,7 +111,7 @@ def test_what_an_application_instance_owns_goes_with_it(api: Api) -> None:
 
     api.delete("ApplicationInstance", "owner")
 
-    api.wait_gone("ConfigMap", "owned", timeout=10)
+    api.wait_gone("ConfigMap", "owned")
     assert api.find("ConfigMap", "free") is not None
 
 
@@ -171,9 +172,10 @@ class TestRoleBasedAccess:
             }
         )
 
+        # The authorizer learns of the role by a watch, a moment later.
+        wait_until(lambda: account.list("ConfigMap"), lambda _: True, transient=(ApiError,), what="it may list")
         with pytest.raises(ApiError, match="cannot create resource"):
             account.create(configmap("forbidden"))
-        assert isinstance(account.list("ConfigMap"), list)
 
 
 class TestOutage:
@@ -187,7 +189,8 @@ class TestOutage:
         with control_plane.outage():
             pass
         api.apply(deployment("app"))
-        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=20, what="the controllers make pods again")
+        soon = 45.0  # s: had they not been started anew, their watches would back off for longer
+        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=soon, what="the controllers make pods again")
 
     def test_what_a_failed_test_left_stopped_is_started_for_the_next(
         self, control_plane: ControlPlane, api: Api
@@ -196,4 +199,4 @@ class TestOutage:
         control_plane.stop_api_server()
         control_plane.recover()
         api.apply(deployment("app"))
-        api.wait_list("Pod", lambda pods: len(pods) == 2, timeout=20, what="the controllers make pods again")
+        api.wait_list("Pod", lambda pods: len(pods) == 2, what="the controllers make pods again")

@@ -107,14 +107,14 @@ def test_a_status_or_an_annotation_is_no_change(api: Api, following: Following) 
 def test_the_last_known_set_holds_while_the_detector_is_gone(
     api: Api, following: Following, caplog: pytest.LogCaptureFixture
 ) -> None:
-    wait_until(lambda: caplog.text, lambda text: "no Detector 'intersection-a'" in text, timeout=20, what="it is said")
+    wait_until(lambda: caplog.text, lambda text: "no Detector 'intersection-a'" in text, what="it is said")
     api.create(detector())
     api.create(rule("a"))
     following.wait_rules("a")
     before = len(following.sets)
     api.delete("Detector", "intersection-a")
     api.create(rule("b"))
-    wait_until(lambda: caplog.text.count("no Detector"), lambda n: n == 2, timeout=20, what="it is said again")
+    wait_until(lambda: caplog.text.count("no Detector"), lambda n: n == 2, what="it is said again")
     assert len(following.sets) == before
     api.create(detector())
     following.wait_rules("a", "b")
@@ -129,7 +129,7 @@ def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
     api.create(rule("broken", actions=[deploy]))
     api.create(rule("sound"))
     following.wait_rules("sound")
-    wait_until(lambda: following.rules.problems, bool, timeout=20, what="the problem is known")
+    wait_until(lambda: following.rules.problems, bool, what="the problem is known")
     assert "not-an-identifier" in following.rules.problems["EventRule broken"]
     assert "EventRule broken cannot be read" in caplog.text
     api.patch("EventRule", "broken", {"spec": {"actions": []}})
@@ -149,5 +149,5 @@ def test_what_changed_during_an_outage_is_seen_after_it(
         assert len(following.sets) == before
     api.delete("EventRule", "a")
     api.create(rule("c"))
-    following.wait_rules("b", "c", timeout=15)
+    following.wait_rules("b", "c")
     assert all(set(names_of(each)) & {"a", "b"} for each in following.sets[before:]), "the outage took no rule away"

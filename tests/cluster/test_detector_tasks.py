@@ -15,13 +15,14 @@ from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.stores import TaskExistsError, manifest, restore
 from detector.engine.episodes.demands import Demand, to_task
 from tests.cluster.api import Api, Object, Objects
-from tests.cluster.background import PATIENCE, Background, background
+from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 
 SECOND = 10**9
 START = 1_767_225_600 * SECOND + 123_456_789
 HOLDER = "intersection-a"
+RARELY = 600.0  # s between two resyncs: what a test sees comes by the watch
 
 
 def demand(namespace: str, subject: str = "car1+car2", **changes: Any) -> Demand:
@@ -72,13 +73,17 @@ class Running:
     def restored(self) -> list[Demand]:
         return self._loop.call(restore(self.store))
 
-    def stop(self, deadline: float = 3.0) -> None:
+    def counted(self, expected: DeployCounts) -> None:
+        """Wait for these counts: a change is counted only once the API server has told that it is made."""
+        wait_until(lambda: self.counts, expected.__eq__, what=f"counted: {expected}")
+
+    def stop(self, deadline: float = 60.0) -> None:
         self._loop.loop.call_soon_threadsafe(self.reconciler.stop, deadline)
         self._future.result(PATIENCE)
 
 
 @contextmanager
-def reconciling(kubeconfig: Path, namespace: str, holder: str = HOLDER, resync: float = 30.0) -> Iterator[Running]:
+def reconciling(kubeconfig: Path, namespace: str, holder: str = HOLDER, resync: float = RARELY) -> Iterator[Running]:
     with background(kubeconfig) as loop:
         running = Running(loop, namespace, holder, resync)
         yield running
@@ -118,7 +123,7 @@ def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, run
     [task] = tasks_are(api, set(), {wanted.name})
     assert task["spec"]["endTime"] == "2026-01-01T00:00:07.123456790Z"
     assert running.restored() == []
-    assert running.counts == DeployCounts(created=1, ended=1)
+    running.counted(DeployCounts(created=1, ended=1))
 
 
 def test_the_values_at_the_start_are_kept(api: Api, namespace: str, running: Running) -> None:
@@ -141,7 +146,7 @@ def test_changed_parameters_are_patched_and_removed_ones_go(api: Api, namespace:
         what="the parameters are those of the new demand",
     )
     assert after["metadata"]["uid"] == before["metadata"]["uid"]
-    assert running.counts == DeployCounts(created=1, patched=1)
+    running.counted(DeployCounts(created=1, patched=1))
 
 
 def test_what_cannot_be_changed_is_made_anew_under_the_same_name(api: Api, namespace: str, running: Running) -> None:
@@ -167,12 +172,9 @@ def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, runnin
         "ApplicationTask",
         wanted.name,
         lambda task: task["metadata"]["uid"] != before["metadata"]["uid"],
-        timeout=15,  # by the watch: the resync is at 30 s
         what="the task is there again",
     )
-    wait_until(
-        lambda: running.counts, lambda counts: counts.recreated == 1, timeout=20, what="counted as created again"
-    )
+    wait_until(lambda: running.counts, lambda counts: counts.recreated == 1, what="counted as created again")
 
 
 def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: Running) -> None:
@@ -196,7 +198,7 @@ def test_an_outage_delays_starts_and_ends_and_loses_none(
     before = tasks_are(api, {stays.name, ends.name})
     with control_plane.outage():
         running.update(by_name(stays, passes), {ends.name: START + SECOND})
-        wait_until(lambda: running.counts, lambda c: c.retried > 0, timeout=20, what="the outage was met")
+        wait_until(lambda: running.counts, lambda c: c.retried > 0, what="the outage was met")
         running.update(by_name(stays, starts), {passes.name: START + 2 * SECOND})
     after = tasks_are(api, {stays.name, starts.name}, {ends.name})
     versions = {task["metadata"]["name"]: task["metadata"]["resourceVersion"] for task in before}
@@ -212,14 +214,14 @@ def test_an_end_that_a_stopped_detector_could_not_tell_is_told_by_the_next(
 ) -> None:
     wanted = demand(namespace)
     with background(control_plane.kubeconfig) as loop:
-        first = Running(loop, namespace, HOLDER, 30.0)
+        first = Running(loop, namespace, HOLDER, RARELY)
         first.update(by_name(wanted))
         tasks_are(api, {wanted.name})
         with control_plane.outage():
             first.update({}, {wanted.name: START + SECOND})
             first.stop(deadline=0.2)
         [task] = tasks_are(api, {wanted.name})
-        second = Running(loop, namespace, HOLDER, 30.0)
+        second = Running(loop, namespace, HOLDER, RARELY)
         assert second.restored() == [wanted]
         assert not is_ended(api.get("ApplicationTask", wanted.name)), "nothing is ended before the engine has spoken"
         second.update({}, {wanted.name: START + 5 * SECOND})
@@ -244,7 +246,7 @@ def test_a_detector_that_stops_leaves_its_live_tasks_alive_and_adopts_them(
         another = demand(namespace, "car5+car6")
         second.update(by_name(*restored, another))
         tasks_are(api, {wanted.name, late.name, another.name})
-        assert second.counts == DeployCounts(created=1)
+        second.counted(DeployCounts(created=1))
     for task in before:
         assert api.get("ApplicationTask", task["metadata"]["name"]) == task
 
@@ -267,7 +269,7 @@ def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: s
     other = demand(namespace, "car3+car4")
     running.update(by_name(wanted, other))
     tasks_are(api, {wanted.name, foreign.name, "mine", other.name})
-    wait_until(lambda: running.counts.refused, lambda r: bool(r["AlreadyExists"]), timeout=20, what="it was refused")
+    wait_until(lambda: running.counts.refused, lambda r: bool(r["AlreadyExists"]), what="it was refused")
     running.update({}, {wanted.name: START, other.name: START})
     tasks_are(api, {wanted.name, foreign.name, "mine"}, {other.name})
     assert [api.get("ApplicationTask", each["metadata"]["name"]) for each in before] == before
@@ -289,7 +291,7 @@ def test_what_is_forbidden_is_done_once_it_is_allowed(control_plane: ControlPlan
     kubeconfig = control_plane.kubeconfig_of_service_account(namespace, "default")
     with reconciling(kubeconfig, namespace, resync=1.0) as running:
         running.update(by_name(wanted))
-        wait_until(lambda: running.counts.refused, lambda r: r["Forbidden"] > 0, timeout=20, what="it was refused")
+        wait_until(lambda: running.counts.refused, lambda r: r["Forbidden"] > 0, what="it was refused")
         assert api.list("ApplicationTask") == []
         api.apply(_role("reads", ["get", "list", "watch", "create", "patch"]))
         tasks_are(api, {wanted.name})
@@ -301,7 +303,7 @@ def test_a_burst_of_demands_is_served_each_once(api: Api, namespace: str, runnin
     tasks_are(api, set(wanted))
     running.update({}, dict.fromkeys(wanted, START + SECOND))
     tasks_are(api, set(), set(wanted))
-    assert running.counts == DeployCounts(created=300, ended=300)
+    running.counted(DeployCounts(created=300, ended=300))
 
 
 def _role(name: str, verbs: list[str]) -> Object:

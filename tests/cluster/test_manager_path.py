@@ -44,7 +44,7 @@ def test_a_task_becomes_a_deployment_that_is_ready_when_its_pods_are(api: Api, m
         what="the instance says what it waits for",
     )
 
-    wait_until(lambda: mark_pods_ready(api), bool, timeout=20, what="the pod exists")
+    wait_until(lambda: mark_pods_ready(api), bool, what="the pod exists")
     done = api.wait_for(
         "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("phase") == "Ready", what="the task is ready"
     )
@@ -53,15 +53,16 @@ def test_a_task_becomes_a_deployment_that_is_ready_when_its_pods_are(api: Api, m
         "Applied": "True",
         "Ready": "True",
     }
-    instance = api.get("ApplicationInstance", NORTH)
-    assert instance["status"]["phase"] == "Ready"
+    instance = api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: raw["status"]["phase"] == "Ready", what="the instance is ready"
+    )
     assert instance["status"]["demands"] == {"count": 1, "names": ["north"]}
     assert instance["status"]["observedGeneration"] == instance["metadata"]["generation"]
     wait_settled(api)
 
 
 def test_when_the_demand_ends_the_instance_lingers_and_goes_with_all_that_is_its(api: Api, manager: Process) -> None:
-    api.create(template(linger="4s"))
+    api.create(template(linger="8s"))
     api.create(task("north"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
     end(api, "north")
@@ -82,7 +83,7 @@ def test_when_the_demand_ends_the_instance_lingers_and_goes_with_all_that_is_its
 
 
 def test_a_new_demand_within_the_linger_keeps_the_instance_untouched(api: Api, manager: Process) -> None:
-    api.create(template(linger="30s"))
+    api.create(template(linger="300s"))
     api.create(task("north"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
     wait_settled(api)
@@ -156,6 +157,7 @@ def test_a_persons_instance_is_made_but_never_released(api: Api, manager: Proces
 
 def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
     api.create(template())
+    api.wait_for("ApplicationTemplate", "app", lambda raw: bool(condition(raw, "Accepted")), what="it is known")
     api.create(task("north"))
     api.create({**task("wrong"), "spec": {"template": "nowhere"}})
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
@@ -173,7 +175,7 @@ def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
         ("ApplicationTask", "wrong", "Refused"),
         ("ApplicationTemplate", "app", "Accepted"),
     ]
-    wait_until(told, lambda found: found == expected, timeout=20, what="the Events are there")
+    wait_until(told, lambda found: found == expected, what="the Events are there")
     manager.restart()
     manager.wait_for_output("watching")
     wait_settled(api)

@@ -6,6 +6,7 @@ What exists over time is compared with what the simulated positions alone say sh
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import sys
@@ -21,7 +22,7 @@ import yaml
 
 from tests.cluster.api import Api
 from tests.cluster.processes import Processes
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))
@@ -31,15 +32,17 @@ from cooperative_recording.vehicles import simulate  # noqa: E402
 
 SEED, DURATION = 3528, 25.0
 EVALUATION = 0.5  # s, of the example's rule
-ALLOWED = EVALUATION + 2.0
+REACTION = 2.0  # s from the evaluation to a Deployment that is there, or gone
+REQUESTS = 10  # how often the API server is asked on the way
 SAMPLING = 0.2  # s: a pose is up to 0.1 s old, and so is what the observer saw
 
 
 @dataclass
 class Seen:
-    """What existed at one moment, in seconds into the drive."""
+    """What existed at one moment."""
 
-    at: float
+    since_ns: int  # the epoch
+    took_s: float  # to look
     pairs: frozenset[tuple[str, ...]]
     sources: dict[str, tuple[str, ...]]
 
@@ -49,7 +52,6 @@ class Observer:
     """Looks at the Deployments and ConfigMaps of a namespace ten times a second."""
 
     api: Api
-    start_ns: int
     seen: list[Seen] = field(default_factory=list)
 
     @contextmanager
@@ -65,7 +67,7 @@ class Observer:
 
     def _run(self, ended: threading.Event) -> None:
         while not ended.wait(0.1):
-            before = time.time_ns()
+            before, began = time.time_ns(), time.monotonic()
             deployments = self.api.list("Deployment")
             configurations = {each["metadata"]["name"]: each for each in self.api.list("ConfigMap")}
             pairs = {_vehicles(each) for each in deployments if each["metadata"]["name"].startswith("scene-recorder")}
@@ -75,7 +77,7 @@ class Observer:
                 if found is not None:
                     content = yaml.safe_load(found["data"]["sources.yaml"])
                     sources[content["place"]] = tuple(content["sources"])
-            self.seen.append(Seen((before - self.start_ns) / 1e9, frozenset(pairs), sources))
+            self.seen.append(Seen(before, time.monotonic() - began, frozenset(pairs), sources))
 
 
 def _vehicles(deployment: dict[str, Any]) -> tuple[str, ...]:
@@ -100,9 +102,12 @@ def apply_example(api: Api, namespace: str, endpoint: str) -> None:
             api.apply(document)
 
 
-def drive(endpoint: str, start_ns: int, *more: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, str(EXAMPLE / "drive.py"), "--connect", endpoint, "--start", str(start_ns)]
-    return subprocess.Popen([*command, "--seed", str(SEED), "--duration", str(DURATION), *more])
+def drive(endpoint: str, *more: str) -> str:
+    """Let the vehicles drive; what they say in the end."""
+    command = [sys.executable, str(EXAMPLE / "drive.py"), "--connect", endpoint, "--wait", f"{PATIENCE:g}"]
+    command += ["--seed", str(SEED), "--duration", str(DURATION), *more]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=DURATION + 2 * PATIENCE)
+    return done.stdout
 
 
 def test_the_deployments_over_time_are_those_that_the_positions_call_for(
@@ -118,17 +123,18 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
         "--output", str(live), "--record-intake", str(intake),
     )  # fmt: skip
     detector.wait_for_output("Detector town runs with 1 rules")
-    start_ns = time.time_ns() + 3_000_000_000
-    observer = Observer(api, start_ns)
+    observer = Observer(api)
     with observer.watching():
-        assert drive(endpoint, start_ns).wait(DURATION + 20) == 0
-        api.wait_list("Deployment", lambda found: not found, timeout=20, what="all applications are gone")
+        said = re.search(r"stamps from (\d+) ns, at most (\d+) ms late$", drive(endpoint).strip())
+        assert said is not None
+        api.wait_list("Deployment", lambda found: not found, what="all applications are gone")
     assert detector.terminate() == 0
 
     judge = episodes(simulate(SEED, DURATION), DURATION)
     assert len(judge) >= 4
-    assert_recorders(observer.seen, recorders(judge, LINGER))
-    assert_fusions(observer.seen, fusions(judge, LINGER))
+    seen = Moments(observer.seen, start_ns=int(said[1]), late_s=int(said[2]) / 1000)
+    assert_recorders(seen, recorders(judge, LINGER))
+    assert_fusions(seen, fusions(judge, LINGER))
     tasks = api.wait_list(
         "ApplicationTask",
         lambda found: all(task.get("status", {}).get("phase") == "Finished" for task in found),
@@ -138,48 +144,65 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
 
     replayed = tmp_path / "replayed"
     subprocess.run(
-        [sys.executable, "-m", "detector.cli", "replay", str(intake), "--output", str(replayed)], check=True, timeout=60
+        [sys.executable, "-m", "detector.cli", "replay", str(intake), "--output", str(replayed)],
+        check=True,
+        timeout=PATIENCE,
     )
     assert (replayed / "events.jsonl").read_bytes() == (live / "events.jsonl").read_bytes()
     assert len((live / "events.jsonl").read_text().splitlines()) == 2 * len(judge)
 
 
-def assert_recorders(seen: list[Seen], spans: dict[tuple[str, str], list[Any]]) -> None:
+@dataclass
+class Moments:
+    """What was seen, in seconds into the drive, and how late it may have been at most.
+
+    A machine that is slow is so for vehicles and observer too: by how much poses were sent late, and by how much
+    longer the API server takes, what comes of them may be late as well.
+    """
+
+    seen: list[Seen]
+    start_ns: int
+    late_s: float
+
+    @property
+    def allowed(self) -> float:
+        return EVALUATION + REACTION + self.late_s + REQUESTS * max(each.took_s for each in self.seen)
+
+    def __iter__(self) -> Iterator[tuple[float, Seen]]:
+        return (((each.since_ns - self.start_ns) / 1e9, each) for each in self.seen)
+
+
+def assert_recorders(seen: Moments, spans: dict[tuple[str, str], list[Any]]) -> None:
     """A recorder exists when its pair's span says so, give or take what is allowed, and at no other time."""
-    assert len(seen) > DURATION * 4, "the observer must have looked often enough to prove anything"
-    for moment in seen:
-        for pair in spans.keys() | moment.pairs:
+    assert len(seen.seen) > DURATION, "the observer must have looked often enough to prove anything"
+    assert {pair for _, moment in seen for pair in moment.pairs} == spans.keys()
+    allowed = seen.allowed
+    for at, moment in seen:
+        for pair, its in spans.items():
             exists = pair in moment.pairs
-            must = any(
-                span.start_s + ALLOWED <= moment.at <= (span.end_s or DURATION) - SAMPLING
-                for span in spans.get(pair, [])
-            )
-            may = any(
-                span.start_s - SAMPLING <= moment.at <= (span.end_s or DURATION) + ALLOWED
-                for span in spans.get(pair, [])
-            )
-            assert exists or not must, f"at {moment.at:.2f} s there is no recorder for {pair}: {spans.get(pair)}"
-            assert may or not exists, f"at {moment.at:.2f} s there is a recorder for {pair}: {spans.get(pair)}"
+            must = any(span.start_s + allowed <= at <= (span.end_s or DURATION) - SAMPLING for span in its)
+            may = any(span.start_s - SAMPLING <= at <= (span.end_s or DURATION) + allowed for span in its)
+            assert exists or not must, f"at {at:.2f} s (+ {allowed:.2f} s) there is no recorder for {pair}: {its}"
+            assert may or not exists, f"at {at:.2f} s (+ {allowed:.2f} s) there is a recorder for {pair}: {its}"
 
 
-def assert_fusions(seen: list[Seen], expected: dict[str, list[Any]]) -> None:
+def assert_fusions(seen: Moments, expected: dict[str, list[Any]]) -> None:
     """The sources at a place are at each moment those of some state that is due about then."""
     met = dict.fromkeys(expected, 0)
-    for moment in seen:
+    allowed = seen.allowed
+    for at, moment in seen:
         for place, states in expected.items():
             sources = moment.sources.get(place)
             due = {
                 tuple(state.sources)
                 for state in states
-                if state.start_s - SAMPLING <= moment.at <= (state.end_s or DURATION) + ALLOWED
+                if state.start_s - SAMPLING <= at <= (state.end_s or DURATION) + allowed
             }
-            settled = any(
-                state.start_s + ALLOWED <= moment.at <= (state.end_s or DURATION) - SAMPLING for state in states
-            )
+            settled = any(state.start_s + allowed <= at <= (state.end_s or DURATION) - SAMPLING for state in states)
             if sources is None:
-                assert not settled, f"at {moment.at:.2f} s there is no fusion at {place}: {states}"
+                assert not settled, f"at {at:.2f} s there is no fusion at {place}: {states}"
             else:
-                assert sources in due, f"at {moment.at:.2f} s the fusion at {place} has {sources}, due is {due}"
+                assert sources in due, f"at {at:.2f} s the fusion at {place} has {sources}, due is {due}"
                 met[place] += 1
     assert all(met.values()), f"each place must have been seen fused: {met}"
 
@@ -198,20 +221,20 @@ def test_with_clock_data_a_recording_gives_the_same_events_played_live_and_repla
     detector_file.write_text(yaml.safe_dump(document), encoding="utf-8")
     recording = tmp_path / "drive.mcap"
     start_ns = 1_767_225_600_000_000_000
-    assert drive(endpoint, start_ns, "--record", str(recording)).wait(60) == 0
+    drive(endpoint, "--start", str(start_ns), "--record", str(recording))
 
     files = ["--detector", str(detector_file), "--rules", str(EXAMPLE / "rules.yaml")]
     live, replayed = tmp_path / "live", tmp_path / "replayed"
     detector = processes.start("detector", "run", *files, "--output", str(live))
     detector.wait_for_output("Detector town runs with 1 rules")
-    assert drive(endpoint, start_ns).wait(DURATION + 30) == 0
+    drive(endpoint, "--start", str(start_ns))
     expected = 2 * len(episodes(simulate(SEED, DURATION), DURATION))
-    wait_until(lambda: len(events_of(live)), lambda count: count >= expected, timeout=20, what="all events are there")
+    wait_until(lambda: len(events_of(live)), lambda count: count >= expected, what="all events are there")
     assert detector.terminate() == 0
     subprocess.run(
         [sys.executable, "-m", "detector.cli", "replay", str(recording), *files, "--output", str(replayed)],
         check=True,
-        timeout=60,
+        timeout=PATIENCE,
     )
     assert events_of(replayed) == events_of(live)
     assert len(events_of(live)) == expected

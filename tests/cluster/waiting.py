@@ -9,6 +9,10 @@ from typing import TypeVar
 
 State = TypeVar("State")
 
+PATIENCE = 120.0
+"""Seconds for what a test waits for but says nothing about the speed of. A test that passes does not wait for them, and
+a machine that is many times slower than usual still passes."""
+
 INTERVAL = 0.05  # s between two looks: short beside what is waited for, long beside one request
 
 
@@ -16,7 +20,7 @@ def wait_until(
     read: Callable[[], State],
     holds: Callable[[State], bool],
     *,
-    timeout: float,
+    timeout: float = PATIENCE,
     what: str,
     transient: tuple[type[Exception], ...] = (),
     diagnose: Callable[[], str] | None = None,
