@@ -8,6 +8,7 @@ come from discovery, so CRDs need nothing more.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +19,15 @@ import urllib3
 from kubernetes.client import ApiClient, Configuration
 from kubernetes.config import load_kube_config
 
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import INTERVAL, PATIENCE, wait_until
 
 Object = dict[str, Any]  # a Kubernetes object, as JSON
 Objects = list[Object]
 FIELD_MANAGER = "test"
 REQUEST_TIMEOUT = 60.0  # s
+
+COME_BACK = frozenset({429, 503})
+"""Nothing was done, and may be soon: a fresh API server answers so while it reads what its storage has of a kind."""
 
 MERGE_PATCH = "application/merge-patch+json"
 JSON_PATCH = "application/json-patch+json"
@@ -250,6 +254,17 @@ class Api:
         content_type: str = "application/json",
         accept: str = "application/json",
     ) -> str:
+        """Return the answer's body; ask again where the answer is to come back later."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                return self._ask(method, path, body, content_type, accept)
+            except ApiError as error:
+                if error.code not in COME_BACK or time.monotonic() >= deadline:
+                    raise
+            time.sleep(INTERVAL)
+
+    def _ask(self, method: str, path: str, body: Object | Objects | None, content_type: str, accept: str) -> str:
         headers = {"Accept": accept, "Content-Type": content_type, "Authorization": self._authorization}
         sent = json.dumps(body) if body is not None and content_type == APPLY_PATCH else body
         url = self._client.configuration.host + path

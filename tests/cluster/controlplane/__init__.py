@@ -28,9 +28,9 @@ from tests.cluster.controlplane import commands
 from tests.cluster.controlplane.kubeconfig import new_token, write_kubeconfig
 from tests.cluster.controlplane.ports import free_ports
 from tests.cluster.crds import apply_crds
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 
-READY_TIMEOUT = 60.0  # s, for each program; a loaded machine takes ten times the usual 2 s
+READY_TIMEOUT = PATIENCE  # for each program; a loaded machine takes ten times the usual 2 s
 
 
 class ControlPlane:
