@@ -59,7 +59,7 @@ def publisher(port: int, tls: str | None = None) -> Iterator[Client]:
         client.tls_set(tls)
     client.connect("localhost", port)
     client.loop_start()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while not client.is_connected():
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -17,6 +17,9 @@ import zenoh
 from detector.streams.zenoh import Put
 from wayside.api.stream import Encoding, Stream
 
+PATIENCE = 60.0
+"""Seconds for what a test waits for but says nothing about the speed of: a test that passes does not wait for them."""
+
 
 class Arrivals:
     """What the streams took in, to be waited for."""
@@ -35,7 +38,7 @@ class Arrivals:
 
     def wait_for(self, done: Callable[[list[tuple[str, str, bytes]]], bool]) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: done(self.seen), timeout=10), self.seen
+            assert self._changed.wait_for(lambda: done(self.seen), timeout=PATIENCE), self.seen
 
 
 def stream(name: str = "pose", key: str = "vehicles/${client:*}/pose", **fields: Any) -> Stream:
@@ -89,7 +92,7 @@ def router_process(endpoint: str) -> Iterator[None]:
         process.wait()
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 10) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline

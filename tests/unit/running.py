@@ -44,7 +44,9 @@ class Process:
         self.name = "d"
 
     def write(self, *rules: Kind, streams: tuple[dict[str, Any], ...] = (), **spec: Any) -> None:
-        detector = a_detector(*streams, zenoh={"listen": [self.endpoint]}, **spec)
+        # However slowly all goes, no sample leaves its window and no client is lost.
+        lasting = {"buffer": {"duration": "5m"}, "clientTimeout": "5m"}
+        detector = a_detector(*streams, zenoh={"listen": [self.endpoint]}, **{**lasting, **spec})
         (self.folder / "detector.yaml").write_text(json.dumps(detector.to_json()))
         (self.folder / "rules.yaml").write_text("\n---\n".join(json.dumps(rule.to_json()) for rule in rules))
 
@@ -76,8 +78,9 @@ class Process:
         end, status = time.monotonic() + PATIENCE, None
         while time.monotonic() < end:
             try:
-                (answer,) = ask(self.network, self.name, "status", {}, 1)
+                (answer,) = ask(self.network, self.name, "status", {}, 5)
             except (NoAnswerError, ValueError):  # it is just starting
+                time.sleep(0.05)
                 continue
             status = read_status(answer.payload)
             if true(status):

@@ -17,7 +17,7 @@ from detector.sources.supervision import SourceThread, State
 from detector.streams.codecs import CdrDecoder
 from detector.streams.tally import Tally
 from tests.unit.driving import a_detector
-from tests.unit.networks import Arrivals, stream, wait_for
+from tests.unit.networks import PATIENCE, Arrivals, stream, wait_for
 from wayside.api.source import DataSource
 from wayside.api.stream import Encoding, Stream
 
@@ -137,7 +137,7 @@ def test_a_bag_is_played_again_and_again_until_it_is_stopped(bag: Path) -> None:
     thread = playing(arrivals, Tally(), paths=[str(bag)], rate=1000, loop=True)
     arrivals.wait_for(lambda seen: len(seen) > 25)
     thread.tell_to_stop()
-    thread.join(2)
+    thread.join(PATIENCE)
     assert thread.state is State.STOPPED
 
 
@@ -149,11 +149,9 @@ def test_stopping_does_not_wait_for_a_pause_in_the_recording(tmp_path: Path) -> 
     arrivals = Arrivals()
     thread = playing(arrivals, Tally(), of=stream(source="recording"), paths=[str(path)])
     arrivals.wait_for(lambda seen: len(seen) == 1)
-    start = time.monotonic()
     thread.tell_to_stop()
-    thread.join(2)
+    thread.join(PATIENCE)  # far less than the pause
     assert thread.state is State.STOPPED
-    assert time.monotonic() - start < 1
 
 
 def test_a_recording_that_is_not_there_is_waited_for(bag: Path, tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from rosbags.highlevel import AnyReader
 from application_manager.core.policy import Policy
 from application_manager.core.rendering import Renderer
 from tests.unit.manager_objects import instance
+from tests.unit.networks import PATIENCE
 from wayside.api import ApplicationTemplate, Detector, EventRule, Kind
 from wayside.api.documents import load_documents
 from wayside.rules import compile_rule
@@ -331,7 +332,7 @@ def test_what_arrives_over_zenoh_is_the_drive_byte_for_byte() -> None:
     with listening(endpoint) as session:
         subscriber = session.declare_subscriber("vehicles/**", take)
         published = publish(drive, 1.0, connect=[endpoint], start_ns=START_NS, speed=4.0)
-        done.get(timeout=10)
+        done.get(timeout=PATIENCE)
         subscriber.undeclare()
     assert published.complete
     assert published.listened
@@ -354,9 +355,9 @@ def test_sigterm_ends_the_drive_in_good_order() -> None:
         subscriber = session.declare_subscriber("vehicles/*/pose", lambda _: first.put(None))
         command = [sys.executable, str(EXAMPLE / "drive.py"), "--connect", endpoint, "--duration", "60"]
         drive = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        first.get(timeout=30)
+        first.get(timeout=PATIENCE)
         drive.send_signal(signal.SIGTERM)
-        out, errors = drive.communicate(timeout=5)
+        out, errors = drive.communicate(timeout=PATIENCE)
         subscriber.undeclare()
     assert (drive.returncode, errors) == (0, "")
     assert out.count("\n") == 1

@@ -49,7 +49,7 @@ async def reconciling(folder: Path, interval: float = 0.02, **options: Any) -> A
 
 async def eventually(holds: Callable[[], bool], what: str) -> None:
     try:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while not holds():  # noqa: ASYNC110  files tell nobody that they changed
                 await asyncio.sleep(0.005)
     except TimeoutError:

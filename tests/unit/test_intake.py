@@ -132,9 +132,9 @@ def test_what_should_not_be_dropped_waits_until_there_is_room_but_not_for_ever()
     put([("k", b"first")])
     put([("k", b"given up")])
     assert intake.dropped == 1
-    patient = intake.patient_putter("tokens", patience=10)
+    patient = intake.patient_putter("tokens", patience=60)
     waiting = threading.Thread(target=patient, args=([("k", b"second")],))
     waiting.start()
     assert [arrival.payload for arrival in intake.drain(2)] == [b"first"]
-    waiting.join(5)
+    waiting.join(60)
     assert [arrival.payload for arrival in intake.drain(3)] == [b"second"]

@@ -11,7 +11,7 @@ from detector.assembly import DetectorError, inlets
 from detector.streams.tally import Cause, Tally
 from detector.streams.zenoh import Network
 from tests.unit.driving import a_detector, a_stream
-from tests.unit.networks import Arrivals, free_endpoint, router, stream, wait_for
+from tests.unit.networks import PATIENCE, Arrivals, free_endpoint, router, stream, wait_for
 from wayside.api.base import PositiveDuration
 from wayside.api.stream import History, Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -82,7 +82,7 @@ def test_samples_lost_on_the_way_are_counted_or_asked_for_again(endpoint: str, a
         config.insert_json5("connect/endpoints", f'["{endpoint}"]')
         with zenoh.open(config) as vehicle:
             publisher = remembering(vehicle)
-            deadline, number = time.monotonic() + 10, 0
+            deadline, number = time.monotonic() + PATIENCE, 0
             while not tally.entries():
                 assert time.monotonic() < deadline
                 publisher.put(str(number))

@@ -18,7 +18,7 @@ from application_manager.workqueue import WorkQueue
 async def running(*queues: WorkQueue[str]) -> AsyncIterator[None]:
     tasks = [asyncio.create_task(queue.run()) for queue in queues]
     try:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             yield
     finally:
         for task in tasks:

@@ -394,4 +394,4 @@ def test_many_definitions_are_taken_in_quickly() -> None:
     many = tuple(Definition(f"a_msgs/msg/N{n}", f"N{n + 1} one\nN{n + 1} two") for n in range(50))
     begin = time.monotonic()
     types_with((*many, Definition("a_msgs/msg/N50", "int8 x")))
-    assert time.monotonic() - begin < 10
+    assert time.monotonic() - begin < 60

@@ -14,7 +14,7 @@ from detector.sources.supervision import SourceThread, State
 from detector.streams.tally import Cause, Tally
 from tests.unit.certificates import Authority
 from tests.unit.mqtt_broker import PASSWORD, broker, publisher
-from tests.unit.networks import Arrivals, free_port, stream, wait_for
+from tests.unit.networks import PATIENCE, Arrivals, free_port, stream, wait_for
 from wayside.api.source import DataSource
 
 
@@ -41,13 +41,13 @@ def mqtt(
         yield thread
     finally:
         thread.tell_to_stop()
-        thread.join(2)
+        thread.join(PATIENCE)
     assert thread.state is State.STOPPED
 
 
 def publish_until(client: Client, topic: str, done: Callable[[], object]) -> None:
     """The first messages may be sent before the subscription is there."""
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE
     while not done():
         assert time.monotonic() < deadline
         client.publish(topic, b"{}")
@@ -113,7 +113,7 @@ def test_with_a_client_id_the_broker_keeps_messages_while_the_detector_is_away(
     with broker(port, guarded=True), publisher(port) as client:  # this broker keeps nothing for who has no name
         with mqtt(arrivals, Tally(), **given):
             publish_until(client, "vehicles/car1/pose", lambda: arrivals.seen)
-        client.publish("vehicles/car1/pose", b"meanwhile", qos=1).wait_for_publish(5)
+        client.publish("vehicles/car1/pose", b"meanwhile", qos=1).wait_for_publish(PATIENCE)
         with mqtt(arrivals, Tally(), **given):
             arrivals.wait_for(lambda seen: seen[-1][2] == b"meanwhile")
 

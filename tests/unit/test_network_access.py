@@ -23,7 +23,7 @@ from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
 from tests.unit.certificates import Authority
 from tests.unit.driving import a_detector
-from tests.unit.networks import Arrivals, free_endpoint, router, router_process, stream, wait_for
+from tests.unit.networks import PATIENCE, Arrivals, free_endpoint, router, router_process, stream, wait_for
 from wayside.api.access import Access
 from wayside.api.zenoh import Zenoh, ZenohMode
 
@@ -66,7 +66,7 @@ def network(arrivals: Arrivals, **config: Any) -> Iterator[Network]:
         running.close()
 
 
-def flows(source: zenoh.Session, arrivals: Arrivals, payload: Any = "x", within: float = 10) -> bool:
+def flows(source: zenoh.Session, arrivals: Arrivals, payload: Any = "x", within: float = PATIENCE) -> bool:
     """Whether what is put arrives."""
     deadline = time.monotonic() + within
     while not arrivals.seen:
@@ -117,7 +117,7 @@ def test_with_mtls_only_who_has_a_certificate_comes_in(
         own = {"ca": str(authority.ca), "certificate": str(certificate), "key": str(key)}
         with network(arrivals, mode="client", connect=[at], tls=own) as welcome:
             assert flows(source, arrivals)
-            assert welcome.connected
+            wait_for(lambda: welcome.connected)
 
 
 def test_a_peer_listens_with_tls_and_asks_for_certificates(
@@ -186,7 +186,7 @@ def test_access_control_of_the_router_decides_what_is_seen(endpoint: str, arriva
         router(listen__endpoints=[endpoint], access_control=rules) as source,
         network(arrivals, mode="client", connect=[endpoint]),
     ):
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE
         while not arrivals.seen and time.monotonic() < deadline:
             source.put("vehicles/car1/pose", "closed")
             source.put("vehicles/car2/pose", "open")
@@ -227,7 +227,7 @@ def test_a_killed_router_is_said_and_so_is_its_return(
             vehicle = open_session(client)
             token = vehicle.liveliness().declare_token("alive/car1")
             assert flows(vehicle, arrivals)
-            assert running.connected
+            wait_for(lambda: running.connected)
             arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", Token.DECLARED.value) in seen)
         wait_for(lambda: not running.connected)
         wait_for(lambda: "is lost, nobody is connected" in caplog.text)
@@ -237,7 +237,7 @@ def test_a_killed_router_is_said_and_so_is_its_return(
             arrivals.wait_for(lambda seen: seen == [(LIVELINESS, "alive/car1", Token.DECLARED.value)])
             arrivals.seen.clear()
             assert flows(vehicle, arrivals)
-            assert running.connected
+            wait_for(lambda: running.connected)
             wait_for(lambda: "connected again" in caplog.text)
         token.undeclare()
         vehicle.close()

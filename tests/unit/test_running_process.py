@@ -14,9 +14,9 @@ import pytest
 from detector.status.model import RuleState, read_status
 from detector.streams.asking import NoAnswerError, ask
 from tests.unit.driving import a_rule, a_stream
-from tests.unit.running import Process
+from tests.unit.running import PATIENCE, Process
 
-SPEED = {"name": "v", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "8s"}
+SPEED = {"name": "v", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "5m"}
 FAST = a_rule("fast", signals=[SPEED], when="v > 10", evaluation={"every": "100ms"})
 
 
@@ -44,12 +44,12 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
     assert [client.name for client in status.clients] == ["car1", "car2"]
     metrics = process.metrics()
     assert metrics["stream_samples_total", "speed"] == 101
-    (answer,) = ask(process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "2"}, 5)
+    (answer,) = ask(process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "30"}, PATIENCE)
     told = read_status(answer.payload).explanation
     assert told is not None
     assert [(each.subject, each.when, each.values) for each in told.subjects] == [("car2", False, {"v": 1.0})]
     with pytest.raises(NoAnswerError, match="detector d has no rule slow; it has fast"):
-        ask(process.network, "d", "status", {"rule": "slow"}, 5)
+        ask(process.network, "d", "status", {"rule": "slow"}, PATIENCE)
     assert metrics["rule_episodes_open", "fast"] == 1
     assert metrics["process_resident_memory_bytes",] > 0
     assert "looked" in process.page("/healthz")
@@ -86,7 +86,7 @@ def test_rules_and_streams_change_without_losing_buffer_or_episodes(process: Pro
     before = process.status_when(lambda s: bool(s.rules[0].open))
     slow = a_rule("slow", signals=[SPEED], when="v > 15", evaluation={"every": "100ms"})
     more = (a_stream("speed"), a_stream("pose"), a_stream("more"))
-    process.change(FAST, slow, streams=more, clientTimeout="20s")
+    process.change(FAST, slow, streams=more, clientTimeout="6m")
     # The new rule's window reaches back to the sample that came before there was such a rule.
     after = process.status_when(lambda s: len(s.rules) == 2 and bool(s.rules[1].open))
     assert [stream.name for stream in after.streams] == ["speed", "pose", "more"]

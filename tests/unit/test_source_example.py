@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.networks import free_port, wait_for
+from tests.unit.networks import PATIENCE, free_port, wait_for
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "source-plugin"
@@ -69,9 +69,9 @@ def test_the_detector_runs_it(environment: Mapping[str, str], tmp_path: Path) ->
                     time.sleep(0.05)
                 return events.exists() and "north" in events.read_text()
 
-            wait_for(started, seconds=30)
+            wait_for(started)
         running.send_signal(signal.SIGTERM)
-        _, log = running.communicate(timeout=10)
+        _, log = running.communicate(timeout=PATIENCE)
     finally:
         running.kill()
         running.wait()

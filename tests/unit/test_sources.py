@@ -22,7 +22,7 @@ from detector.sources.registry import OFFERS, plugin_problems
 from detector.sources.supervision import Sources, SourceThread, State
 from detector.streams.tally import Cause, Tally
 from tests.unit.driving import a_detector, a_stream
-from tests.unit.networks import Arrivals, stream, wait_for
+from tests.unit.networks import PATIENCE, Arrivals, stream, wait_for
 from wayside.api import Detector
 from wayside.api.source import DataSource
 
@@ -72,7 +72,7 @@ class Hanging(Once):
     ended = threading.Event()
 
     def run(self, feed: Feed) -> None:
-        self.ended.wait(30)
+        self.ended.wait(PATIENCE)
         feed.put("vehicles/car1/pose", b"late")
 
 
@@ -137,7 +137,7 @@ def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, a
 
     wait_for(lambda: failures() >= 3)
     thread.tell_to_stop()
-    thread.join(5)
+    thread.join(PATIENCE)
     assert thread.state is State.STOPPED
     assert thread.last_error == error
     assert len(arrivals.seen) in ((0,) if plugin == "leaving" else (failures(), failures() + 1))

@@ -32,7 +32,7 @@ from tests.unit.driving import Drive, a_deploy, a_detector, a_rule, arrival, at
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
-PATIENCE = 30.0  # s
+PATIENCE = 60.0  # s
 
 
 def speeding(**spec: Any) -> Any:

@@ -124,10 +124,10 @@ def test_what_is_asked_of_the_evaluation_is_done_on_its_thread_and_errors_are_th
     )
     early = evaluator.call(lambda: drive.engine.now)
     evaluator._thread.start()
-    assert early.result(5) == drive.engine.now
+    assert early.result(60) == drive.engine.now
     with pytest.raises(ZeroDivisionError):
-        evaluator.call(lambda: 1 // 0).result(5)
-    assert evaluator.call(lambda: "goes on").result(5) == "goes on"
+        evaluator.call(lambda: 1 // 0).result(60)
+    assert evaluator.call(lambda: "goes on").result(60) == "goes on"
     evaluator.stop()
     assert evaluator.call(lambda: "too late").cancelled()
     assert failures == []
@@ -160,11 +160,11 @@ def answering(endpoint: str) -> Iterator[None]:
 def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoint: str) -> None:
     config = Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])
     for holder in ("d", "*"):
-        (answer,) = ask(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 5)
+        (answer,) = ask(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 30)
         assert answer.key == "wayside/detectors/d/status"
         assert b"'rule': 'r', 'subject': 'a+b~c'" in answer.payload
     with pytest.raises(NoAnswerError, match="does not answer 'nonsense'"):
-        ask(config, "d", "nonsense", {}, 5)
+        ask(config, "d", "nonsense", {}, 30)
     with pytest.raises(NoAnswerError, match=r"no detector other answers at tcp/.* within 0.5 s: is it running"):
         ask(config, "other", "status", {}, 0.5)
 
@@ -173,7 +173,7 @@ def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoi
 def test_the_detectors_file_tells_where_it_listens(endpoint: str, tmp_path: Path) -> None:
     file = tmp_path / "detector.yaml"
     file.write_text(a_detector(zenoh={"listen": [endpoint]}).model_dump_json(by_alias=True, exclude_none=True))
-    (answer,) = inquire("status", {}, file, None, None, 5)
+    (answer,) = inquire("status", {}, file, None, None, 30)
     assert answer.key == "wayside/detectors/d/status"
 
 

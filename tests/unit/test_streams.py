@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
-from tests.unit.networks import Arrivals, free_endpoint, stream
+from tests.unit.networks import PATIENCE, Arrivals, free_endpoint, stream, wait_for
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 
@@ -74,18 +74,18 @@ def test_data_flows_once_the_router_exists_and_again_after_it_was_away(
     assert not network.connected
     for text in (b"first", b"second"):
         with session("router", listen=endpoint) as router:
-            deadline = time.monotonic() + 15
+            deadline = time.monotonic() + PATIENCE
             while not any(payload == text for _, _, payload in arrivals.seen):
                 assert time.monotonic() < deadline, "nothing arrived"
                 router.put("vehicles/car1/pose", text)
-            assert network.connected
+            wait_for(lambda: network.connected)
     network.close()
 
 
 def test_events_are_published_with_their_encoding(listening: Network, endpoint: str) -> None:
     with session("client", connect=endpoint) as listener:
         subscriber = listener.declare_subscriber("wayside/events/**")
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE
         while (event := subscriber.try_recv()) is None:  # the first ones may go out before the subscription is known
             assert time.monotonic() < deadline
             listening.publish("wayside/events/det/rule/car1+car2", b"{}")
@@ -111,7 +111,7 @@ def test_closing_while_no_router_answers_is_prompt(endpoint: str, arrivals: Arri
     network.start()
     start = time.monotonic()
     network.close()
-    assert time.monotonic() - start < 1.5
+    assert time.monotonic() - start < 5
 
 
 def test_an_endpoint_that_cannot_be_listened_on_is_an_error_that_names_it(arrivals: Arrivals) -> None:
