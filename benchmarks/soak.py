@@ -32,10 +32,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import onnx
 import zenoh
-from onnx import TensorProto, helper, numpy_helper
 from prometheus_client.parser import text_string_to_metric_families
 
 from benchmarks.soaking.judging import (
@@ -47,7 +44,19 @@ from benchmarks.soaking.judging import (
     look_at_rules,
     look_at_streams,
 )
-from benchmarks.soaking.traffic import EXAMPLE, FLUSH, START, Sent, traffic
+from benchmarks.soaking.traffic import (
+    EXAMPLE,
+    FLUSH,
+    LATENESS,
+    OVER_MQTT,
+    SIDE,
+    START,
+    VEHICLES,
+    Sent,
+    traffic,
+)
+from tests.unit.mqtt_broker import broker, publisher
+from tests.unit.onnx_models import mean_of, weighted
 
 SOAKING = Path(__file__).parent / "soaking"
 SEED = 3528
@@ -64,15 +73,21 @@ AHEAD = 90.0
 class Detector:
     """The process under test, and its metrics over time."""
 
-    def __init__(self, folder: Path, record: bool) -> None:
+    def __init__(self, folder: Path, broker_port: int, record: bool) -> None:
         self.folder = folder
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.port = free_port()
         self.series: list[tuple[float, float, float]] = []
         """Seconds of the wall, seconds of the data evaluated, bytes of memory."""
         detector = (SOAKING / "detector.yaml").read_text().replace("ENDPOINT", self.endpoint)
-        (folder / "detector.yaml").write_text(detector)
-        rules = (SOAKING / "rules.yaml").read_text().replace("MODEL", str(a_model(folder / "smooth.onnx")))
+        (folder / "detector.yaml").write_text(detector.replace("MQTT_PORT", str(broker_port)))
+        rules = (SOAKING / "rules.yaml").read_text()
+        for place, model in (
+            ("CAMERA_MODEL", mean_of(folder / "camera.onnx", [1, SIDE, SIDE])),
+            ("LIDAR_MODEL", mean_of(folder / "lidar.onnx", [64, 3])),
+            ("MODEL", weighted(folder / "smooth.onnx", [0.1] * 10)),
+        ):
+            rules = rules.replace(place, str(model))
         (folder / "rules.yaml").write_text(rules)
         self.files = ["--detector", "detector.yaml", "--rules", "rules.yaml", "--rules", str(EXAMPLE / "rules.yaml")]
         recording = ["--record-intake", "intake.mcap"] if record else []
@@ -160,18 +175,20 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if options.output is None else options.output.resolve()
         folder.mkdir(parents=True, exist_ok=True)
-        sys.exit(soak(folder, options.minutes * 60, options.speed, options.replay))
+        port = free_port()
+        with broker(port):
+            sys.exit(soak(folder, port, options.minutes * 60, options.speed, options.replay))
 
 
-def soak(folder: Path, seconds: int, speed: float, replay: bool) -> int:
-    detector = Detector(folder, replay)
+def soak(folder: Path, broker_port: int, seconds: int, speed: float, replay: bool) -> int:
+    detector = Detector(folder, broker_port, replay)
     detector.await_start()
     sent = Sent()
     begun = time.monotonic()
     try:
-        asked = send(detector, seconds, speed, sent)
+        asked = send(detector, broker_port, seconds, speed, sent)
         wall = time.monotonic() - begun
-        metrics = detector.rest(seconds + FLUSH - 6)  # lateness is 5 s
+        metrics = detector.rest(seconds + FLUSH - LATENESS - 1)
     finally:
         code = detector.end()
     total = sum(sent.samples.values())
@@ -192,10 +209,11 @@ def soak(folder: Path, seconds: int, speed: float, replay: bool) -> int:
     return 1 if verdict.wrong else 0
 
 
-def send(detector: Detector, seconds: int, speed: float, sent: Sent) -> int:
+def send(detector: Detector, broker_port: int, seconds: int, speed: float, sent: Sent) -> int:
     """Publish the traffic, at most so much faster than it happens, and never far ahead of the evaluation.
 
-    Once a minute the rule on-demand is asked; returns how often it answered.
+    Once a minute the rule on-demand is asked, and the token of a vehicle is withdrawn for a moment. Returns how often
+    the rule answered.
     """
     asked, answered = 0, 0
     config = zenoh.Config()
@@ -205,8 +223,9 @@ def send(detector: Detector, seconds: int, speed: float, sent: Sent) -> int:
         ("scouting/multicast/enabled", "false"),
     ):
         config.insert_json5(key, value)
-    with zenoh.open(config) as session:
+    with zenoh.open(config) as session, publisher(broker_port) as over_mqtt:
         publishers: dict[str, Any] = {}
+        tokens = {vehicle.name: Token(session, vehicle.name) for vehicle in VEHICLES}
         begun, told = time.monotonic(), time.monotonic()
         for after, key, payload in traffic(SEED, START, seconds, sent):
             due = begun + after / 1e9 / speed
@@ -214,15 +233,17 @@ def send(detector: Detector, seconds: int, speed: float, sent: Sent) -> int:
                 if detector.process.poll() is not None:
                     sys.exit(f"the detector ended:\n{(detector.folder / 'log').read_text()[-2000:]}")
                 time.sleep(min(max(early, 0.005), 0.1))
-            publisher = publishers.get(key)
-            if publisher is None:
-                publisher = publishers[key] = session.declare_publisher(
-                    key, congestion_control=zenoh.CongestionControl.BLOCK
-                )
-            publisher.put(payload)
+            if key.endswith(OVER_MQTT):
+                over_mqtt.publish(key, payload, qos=1)
+            else:
+                if key not in publishers:
+                    publishers[key] = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+                publishers[key].put(payload)
+            tokens[VEHICLES[0].name].keep()
             if after >= asked * 60 * 10**9 + 30 * 10**9:
                 asked += 1
                 question = "wayside/detectors/soak/evaluate?rule=on-demand"
+                tokens[VEHICLES[0].name].withdraw()
                 answered += sum(reply.ok is not None for reply in session.get(question, timeout=30))
             if time.monotonic() - told > 15:
                 told = time.monotonic()
@@ -232,23 +253,28 @@ def send(detector: Detector, seconds: int, speed: float, sent: Sent) -> int:
     return answered
 
 
+class Token:
+    """A vehicle's liveliness token."""
+
+    def __init__(self, session: zenoh.Session, client: str) -> None:
+        self._declare = lambda: session.liveliness().declare_token(f"alive/{client}")
+        self._token: zenoh.LivelinessToken | None = self._declare()
+        self._withdrawn = 0.0
+
+    def withdraw(self) -> None:
+        if self._token is not None:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
+            self._token, self._withdrawn = None, time.monotonic()
+
+    def keep(self) -> None:
+        """Declare it again, a second after it was withdrawn."""
+        if self._token is None and time.monotonic() - self._withdrawn > 1.0:
+            self._token = self._declare()
+
+
 def environment() -> dict[str, str]:
     """With which our own modules are found."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
-
-
-def a_model(path: Path) -> Path:
-    """The mean of ten values."""
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["x", "w"], ["y"])],
-        "mean",
-        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 10])],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, ["n", 1])],
-        [numpy_helper.from_array(np.full((10, 1), 0.1, np.float32), "w")],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    onnx.save(model, path)
-    return path
 
 
 def free_port() -> int:

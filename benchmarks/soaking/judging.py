@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from benchmarks.soaking.traffic import EXAMPLE, FLUSH, START, Sent
+from benchmarks.soaking.traffic import EXAMPLE, FLUSH, LATENESS, OVER_MQTT, START, Sent
 
 GROWTH, SLACK = 0.02, 3 * 2**20
 """How much memory may differ between the second sixth and the last, for noise: this share, or these bytes."""
@@ -71,10 +71,10 @@ def look_at_drops(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
 
 def look_at_streams(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
     buffered = 0.0
-    for stream in ("pose", "points", "telemetry", "status"):
+    for stream in ("pose", "points", "telemetry", "status", OVER_MQTT, "camera"):
         verdict.equal(f"samples of {stream}", metrics["stream_samples_total", stream], sent.samples[stream])
         verdict.true(f"{stream} has latencies", metrics["stream_latency_seconds_count", stream] > 0)
-        verdict.equal(f"age of {stream}", metrics["stream_age_seconds", stream], FLUSH - 5, 2)
+        verdict.equal(f"age of {stream}", metrics["stream_age_seconds", stream], FLUSH - LATENESS, 2)
         verdict.true(f"{stream} is buffered", metrics["stream_buffered_samples", stream] > 0)
     for key, value in metrics.items():
         buffered += value if key[0] == "stream_buffered_bytes" else 0
@@ -87,9 +87,12 @@ def look_at_streams(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
 def look_at_rules(verdict: Verdict, metrics: Metrics, folder: Path, seconds: int, sent: Sent, asked: int) -> None:
     started: Counter[str] = Counter()
     ended: Counter[str] = Counter()
+    lost = 0
     for line in (folder / "out" / "events.jsonl").read_text().splitlines():
         event = json.loads(line)
         (started if event["type"].endswith("started") else ended)[event["data"]["rule"]] += 1
+        lost += event["data"].get("reason") == "ClientLost"
+    verdict.true("episodes ended with a vehicle's token", lost > 0 or seconds < 600)
     documents = [
         *yaml.safe_load_all((folder / "rules.yaml").read_text()),
         *yaml.safe_load_all((EXAMPLE / "rules.yaml").read_text()),

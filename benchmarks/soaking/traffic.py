@@ -11,9 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cbor2
+import numpy as np
 from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
+from rosbags.typesys import Stores, get_typestore
 
 DENM = DENM_PDU_Descriptions.DENM
+
+_TYPES = get_typestore(Stores.ROS2_HUMBLE)
+_IMAGE, _HEADER, _TIME = (
+    _TYPES.types[name] for name in ("sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+)
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no package
@@ -34,8 +41,20 @@ ITS_EPOCH = 1_072_915_200_000 - 5_000
 BAD_EVERY = 60 * 10**9
 """Of each kind of bad sample there is one in so many nanoseconds."""
 
-FLUSH = 15
+LATENESS = 10
+"""Seconds: what the Detector says."""
+
+FLUSH = 20
 """Seconds that the clock goes on alone, so that everything before has been evaluated."""
+
+CAMERAS = 2
+"""So many vehicles have a camera."""
+
+SIDE = 8
+"""Pixels of an image's side."""
+
+OVER_MQTT = "mileage"
+"""The stream that comes over MQTT."""
 
 
 @dataclass
@@ -93,7 +112,26 @@ def _telemetry(start_ns: int) -> Iterator[tuple[int, str, bytes]]:
                 battery = 50 + 45 * math.sin(after / 60e9 + number)
                 status = {"t": (start_ns + after) / 1e9, "battery": battery}
                 yield after, f"vehicles/{vehicle.name}/status", cbor2.dumps(status)
+                mileage = {"t": (start_ns + after) / 1e9, "km": after / 1e11 + number}
+                yield after, f"vehicles/{vehicle.name}/{OVER_MQTT}", json.dumps(mileage).encode()
+                if number < CAMERAS:
+                    yield after, f"vehicles/{vehicle.name}/camera", _image(start_ns + after)
         step += 1
+
+
+def _image(now: int) -> bytes:
+    """For twenty seconds of each minute it is white, else black."""
+    brightness = 255 if now % (60 * 10**9) < 20 * 10**9 else 0
+    image = _IMAGE(
+        header=_HEADER(stamp=_TIME(sec=now // 10**9, nanosec=now % 10**9), frame_id="camera"),
+        height=SIDE,
+        width=SIDE,
+        encoding="mono8",
+        is_bigendian=0,
+        step=SIDE,
+        data=np.full(SIDE * SIDE, brightness, np.uint8),
+    )
+    return bytes(_TYPES.serialize_cdr(image, _IMAGE.__msgtype__))
 
 
 def _warning(now: int, number: int) -> bytes:
