@@ -115,6 +115,7 @@ class Destination:
             age = self._limits.age
             if age is None:
                 return []
+            self._scan()
             horizon = time.time() - age.seconds
             return [self._drop(each) for each in [*self._kept] if each.ended < horizon]
 
@@ -131,7 +132,7 @@ class Destination:
         if files > 0 and limits.files is not None and total > limits.files:
             return f"there would be more than {limits.files} files (spec.recordings.files)"
         if size > 0 and self._free() - self._ahead - size < limits.reserve.bytes:
-            return f"less than spec.recordings.reserve ({limits.reserve}) of the disk would be free"
+            return f"the disk would have less than {limits.reserve} left free (spec.recordings.reserve)"
         return ""
 
     def _free(self) -> int:

@@ -78,6 +78,13 @@ class Folder:
         if gone:
             self._dropped(gone)
 
+    def use_room(self) -> None:
+        """Gives back the room that was kept: to be called before the recording is completed. Raises OSError."""
+        room = self.path / _ROOM
+        if room.exists():
+            room.unlink()
+            self.claim(-_ROOM_BYTES, 0)
+
     def describe(self, told: Mapping[str, Any]) -> None:
         """Writes the description. Raises OSError."""
         _write(self.path / DESCRIPTION, json.dumps(told, ensure_ascii=False, indent=1))
@@ -92,7 +99,6 @@ class Folder:
 
     def publish(self, parts: Sequence[Part], told: Mapping[str, Any]) -> Kept:
         """Gives the folder its final name, once the disk has everything. Raises OSError: then it is as it was."""
-        (self.path / _ROOM).unlink(missing_ok=True)
         _write(self.path / "metadata.yaml", metadata_yaml(parts, as_text(told)))
         self.describe(told)
         os.fsync(self._lock)

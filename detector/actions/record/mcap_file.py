@@ -22,7 +22,7 @@ from detector.actions.record.compressing import Compress, Pieces
 from detector.actions.record.mcap_contents import LIBRARY, MAGIC, Contents, packed, packed_message_indexes
 
 _CHUNK = 2**20
-"""A chunk is written when it holds so many bytes."""
+"""A chunk holds about so many bytes at most, or one message."""
 _APART = 2**15
 """A payload of so many bytes stays where it is; smaller ones are copied side by side."""
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -103,6 +103,12 @@ class McapFile:
     def add(self, channel: int, sequence: int, log_time: int, publish_time: int, payload: bytes) -> None:
         """A message, which is written with its chunk. Times are nanoseconds since the epoch."""
         length = len(payload)
+        if self.waiting and self._size + length > _CHUNK:
+            try:
+                self.flush()
+            except BaseException:
+                self.lost += 1
+                raise
         if not self.waiting:
             self._first = self._last = log_time
         elif log_time < self._first:

@@ -152,6 +152,7 @@ class Recording:
         except (NoRoomError, OSError) as error:
             cut = cut or reason(error)
         try:
+            self._folder.use_room()
             while self._file is not None:
                 cut = self._complete(self._file, told, cut, missing)
             told = self._ending(told, cut, missing)

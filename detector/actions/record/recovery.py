@@ -47,6 +47,7 @@ def _recovered(destination: Destination, path: Path) -> Kept | None:
     folder = Folder(destination, path, name, lambda dropped: None, forced=True)
     files = sorted(path.glob("*.mcap"), key=lambda each: int(each.stem.rpartition("_")[2]))
     folder.claim(sum(each.stat().st_size for each in path.iterdir()), 0, len(files))
+    folder.use_room()
     told = folder.described()
     try:
         parts = [] if told is None else [part for file in files if (part := _part(file, folder, told)) is not None]
