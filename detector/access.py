@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wayside.api.access import Access
+from wayside.api.database import Database
 
 SECRETS_VARIABLE = "WAYSIDE_SECRETS"
 SECRETS_FOLDER = "/etc/wayside/secrets"
@@ -87,6 +88,19 @@ def login(access: Access, field: str) -> Login | None:
 def secret_text(name: str, key: str, field: str) -> str:
     """What a Secret holds under a key; a newline at its end does not count. Raises AccessError."""
     return _text(_secret(name, field) / key, field)
+
+
+def database_uri(database: Database, field: str) -> str:
+    """The connection string of a database; `field` is where `database` stands. Raises AccessError."""
+    if database.uri_file is not None:
+        return _text(Path(database.uri_file), f"{field}.uriFile")
+    if database.uri_secret is not None:
+        return secret_text(database.uri_secret, "uri", f"{field}.uriSecret")
+    variable = database.uri_variable or ""
+    uri = os.environ.get(variable)
+    if uri is None:
+        raise AccessError(f"{field}.uriVariable: the environment variable {variable} is not set: set it")
+    return uri
 
 
 def _secret(name: str, field: str) -> Path:

@@ -20,6 +20,7 @@ from wayside.api.base import (
     conditions_field,
 )
 from wayside.api.constants import Constants
+from wayside.api.database import Database
 from wayside.api.recordings import Recordings
 from wayside.api.source import DataSource
 from wayside.api.stream import (
@@ -148,6 +149,9 @@ class DetectorSpec(Model):
     )
     recordings: Recordings | None = Field(
         default=None, description="Where the recordings of record actions go. Rules that record need it."
+    )
+    database: Database | None = Field(
+        default=None, description="The MongoDB that database actions write to. Those rules need it."
     )
     rules: RuleSelector = Field(default=RuleSelector(), description="Which EventRules of the namespace are evaluated.")
 

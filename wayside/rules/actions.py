@@ -15,6 +15,7 @@ from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
 from wayside.expressions import CompiledTemplate, Environment
 from wayside.rules.compiled import CompiledAction, CompiledWindow
+from wayside.rules.database import database_problems
 
 
 class Compiler(Protocol):
@@ -61,6 +62,9 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
     rendered = {
         name: compiler.template((*at, *below), {name: value}, environment) for name, value in values.items()
     }  # one by one: what cannot be rendered takes nothing else with it
+    if action.database is not None:
+        for path, text in database_problems(action.database, compiler.detector):
+            compiler.problem((*at, *path), text)
     window = action.window
     return CompiledAction(
         action.name,

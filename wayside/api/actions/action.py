@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
+from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.plugin import ActionPlugin
 from wayside.api.actions.record import Record
@@ -14,7 +15,7 @@ from wayside.api.actions.trigger import Trigger
 from wayside.api.actions.window import Window
 from wayside.api.base import JsonValue, Model, ObjectName, validations
 
-_KINDS = ("deploy", "record", "trigger", "plugin")
+_KINDS = ("deploy", "record", "database", "trigger", "plugin")
 _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
@@ -31,6 +32,9 @@ class Action(Model):
     )
     record: Record | None = Field(default=None, description="Record its samples as rosbag2 with MCAP files.")
     trigger: Trigger | None = Field(default=None, description="Have another system record while the episode lasts.")
+    database: DatabaseAction | None = Field(
+        default=None, description="Write the samples around the episode to the Detector's database (MongoDB)."
+    )
     plugin: ActionPlugin | None = Field(default=None, description="What an installed package does about it.")
 
     @model_validator(mode="after")

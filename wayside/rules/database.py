@@ -1,0 +1,24 @@
+"""What a database action asks of its Detector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from wayside.api import Detector
+from wayside.api.actions.database import DatabaseAction
+from wayside.api.wording import FieldPath
+
+
+def database_problems(action: DatabaseAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
+    """What is missing; the paths begin at the action."""
+    database = detector.spec.database
+    if database is None:
+        yield (
+            ("database",),
+            f"Detector {detector.name} has no database: give it spec.database, e.g. {{uriVariable: MONGODB_URI}}",
+        )
+    elif action.files is not None and database.files is None:
+        yield (
+            ("database", "files"),
+            f"Detector {detector.name} has no place for files: give it spec.database.files.path, or remove files",
+        )
