@@ -79,7 +79,7 @@ def ensure_binaries(console: Console | None = None) -> Binaries:
     if missing := [name for name in PACKAGES if name not in found]:
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
-        with _locked(folder / ".lock"):
+        with locked(folder / ".lock"):
             missing = [name for name in missing if _find(name) is None]  # somebody may have built it meanwhile
             for number, name in enumerate(missing, start=1):
                 _build(name, folder, f"{number} of {len(missing)}", console)
@@ -162,7 +162,8 @@ def _progress(what: str, console: Console) -> Iterator[None]:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
+    """Keep others out of a folder."""
     with path.open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield

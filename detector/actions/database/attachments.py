@@ -1,0 +1,79 @@
+"""Large binary fields of a message leave it: images as PNG, point clouds as PCD, others as they are."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from detector.actions.database.pcd import pcd
+from detector.actions.database.png import png
+
+_IMAGE = {"height", "width", "encoding", "step", "data"}
+_CLOUD = {"height", "width", "fields", "point_step", "row_step", "data"}
+_COMPRESSED = (("jpeg", "jpg"), ("jpg", "jpg"), ("png", "png"), ("webp", "webp"))
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file that a document refers to."""
+
+    path: str
+    """Below the folder for files."""
+    content: bytes
+
+    def reference(self) -> dict[str, Any]:
+        """What stands in the document in place of the content."""
+        return {
+            "file": self.path,
+            "format": self.path.rpartition(".")[2].upper(),
+            "bytes": len(self.content),
+            "sha256": hashlib.sha256(self.content).hexdigest(),
+        }
+
+
+def detach(message: Any, above: int, place: str) -> tuple[Any, list[Attachment]]:
+    """The message with references in place of its binary fields of more than `above` bytes, and the files.
+
+    `place` is what the files' paths begin with.
+    """
+    files: list[Attachment] = []
+
+    def keep(content: bytes, suffix: str) -> dict[str, Any]:
+        number = f"-{len(files)}" if files else ""
+        files.append(Attachment(f"{place}{number}.{suffix}", content))
+        return files[-1].reference()
+
+    def large(value: Any) -> bool:
+        return isinstance(value, bytes) and len(value) > above
+
+    def walk(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {
+                name: keep(*_form(value, name, each)) if large(each) else walk(each) for name, each in value.items()
+            }
+        if isinstance(value, list) and value and not isinstance(value[0], float | int | str):
+            return [keep(each, "bin") if large(each) else walk(each) for each in value]
+        return value
+
+    if isinstance(message, bytes):  # of a raw stream
+        return (keep(message, "bin") if large(message) else message), files
+    return walk(message), files
+
+
+def _form(around: Mapping[str, Any], name: str, content: bytes) -> tuple[bytes, str]:
+    """What the field's file holds, and its suffix."""
+    if name == "data":
+        try:
+            if around.keys() >= _IMAGE and (image := png(around)) is not None:
+                return image, "png"
+            if around.keys() >= _CLOUD and (cloud := pcd(around)) is not None:
+                return cloud, "pcd"
+        except (TypeError, ValueError, KeyError):  # looks like one, and is none
+            return content, "bin"
+        told = str(around.get("format", "")).lower()
+        for word, suffix in _COMPRESSED:
+            if word in told:
+                return content, suffix
+    return content, "bin"

@@ -1,0 +1,140 @@
+"""From a sample of a scenario to its document: what was said, by whom, when.
+
+A document's id is made of the scenario and the sample alone, so however often it is sent, it is there once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from bson import Binary, Int64
+from bson.datetime_ms import DatetimeMS
+
+from detector.actions.database.attachments import Attachment, detach
+from detector.actions.database.values import UnfitError, encoded
+from detector.actions.episode import EpisodeSample
+from detector.engine.samples.sample import DecodeError, Decoder, NearDecoder
+from wayside.api.stream import Stream
+
+LARGEST = 16 * 2**20 - 2**14
+"""MongoDB takes documents of 16 MiB; a little is left for what servers add."""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What a sample became."""
+
+    collection: str
+    document: bytes
+    """BSON."""
+    files: tuple[Attachment, ...] = ()
+    cut: str = ""
+    """Why the message itself is not in the document; empty where it is."""
+    undecoded: bool = False
+    """The payload is in the document as it came."""
+
+
+def collection_of(stream: Stream) -> str:
+    """One per message type; streams whose messages have no type have one each, e.g. json/imu."""
+    return stream.type or f"{stream.encoding}/{stream.name}"
+
+
+@dataclass(slots=True)
+class Documents:
+    """Makes the documents of one scenario."""
+
+    scenario: str
+    place: str
+    """What the paths of its files begin with."""
+    streams: Mapping[str, Stream]
+    decoders: Mapping[str, Decoder]
+    above: int | None
+    """Binary fields of more bytes go to files; None: they stay."""
+    _last: dict[tuple[str, str], tuple[int, dict[bytes, int]]] = field(default_factory=dict)
+
+    def make(self, sample: EpisodeSample) -> Made:
+        """The sample's document."""
+        stream = self.streams[sample.stream]
+        decoder = self.decoders[sample.stream]
+        identity = self._identity(sample)
+        document: dict[str, Any] = {
+            "_id": Binary(identity),
+            "scenario": self.scenario,
+            "client": sample.client,
+            "stream": sample.stream,
+            "key": sample.key,
+            "at": DatetimeMS(sample.time // 1_000_000),
+            "time": Int64(sample.time),
+            "received": Int64(sample.received),
+        }
+        try:
+            message = decoder.decode(sample.payload)
+            stamp = (
+                decoder.stamp_near(sample.payload, sample.received)
+                if isinstance(decoder, NearDecoder)
+                else decoder.stamp(sample.payload)
+            )
+        except DecodeError as error:
+            document |= {"error": str(error)[:1000], "payload": sample.payload}
+            return self._fitting(stream, sample, document, identity, (), undecoded=True)
+        if stamp is not None:
+            document["stamp"] = Int64(stamp)
+        files: list[Attachment] = []
+        if self.above is not None and len(sample.payload) > self.above:
+            message, files = detach(message, self.above, self._path(sample, identity))
+        document["msg"] = message
+        return self._fitting(stream, sample, document, identity, tuple(files), undecoded=False)
+
+    def _fitting(
+        self,
+        stream: Stream,
+        sample: EpisodeSample,
+        document: dict[str, Any],
+        identity: bytes,
+        files: tuple[Attachment, ...],
+        *,
+        undecoded: bool,
+    ) -> Made:
+        """The document, or one that refers to the payload or says what is left out where it is too large."""
+        collection = collection_of(stream)
+        try:
+            made = encoded(document)
+            if len(made) <= LARGEST:
+                return Made(collection, made, files, undecoded=undecoded)
+            reason = f"it would be a document of {len(made)} bytes, and MongoDB takes {LARGEST}"
+        except UnfitError as error:
+            reason = str(error)
+        document.pop("msg", None)
+        document.pop("payload", None)
+        if self.above is not None:
+            whole = Attachment(f"{self._path(sample, identity)}.{stream.encoding}", sample.payload)
+            document |= {"payload": whole.reference(), "note": f"the message is in a file: {reason}"}
+            return Made(collection, encoded(document), (whole,), undecoded=undecoded)
+        document["cut"] = reason
+        return Made(collection, encoded(document), cut=reason, undecoded=undecoded)
+
+    def _path(self, sample: EpisodeSample, identity: bytes) -> str:
+        return f"{self.place}/{sample.stream}/{sample.client}/{sample.time}-{identity[8:14].hex()}"
+
+    def _identity(self, sample: EpisodeSample) -> bytes:
+        """20 bytes: the time first, so that documents lie in the index as they come, then what tells samples apart.
+
+        With clock Data a client may send the same bytes twice with one stamp: the second one gets another number.
+        """
+        digest = hashlib.blake2b(sample.payload, digest_size=12)
+        said = (self.scenario, sample.client, sample.stream, sample.key, str(sample.received))
+        digest.update("\0".join(said).encode())
+        name = digest.digest()
+        lane = (sample.client, sample.stream)
+        at, seen = self._last.get(lane, (None, {}))
+        if at != sample.time:
+            seen = {}
+            self._last[lane] = (sample.time, seen)
+        number = seen.get(name, 0)
+        seen[name] = number + 1
+        if number:
+            name = hashlib.blake2b(name + number.to_bytes(4, "big"), digest_size=12).digest()
+        return sample.time.to_bytes(8, "big", signed=True) + name

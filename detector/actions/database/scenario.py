@@ -1,0 +1,187 @@
+"""The documents about a scenario: what it is, what kind it is of, and which clients were there.
+
+A scenario is complete only where `complete` is true. That is written last, once all its samples are.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from bson import Int64
+from bson.datetime_ms import DatetimeMS
+
+from detector.actions.database.values import plain
+from detector.actions.database.work import Write
+from detector.actions.episode import Completion, Episode
+from wayside.api import Detector, EventRule
+from wayside.api.base import JsonValue
+
+SCENARIOS, TYPES, CLIENTS = "Scenarios", "ScenarioTypes", "ConnectedClients"
+OPEN, COMPLETE, INCOMPLETE, INTERRUPTED = "Open", "Complete", "Incomplete", "Interrupted"
+
+
+def scenario_id(episode: Episode, action: str) -> str:
+    """The same for the same episode and action, whichever process writes it."""
+    return f"{episode.id}.{action}"
+
+
+@dataclass(slots=True)
+class Scenario:
+    """What is known of one while it is written."""
+
+    id: str
+    holder: str
+    action: str
+    database: str
+    rule: EventRule
+    resumed: bool
+    messages: Counter[str] = field(default_factory=Counter)
+    """Documents handed over, by collection."""
+    clients: dict[str, tuple[int, int, set[str]]] = field(default_factory=dict)
+    """Of each client the first and last time, and its streams."""
+    bytes: int = 0
+    files: int = 0
+    lost: Counter[str] = field(default_factory=Counter)
+    """What is not there and should be, by reason."""
+
+    def saw(self, client: str, stream: str, time: int) -> None:
+        """Note a client's sample."""
+        first, last, streams = self.clients.get(client, (time, time, set()))
+        streams.add(stream)
+        self.clients[client] = (min(first, time), max(last, time), streams)
+
+
+def type_id(rule: EventRule) -> str:
+    """A version of a rule: its scenarios are of one type."""
+    return f"{rule.metadata.namespace}/{rule.name}@{rule.metadata.generation}"
+
+
+def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue]) -> list[Write]:
+    """Make it known, as one that is not complete."""
+    rule = scenario.rule
+    of_type = {
+        "rule": rule.name,
+        "namespace": rule.metadata.namespace,
+        "generation": Int64(rule.metadata.generation),
+        "description": rule.spec.description,
+        "classification": None if rule.spec.classification is None else rule.spec.classification.to_json(),
+        "spec": json.dumps(rule.spec.to_json(), ensure_ascii=False),  # as text: its names may be none of MongoDB's
+    }
+    known = {
+        "rule": rule.name,
+        "generation": Int64(rule.metadata.generation),
+        "type": type_id(rule),
+        "classification": episode.classification,
+        "episode": episode.id,
+        "holder": scenario.holder,
+        "action": scenario.action,
+        "subject": episode.subject,
+        "subjects": list(episode.clients),
+        "element": episode.element,
+        "onset": DatetimeMS(episode.onset_time // 1_000_000),
+        "onsetTime": Int64(episode.onset_time),
+        "startTime": Int64(episode.start_time),
+        **plain({"values": episode.values, "metadata": metadata}),
+        "complete": False,
+        "rejected": False,
+    }
+    writes = [
+        _change(scenario, TYPES, {"_id": type_id(rule)}, {"$setOnInsert": of_type}),
+        _change(scenario, SCENARIOS, {"_id": scenario.id}, {"$setOnInsert": {**known, "state": OPEN}}),
+    ]
+    if scenario.resumed:
+        interrupted = {"state": INTERRUPTED, "interrupted": True}
+        writes.append(_change(scenario, SCENARIOS, {"_id": scenario.id}, {"$set": interrupted}))
+    return writes
+
+
+def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
+    """Scenarios that an earlier run left open: nobody writes them any more."""
+    find = {"holder": holder, "rule": rule, "action": action, "state": OPEN}
+    change = {"find": find, "change": {"$set": {"state": INTERRUPTED, "interrupted": True}}, "many": True}
+    return Write(database, SCENARIOS, changes=[change])
+
+
+def finish(scenario: Scenario, episode: Episode, completion: Completion, detector: Detector) -> list[Write]:
+    """Say all that is known in the end. The last request makes it complete, where nothing is missing."""
+    labels = {client.name: client.labels for client in detector.spec.clients}
+    clients = [
+        {
+            "find": {"_id": name},
+            "change": {
+                "$setOnInsert": {"name": name},
+                "$set": {"labels": labels.get(name, {})},
+                "$min": {"firstSeen": Int64(first)},
+                "$max": {"lastSeen": Int64(last)},
+                "$addToSet": {"streams": {"$each": sorted(streams)}, "detectors": scenario.holder},
+            },
+            "many": False,
+        }
+        for name, (first, last, streams) in sorted(scenario.clients.items())
+    ]
+    known: dict[str, Any] = {
+        "endTime": None if episode.end_time is None else Int64(episode.end_time),
+        "reason": episode.reason,
+        "clients": sorted(scenario.clients),
+        "messages": {name: Int64(count) for name, count in sorted(scenario.messages.items())},
+        "bytes": Int64(scenario.bytes),
+        "files": Int64(scenario.files),
+        "cut": completion.cut,
+        "missing": Int64(missing(scenario, completion)),
+        "lost": {reason: Int64(count) for reason, count in sorted(scenario.lost.items())},
+    }
+    find = {"_id": scenario.id}
+    writes = [Write(scenario.database, CLIENTS, changes=clients)] if clients else []
+    if why_incomplete(scenario, episode, completion):
+        state = INTERRUPTED if scenario.resumed else INCOMPLETE
+        return [*writes, _change(scenario, SCENARIOS, find, {"$set": {**known, "state": state}}, scenario.id)]
+    intact = {**find, "rejected": False, "state": {"$in": [OPEN, COMPLETE]}}
+    last = {"find": intact, "change": {"$set": {"state": COMPLETE, "complete": True}}, "many": True}
+    return [
+        *writes,
+        _change(scenario, SCENARIOS, find, {"$set": known}),
+        Write(scenario.database, SCENARIOS, changes=[last], completes=scenario.id),
+    ]
+
+
+def why_incomplete(scenario: Scenario, episode: Episode, completion: Completion) -> str:
+    """Why not all of it is there; empty where it is."""
+    reasons = [f"{count} lost: {reason}" for reason, count in sorted(scenario.lost.items())]
+    if completion.missing:
+        reasons.append(f"{completion.missing} lost: the samples came faster than they could be taken")
+    if completion.cut:
+        reasons.append(completion.cut)
+    if scenario.resumed:
+        reasons.append("the beginning was seen by an earlier run of the detector")
+    if episode.end_time is None and not completion.cut:
+        reasons.append("its end was not seen")
+    return "; ".join(reasons)
+
+
+def missing(scenario: Scenario, completion: Completion) -> int:
+    """How many samples, or parts of them, are not there."""
+    return completion.missing + sum(scenario.lost.values())
+
+
+def reject(database: str, scenario: str, why: str) -> Write:
+    """The server refused one of its documents: it can no longer become complete."""
+    change = {"$set": {"rejected": True, "rejection": why, "state": INCOMPLETE, "complete": False}}
+    return Write(database, SCENARIOS, changes=[{"find": {"_id": scenario}, "change": change, "many": False}])
+
+
+def give_up(write: Write, why: str) -> Write:
+    """In place of the request that would have made a scenario complete."""
+    change = {"$set": {"state": INCOMPLETE, "cut": why}}
+    find = {"_id": write.completes}
+    return Write(write.database, SCENARIOS, changes=[{"find": find, "change": change, "many": False}])
+
+
+def _change(
+    scenario: Scenario, collection: str, find: Mapping[str, Any], change: Mapping[str, Any], completes: str = ""
+) -> Write:
+    changes = [{"find": find, "change": change, "many": False}]
+    return Write(scenario.database, collection, changes=changes, completes=completes)

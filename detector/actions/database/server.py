@@ -1,0 +1,173 @@
+"""The MongoDB server, as far as it is written to: one request at a time, and nothing of the credentials gets out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import unquote_plus
+
+from bson.errors import InvalidDocument
+from bson.raw_bson import RawBSONDocument
+from pymongo import MongoClient, UpdateMany, UpdateOne, WriteConcern
+from pymongo.errors import (
+    AutoReconnect,
+    BulkWriteError,
+    ConfigurationError,
+    ConnectionFailure,
+    DocumentTooLarge,
+    NetworkTimeout,
+    NotPrimaryError,
+    PyMongoError,
+    ServerSelectionTimeoutError,
+)
+
+from detector.actions.database.work import Write
+
+_DUPLICATE = 11000
+_SECONDS = 10.0
+"""How long one request may take before the connection counts as broken."""
+
+
+class UnavailableError(Exception):
+    """The server did not do it, and may later; the text is for people."""
+
+    def __init__(self, text: str, *, broke: bool = False) -> None:
+        super().__init__(text)
+        self.broke = broke
+        """The connection ended with this request: it may be the request's own doing."""
+
+
+class RefusedError(Exception):
+    """The request as a whole cannot be done, now or later; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """One document or change that the server does not take."""
+
+    index: int
+    why: str
+
+
+class Redactor:
+    """Takes whatever is secret in a connection string out of texts."""
+
+    def __init__(self, uri: str) -> None:
+        secrets = {uri}
+        found = re.match(r"[^:/]*://(?P<rest>.*)", uri, re.DOTALL)
+        rest = found["rest"] if found else uri
+        login, at, _ = rest.rpartition("@")
+        if at:
+            user, _, password = login.partition(":")
+            secrets |= {login, password, unquote_plus(password), unquote_plus(login)}
+            if not password:
+                secrets.add(user)
+            secrets |= {part for part in re.split(r"[@/]", password) if len(part) > 2}
+        for name, value in re.findall(r"[?&]([^=&]+)=([^&]*)", rest):
+            if re.search("password|token|secret|authmechanismproperties", name, re.IGNORECASE):
+                secrets |= {value, unquote_plus(value)}
+        self._secrets = sorted((secret for secret in secrets if secret), key=len, reverse=True)
+
+    def __call__(self, text: object) -> str:
+        """The text without secrets."""
+        clean = str(text)
+        for secret in self._secrets:
+            clean = clean.replace(secret, "***")
+        return clean if len(clean) <= 500 else clean[:500] + "…"
+
+
+class Server:
+    """A connection to it, which is made when it is first needed."""
+
+    def __init__(self, uri: str, *, majority: bool) -> None:
+        """Raises ValueError where the connection string is wrong, without showing it."""
+        self.redact = Redactor(uri)
+        self._concern = WriteConcern("majority" if majority else 1, wtimeout=int(_SECONDS * 500))
+        self._sure = WriteConcern("majority", wtimeout=int(_SECONDS * 500))
+        try:
+            self._client: MongoClient[Any] = MongoClient(
+                uri,
+                appname="wayside",
+                connect=False,
+                serverSelectionTimeoutMS=1000,
+                connectTimeoutMS=3000,
+                socketTimeoutMS=int(_SECONDS * 1000),
+                retryWrites=False,  # the queue before it tries again, in order
+            )
+        except (PyMongoError, ValueError, TypeError) as error:
+            raise ValueError(self.redact(error)) from None
+
+    def write(self, write: Write) -> tuple[int, list[Refused]]:
+        """Do it: how many documents changes have matched, and what was refused of it; all else is done.
+
+        Raises UnavailableError, RefusedError.
+        """
+        try:
+            return self._insert(write) if write.documents else self._change(write)
+        except BulkWriteError as error:
+            return 0, self._refused(error.details, inserting=bool(write.documents))
+        except (DocumentTooLarge, InvalidDocument) as error:
+            raise RefusedError(self.redact(error)) from None
+        except ConnectionFailure as error:
+            broke = isinstance(error, AutoReconnect) and not isinstance(
+                error, NetworkTimeout | NotPrimaryError | ServerSelectionTimeoutError
+            )
+            raise UnavailableError(self._short(error), broke=broke) from None
+        except (PyMongoError, ConfigurationError) as error:
+            raise UnavailableError(self._short(error)) from None
+
+    def _insert(self, write: Write) -> tuple[int, list[Refused]]:
+        collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]
+        collection.insert_many([RawBSONDocument(document) for document in write.documents], ordered=False)
+        return len(write.documents), []
+
+    def _change(self, write: Write) -> tuple[int, list[Refused]]:
+        requests = [
+            UpdateMany(each["find"], each["change"])
+            if each["many"]
+            else UpdateOne(each["find"], each["change"], upsert=True)
+            for each in write.changes
+        ]
+        collection = self._client.get_database(write.database, write_concern=self._sure)[write.collection]
+        done = collection.bulk_write(requests, ordered=False)
+        return done.matched_count, []
+
+    def _refused(self, details: Mapping[str, Any], *, inserting: bool) -> list[Refused]:
+        """What of a request was refused; that a document is there already is as it should be.
+
+        Raises UnavailableError where the rest is not safe yet, or another detector made the same at the same time.
+        """
+        if not inserting and any(_there_already(each) for each in details.get("writeErrors", ())):
+            raise UnavailableError("somebody else makes the same document")
+        refused = [
+            Refused(int(each["index"]), self.redact(each.get("errmsg", "")))
+            for each in details.get("writeErrors", ())
+            if not _there_already(each)
+        ]
+        concerns: Sequence[Mapping[str, Any]] = details.get("writeConcernErrors", ())
+        if concerns:
+            raise UnavailableError(self.redact(concerns[0].get("errmsg", "the write concern is not met")))
+        return refused
+
+    def _short(self, error: PyMongoError) -> str:
+        """What happened, without the driver's account of its topology."""
+        text = str(error).partition(", Topology Description")[0].partition(" (configured timeouts")[0]
+        return self.redact(text.partition(", full error:")[0])
+
+    def answers(self) -> bool:
+        """Whether it can be spoken to at all."""
+        try:
+            self._client.admin.command("ping")
+        except PyMongoError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """End the connection."""
+        self._client.close()
+
+
+def _there_already(error: Mapping[str, Any]) -> bool:
+    return error.get("code") == _DUPLICATE and error.get("keyPattern", {"_id": 1}) == {"_id": 1}

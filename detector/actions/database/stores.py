@@ -1,0 +1,64 @@
+"""One queue for each database of the process, shared by its actions; it ends with the last of them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from detector.access import AccessError, database_uri
+from detector.actions.base import ActionError
+from detector.actions.database.server import Server
+from detector.actions.database.spool import Spool, SpoolError
+from detector.actions.database.store import Store
+from wayside.api.database import Database, WriteConcern
+
+_FIELD = "spec.database"
+_CLOSING = 3.0
+"""At the end, so many seconds are left to write what there is."""
+
+_lock = threading.Lock()
+_stores: dict[Database, tuple[Store, int]] = {}
+
+
+def acquire(database: Database, lose: Callable[[str, int, str], None]) -> Store:
+    """The database's queue. Raises ActionError where it cannot be made, without showing what is secret."""
+    key = _key(database)
+    with _lock:
+        store, users = _stores.get(key, (None, 0))
+        if store is None:
+            store = _made(database, lose)
+        _stores[key] = (store, users + 1)
+        return store
+
+
+def release(database: Database) -> None:
+    """The caller needs the queue no more."""
+    key = _key(database)
+    with _lock:
+        store, users = _stores[key]
+        if users > 1:
+            _stores[key] = (store, users - 1)
+            return
+        del _stores[key]
+        store.close(_CLOSING)  # before another one can ask for the same spool
+
+
+def _key(database: Database) -> Database:
+    return database.model_copy(update={"files": None})
+
+
+def _made(database: Database, lose: Callable[[str, int, str], None]) -> Store:
+    try:
+        uri = database_uri(database, _FIELD)
+        server = Server(uri, majority=database.write_concern is WriteConcern.MAJORITY)
+    except AccessError as error:
+        raise ActionError(str(error)) from None
+    except ValueError as error:
+        raise ActionError(f"{_FIELD}: the connection string is wrong: {error}: write mongodb://…") from None
+    try:
+        spool = None if database.spool is None else Spool(Path(database.spool.path), database.spool.bytes.bytes)
+    except SpoolError as error:
+        server.close()
+        raise ActionError(f"{_FIELD}.spool.path: {error}") from None
+    return Store(server, spool, lose)

@@ -1,0 +1,5 @@
+import sys
+
+from tests.mongodb import main
+
+sys.exit(main())
