@@ -38,6 +38,7 @@ lint: $(BIN)/.installed-dev ## style, types and the direction of the imports
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check --quiet . && $(BIN)/mypy && $(BIN)/lint-imports
 
 unit: $(BIN)/.installed-dev ## the tests that need no cluster
+	@$(BIN)/python -m tests.mongodb
 	@$(BIN)/python -m pytest tests/unit
 
 cluster: $(BIN)/.installed-dev ## the tests against a real control plane; builds it first where it is missing

@@ -124,7 +124,9 @@ def _build(program: Path, console: Console) -> None:
     try:
         go = find_go(program.parent.parent.parent / "controlplane" / "go", console)
     except GoUnavailableError as error:
-        raise ServerUnavailableError(f"a MongoDB server has to be built, which needs Go ({error}); or {remedy}") from error
+        raise ServerUnavailableError(
+            f"a MongoDB server has to be built, which needs Go ({error}); or {remedy}"
+        ) from error
     unfinished = program.with_name(f".mongodb.{os.getpid()}")
     console.print("building a MongoDB server (FerretDB, once; about a minute)", highlight=False)
     began = time.monotonic()

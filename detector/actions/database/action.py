@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import bson
 
-from detector.actions.base import Action, Setting
+from detector.actions.base import Action, ActionError, Setting
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.documents import Documents, Made
 from detector.actions.database.folder import Folder, FolderError
@@ -23,6 +24,8 @@ from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome
 from wayside.api.actions.database import Attachments, DatabaseAction
 from wayside.api.base import JsonValue
 from wayside.api.database import Database as Place
+
+_log = logging.getLogger(__name__)
 
 FLUSH = 0.2
 """Documents wait at most so many seconds for others to be sent with."""
@@ -59,6 +62,7 @@ class Database(Action[DatabaseAction]):
         self._works: dict[str, _Work] = {}
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
+        self._awake = False
 
     def started(self, episode: Episode) -> None:
         """Make the scenario known in the database, as one that is not complete."""
@@ -145,7 +149,10 @@ class Database(Action[DatabaseAction]):
         works = {work.scenario.id: work.scenario for work in self._works.values()}
         why = "no room in the queue" if not self._store.away else "no room while the database is away"
         for name, count in batch.owners.items():
-            self._lose(works[name], count, why)
+            if name in works:  # else it failed meanwhile
+                self._lose(works[name], count, why)
+            else:
+                losing(count, why)
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """Queue what makes the scenario complete, or what says why it is not."""
@@ -169,7 +176,13 @@ class Database(Action[DatabaseAction]):
             self._store.put_change(write, confirm if write.completes else None)
 
     def wake(self) -> float | None:
-        """Queue what has waited long enough."""
+        """Queue what has waited long enough. The first time, what an earlier run left on disk is taken up."""
+        if not self._awake:
+            self._awake = True
+            try:
+                self._connect()
+            except ActionError as error:
+                _log.error("action %s of EventRule %s: %s", self.setting.action, self.setting.rule.name, error)
         if not self._batches:
             return None
         left = self._due - time.monotonic()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from detector.actions.database.attachments import Attachment
@@ -34,7 +35,8 @@ class Folder:
                 os.fsync(file.fileno())
             unfinished.replace(target)
         except OSError as error:
-            unfinished.unlink(missing_ok=True)
+            with suppress(OSError):
+                unfinished.unlink(missing_ok=True)
             raise FolderError(f"a file could not be written: {error.strerror or type(error).__name__}") from None
         self._used += len(attachment.content)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -87,16 +88,18 @@ class Server:
         self._concern = WriteConcern("majority" if majority else 1, wtimeout=int(_SECONDS * 500))
         self._sure = WriteConcern("majority", wtimeout=int(_SECONDS * 500))
         try:
-            self._client: MongoClient[Any] = MongoClient(
-                uri,
-                appname="wayside",
-                connect=False,
-                serverSelectionTimeoutMS=1000,
-                connectTimeoutMS=3000,
-                socketTimeoutMS=int(_SECONDS * 1000),
-                retryWrites=False,  # the queue before it tries again, in order
-            )
-        except (PyMongoError, ValueError, TypeError) as error:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # an option that the driver would ignore, and print with its value
+                self._client: MongoClient[Any] = MongoClient(
+                    uri,
+                    appname="wayside",
+                    connect=False,
+                    serverSelectionTimeoutMS=1000,
+                    connectTimeoutMS=3000,
+                    socketTimeoutMS=int(_SECONDS * 1000),
+                    retryWrites=False,  # the queue before it tries again, in order
+                )
+        except (PyMongoError, ValueError, TypeError, Warning) as error:
             raise ValueError(self.redact(error)) from None
 
     def write(self, write: Write) -> tuple[int, list[Refused]]:

@@ -34,6 +34,9 @@ _SUSPECT = 3
 _PATIENCE = 10
 """So many tenths of a second somebody who puts waits for room before the disk is asked."""
 
+_LAST_TRY = 0.5
+"""At the end, a server that is away gets so many seconds more."""
+
 Confirm = Callable[[bool, str], None]
 """Told that a scenario is complete in the database, or that it is not, and why."""
 
@@ -41,14 +44,12 @@ Confirm = Callable[[bool, str], None]
 class Store:
     """The queue, and the thread that empties it."""
 
-    def __init__(
-        self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None], *, memory: int = MEMORY
-    ) -> None:
+    def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
         """`lose` is told what is lost of an earlier run's records."""
         self._server = server
         self._spool = spool
         self._lose = lose
-        self._capacity = memory
+        self._capacity = MEMORY
         self._lock = threading.Condition()
         self._disk = threading.Lock()
         """Held while records are moved, taken or removed; never together with a request to the server."""
@@ -128,7 +129,7 @@ class Store:
         """Write what there is, at most for so long; the rest goes to the spool, or is lost where there is none."""
         with self._lock:
             self._closing = True
-            self._deadline = time.monotonic() + seconds
+            self._deadline = time.monotonic() + (seconds if not self._away else min(seconds, _LAST_TRY))
             self._lock.notify_all()
         self._thread.join(seconds + 1)
         if self._thread.is_alive():  # a request hangs; whether it was done or not, its documents come again
@@ -203,6 +204,8 @@ class Store:
                 broke = broke + 1 if error.broke and self._server.answers() else 0
                 if broke >= _SUSPECT:
                     return self._divide(write, "the server ends the connection when it gets it")
+                if error.broke and broke:
+                    pause = 0.05  # it is there
                 if not self._pause(pause * random.uniform(0.7, 1.3)):  # noqa: S311  no secret
                     return False
                 pause = min(_LONGEST, pause * 2)

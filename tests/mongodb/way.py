@@ -1,0 +1,91 @@
+"""A way to a server over TCP that a test can cut, hang or poison: what is at its ends is real."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from contextlib import suppress
+
+
+class Way:
+    """Forwards connections from a port of its own."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._to = (host, port)
+        self._listener: socket.socket | None = None
+        self.port = 0
+        self._open: set[socket.socket] = set()
+        self._lock = threading.Lock()
+        self._flowing = threading.Event()
+        self._flowing.set()
+        self.poison: bytes | None = None
+        """A connection that carries these bytes ends."""
+        self.restore()
+
+    @property
+    def uri(self) -> str:
+        return f"mongodb://127.0.0.1:{self.port}/?directConnection=true"
+
+    def restore(self) -> None:
+        """Let connections through."""
+        self._flowing.set()
+        if self._listener is not None:
+            return
+        listener = socket.socket()
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(("127.0.0.1", self.port))
+        listener.listen()
+        self.port = listener.getsockname()[1]
+        self._listener = listener
+        threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
+
+    def cut(self) -> None:
+        """End all connections, and refuse others."""
+        if self._listener is not None:
+            self._listener.shutdown(socket.SHUT_RDWR)
+            self._listener.close()
+            self._listener = None
+        self._flowing.set()
+        with self._lock:
+            ends = list(self._open)
+        for each in ends:
+            _end(each)
+
+    def hang(self) -> None:
+        """Take what comes, and pass nothing on."""
+        self._flowing.clear()
+
+    def _accept(self, listener: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = listener.accept()
+                try:
+                    far = socket.create_connection(self._to)
+                except OSError:
+                    _end(near)
+                    continue
+                with self._lock:
+                    self._open |= {near, far}
+                for source, target in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass_on, args=(source, target), daemon=True).start()
+
+    def _pass_on(self, source: socket.socket, target: socket.socket) -> None:
+        tail = b""
+        with suppress(OSError):
+            while data := source.recv(65536):
+                self._flowing.wait()
+                if self.poison and self.poison in tail + data:
+                    break
+                tail = data[-64:]
+                target.sendall(data)
+        for each in (source, target):
+            _end(each)
+        with self._lock:
+            self._open -= {source, target}
+
+
+def _end(end: socket.socket) -> None:
+    with suppress(OSError):
+        end.shutdown(socket.SHUT_RDWR)
+    with suppress(OSError):
+        end.close()

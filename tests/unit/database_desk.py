@@ -1,0 +1,126 @@
+"""A database action as its host has it, before a real server: episodes in a few words, and what came of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from detector.actions import Completion, Episode, EpisodeSample, Outcome, OutcomeState, Setting, Surroundings
+from detector.actions.database import Database
+from detector.assembly import inlets
+from tests.unit.driving import START, a_detector, a_rule, a_stream, at
+from wayside.api.actions.database import DatabaseAction
+
+
+class Nobody:
+    """No Zenoh: the action needs none."""
+
+    def publish(self, *_: Any) -> None:
+        raise AssertionError("the database action publishes nothing")
+
+    def ask(self, *_: Any) -> list[bytes]:
+        raise AssertionError("the database action asks nobody")
+
+
+class Desk:
+    """One action, driven by hand."""
+
+    def __init__(self, database: dict[str, Any], name: str, streams: Sequence[Any] = (), **parameters: Any) -> None:
+        self.detector = a_detector(*(streams or (a_stream("speed"), a_stream("pose"))), database=database)
+        self.rule = a_rule("brake", when="true", description="Hard braking.", signals=[], actions=[])
+        self.outcomes: dict[str, list[Outcome]] = {}
+        self.losses: Counter[str] = Counter()
+        self._changed = threading.Condition()
+        entries = inlets(self.detector)
+        self.surroundings = Surroundings(self.detector, entries.decoders, entries.types)
+        self.closing = threading.Event()
+        setting = Setting(
+            rule=self.rule,
+            action="keep",
+            holder="d",
+            surroundings=lambda: self.surroundings,
+            messenger=Nobody(),
+            report=self._report,
+            lose=self._lose,
+            closing=self.closing,
+        )
+        self.name = name
+        self.action = Database(DatabaseAction(database=name, **parameters), setting)
+        self.action.wake()
+
+    def _report(self, episode: Episode, outcome: Outcome) -> None:
+        with self._changed:
+            self.outcomes.setdefault(episode.id, []).append(outcome)
+            self._changed.notify_all()
+
+    def _lose(self, what: str, count: int, why: str) -> None:
+        with self._changed:
+            self.losses[f"{what}: {why}"] += count
+            self._changed.notify_all()
+
+    def begin(self, name: str = "e1", **fields: Any) -> Episode:
+        known: dict[str, Any] = {
+            "id": name,
+            "rule": self.rule.name,
+            "subject": "car1",
+            "clients": ("car1",),
+            "element": None,
+            "onset_time": START,
+            "start_time": START,
+            "values": {"speed": 12.5},
+            "classification": {"incidence": ["Rare"]},
+            "rendered": {},
+            "unrendered": {},
+            "started": {},
+        }
+        episode = Episode(**{**known, **fields})
+        self.action.started(episode)
+        return episode
+
+    def take(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
+        self.action.samples(episode, samples)
+        self.action.wake()
+
+    def finish(self, episode: Episode, cut: str = "", missing: int = 0) -> None:
+        ended = replace(episode, end_time=at(60), reason="Until")
+        self.action.ended(ended)
+        self.action.completed(ended, Completion(cut, missing))
+
+    def last(self, name: str = "e1") -> Outcome | None:
+        with self._changed:
+            return self.outcomes[name][-1] if name in self.outcomes else None
+
+    def outcome(self, name: str = "e1", within: float = 20) -> Outcome:
+        """What became of the episode in the end."""
+
+        def final() -> bool:
+            return name in self.outcomes and self.outcomes[name][-1].state is not OutcomeState.RUNNING
+
+        with self._changed:
+            assert self._changed.wait_for(final, within), self.outcomes.get(name)
+            return self.outcomes[name][-1]
+
+    def close(self) -> None:
+        self.closing.set()
+        self.action.close()
+
+
+def speeds(count: int, client: str = "car1", first: int = 0, pad: int = 0) -> list[EpisodeSample]:
+    """So many samples of JSON, at 100 Hz."""
+    filler = b', "pad": "' + b"x" * pad + b'"' if pad else b""
+    return [
+        EpisodeSample(client, "speed", f"vehicles/{client}/speed", time, time, b'{"v": %d%b}' % (number, filler))
+        for number in range(first, first + count)
+        for time in (START + number * 10_000_000,)
+    ]
+
+
+def wait_until(condition: Callable[[], bool], within: float = 20) -> None:
+    deadline = time.monotonic() + within
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.01)
