@@ -34,7 +34,7 @@ def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], a
         return app(arguments, prog_name=program, standalone_mode=False) or 0
     except typer.Abort:
         return INTERRUPTED
-    except Exception as error:
+    except Exception as error:  # the program's edge: what is not expected is raised again
         causes = _leaves(error)
         if not all(isinstance(each, (_UsageError, *(() if debug else expected))) for each in causes):
             raise

@@ -68,7 +68,7 @@ class ModelFile:
         options.log_severity_level = 4
         try:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except Exception as error:
+        except Exception as error:  # onnxruntime's errors have no base of their own
             raise ModelError(f"is no ONNX model that can be run: {_line(error)}") from error
         self.sha256 = sha256
         self.inputs = tuple(map(_tensor, self._session.get_inputs()))
@@ -84,7 +84,7 @@ class ModelFile:
         names = [each.name for each in self.outputs]
         try:
             return dict(zip(names, self._session.run(names, dict(inputs)), strict=True))
-        except Exception as error:
+        except Exception as error:  # as above
             raise ModelError(f"the model failed: {_line(error)}") from error
 
     def run_rows(self, rows: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:

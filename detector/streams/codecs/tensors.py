@@ -98,5 +98,5 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
 def _message(payload: bytes, kind: str) -> Any:
     try:
         return standard().store.deserialize_cdr(payload, kind)
-    except Exception as error:
+    except Exception as error:  # rosbags raises what its generated code meets: struct's, numpy's, assertions
         raise DecodeError(f"no {kind}: {error}") from error
