@@ -11,12 +11,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from detector.engine.buffering.messages import KeyReader
 from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
+from detector.engine.episodes.current import Identity
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
 from detector.engine.episodes.subjects import Subject
-from detector.engine.evaluation import Answer, Identity, RuleRun, same_semantics
+from detector.engine.evaluation import Answer, RuleRun, same_semantics
 from detector.engine.knowledge import Knowledge
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.samples.sample import Arrival, Decoder, Sample

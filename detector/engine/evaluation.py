@@ -5,52 +5,25 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from detector.engine.buffering.clients import Clients
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.budget import Budget
+from detector.engine.episodes.current import Episode, Identity
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.following import followed
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.episodes.rendering import render
 from detector.engine.episodes.subjects import Subject, fits
 from detector.engine.scoping.plugins import PluginSignals
 from detector.engine.scoping.scopes import Candidate, Views, candidates
 from detector.engine.scoping.snapshots import snapshot
 from detector.engine.timing.schedule import Only
 from wayside.api.base import JsonValue
-from wayside.expressions import UNKNOWN, Expression, InterpolationError, Unknown
-from wayside.rules import CompiledDeploy, CompiledRule
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Whose episodes these are."""
-
-    detector: str
-    holder: str
-    namespace: str
-
-
-@dataclass(slots=True)
-class Episode:
-    """An open episode. Times are nanoseconds since the epoch."""
-
-    id: str
-    subject: Subject
-    onset: int
-    start: int
-    values: Mapping[str, Any]
-    variables: Mapping[str, Any] | None
-    """What the conditions saw at the start; None in a restored episode until its next evaluation."""
-    demands: dict[str, Demand] = field(default_factory=dict)
-    """By action; an action whose parameters cannot be rendered yet has none."""
-    outdated: set[str] = field(default_factory=set)
-    """Actions that changed since: their demands hold until they can be rendered anew."""
+from wayside.expressions import UNKNOWN, Expression, Unknown
+from wayside.rules import CompiledRule
 
 
 class Sight(NamedTuple):
@@ -192,21 +165,11 @@ class RuleRun:
             {d.action: d for d in demands if d.action in deploys},
             {d.action for d in demands if d.action in deploys and deploys[d.action] != (d.template, d.priority)},
         )
-        return self._start_of(self._open[episode.subject])
+        return self._open[episode.subject].started(self.rule, self._identity)
 
     def episodes(self) -> Iterator[OpenEpisode]:
         """The episodes that have not ended."""
-        for episode in self._open.values():
-            yield OpenEpisode(
-                self.rule.name,
-                episode.subject,
-                episode.id,
-                episode.onset,
-                episode.start,
-                episode.values,
-                self.rule.classification,
-                self.rule.digest,
-            )
+        return (episode.kept(self.rule) for episode in self._open.values())
 
     def change_actions(self, rule: CompiledRule) -> None:
         """Go on with a rule that differs in nothing that decides which episodes there are.
@@ -218,9 +181,7 @@ class RuleRun:
         self.rule = rule
         self._timing = _timing(rule)
         for episode in self._open.values():
-            for action in gone:
-                episode.demands.pop(action, None)
-            episode.outdated = (episode.outdated | changed) - gone
+            episode.change(changed, gone)
             self._render(episode)
 
     def end_all(self, now: int, reason: Reason) -> Iterator[Event]:
@@ -239,7 +200,7 @@ class RuleRun:
     def open_starts(self) -> Iterator[Event]:
         """The events that said that the episodes which are open started, in order of the subjects."""
         for subject in sorted(self._open, key=lambda each: each.text):
-            yield self._start_of(self._open[subject])
+            yield self._open[subject].started(self.rule, self._identity)
 
     def _in_progress(self) -> Iterator[Subject]:
         return (subject for subject, state in self._states.items() if state.is_open or state.onset is not None)
@@ -278,10 +239,10 @@ class RuleRun:
             case None:
                 episode = self._open.get(candidate.subject)
                 if episode is not None:
-                    if episode.outdated or len(episode.demands) < len(self.rule.deploys):
+                    if not episode.is_complete(self.rule):
                         episode.variables = variables
                         self._render(episode)
-                    self._follow(episode, variables)
+                    self.version += episode.follow(self.rule, variables, self.counters)
         if self.witness is not None:
             self.witness(Sight(now, candidate, when, until, state.is_open, state.onset))
         if self._answers is not None:
@@ -308,81 +269,15 @@ class RuleRun:
         self._open[subject] = episode
         self.counters.started += 1
         self._render(episode)
-        return self._start_of(episode)
-
-    def _start_of(self, episode: Episode) -> Event:
-        """The event of the episode's start, with what is rendered for the rule's actions as they are now."""
-        rendered = {action.name: render(action, episode.variables) for action in self.rule.actions}
-        return replace(self._event(episode, None, None, episode.values), rendered=rendered)
+        return episode.started(self.rule, self._identity)
 
     def _ended(self, now: int, episode: Episode, reason: Reason, values: Mapping[str, Any]) -> Event:
         self.counters.ended += 1
         self.version += 1
-        return self._event(episode, now, reason, values)
-
-    def _event(self, episode: Episode, end: int | None, reason: Reason | None, values: Mapping[str, Any]) -> Event:
-        return Event(
-            holder=self._identity.holder,
-            rule=self.rule.name,
-            subject=episode.subject.text,
-            subjects=episode.subject.clients,
-            episode=episode.id,
-            onset_time=episode.onset,
-            start_time=episode.start,
-            end_time=end,
-            reason=reason,
-            values=values,
-            classification=self.rule.classification,
-            models={model.name: model.runner.sha256 for model in self.rule.models if model.runner is not None},
-            element=episode.subject.element,
-            dry_run=self.rule.dry_run,
-        )
+        return episode.ended(self.rule, self._identity, now, reason, values)
 
     def _render(self, episode: Episode) -> None:
-        """Render what the episode does not have as the rule says; what cannot be rendered is tried at the next tick."""
-        if episode.variables is None:
-            return
-        for deploy in self.rule.deploys:
-            if deploy.action not in episode.demands or deploy.action in episode.outdated:
-                try:
-                    parameters = deploy.parameters.render(episode.variables)
-                except InterpolationError as error:
-                    self.counters.errors += 1
-                    self.counters.last_error = f"action {deploy.action}: {error}"
-                    continue
-                episode.demands[deploy.action] = self._demand(episode, deploy, parameters)
-                episode.outdated.discard(deploy.action)
-                self.version += 1
-
-    def _follow(self, episode: Episode, variables: Mapping[str, Any]) -> None:
-        """Evaluate anew the parameters of the actions that say so."""
-        for deploy in self.rule.deploys:
-            demand = episode.demands.get(deploy.action)
-            if deploy.follow and demand is not None and deploy.action not in episode.outdated:
-                parameters = followed(deploy, demand.parameters, variables, self.counters)
-                if parameters != demand.parameters:
-                    episode.demands[deploy.action] = replace(demand, parameters=parameters)
-                    self.version += 1
-
-    def _demand(self, episode: Episode, deploy: CompiledDeploy, parameters: Any) -> Demand:
-        return Demand(
-            rule=self.rule.name,
-            action=deploy.action,
-            template=deploy.template,
-            priority=deploy.priority,
-            parameters=parameters or {},
-            detector=self._identity.detector,
-            holder=self._identity.holder,
-            namespace=self._identity.namespace,
-            subject=episode.subject.text,
-            subjects=episode.subject.clients,
-            episode=episode.id,
-            onset_time=episode.onset,
-            start_time=episode.start,
-            classification=self.rule.classification,
-            values=episode.values,
-            rule_digest=self.rule.digest,
-        )
+        self.version += episode.render(self.rule, self._identity, self.counters)
 
 
 def same_semantics(run: RuleRun, rule: CompiledRule) -> bool:

@@ -1,0 +1,142 @@
+"""One open episode of a rule: what its events say, and the demands that its deploy actions hold."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from detector.engine.counters import RuleCounters
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.following import followed
+from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.rendering import render
+from detector.engine.episodes.subjects import Subject
+from wayside.expressions import InterpolationError
+from wayside.rules import CompiledDeploy, CompiledRule
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Whose episodes these are."""
+
+    detector: str
+    holder: str
+    namespace: str
+
+
+@dataclass(slots=True)
+class Episode:
+    """An open episode. Times are nanoseconds since the epoch."""
+
+    id: str
+    subject: Subject
+    onset: int
+    start: int
+    values: Mapping[str, Any]
+    variables: Mapping[str, Any] | None
+    """What the conditions saw at the start; None in a restored episode until its next evaluation."""
+    demands: dict[str, Demand] = field(default_factory=dict)
+    """By action; an action whose parameters cannot be rendered yet has none."""
+    outdated: set[str] = field(default_factory=set)
+    """Actions that changed since: their demands hold until they can be rendered anew."""
+
+    def started(self, rule: CompiledRule, identity: Identity) -> Event:
+        """The event of its start, with what is rendered for the rule's actions as they are now."""
+        rendered = {action.name: render(action, self.variables) for action in rule.actions}
+        return replace(self._event(rule, identity, None, None, self.values), rendered=rendered)
+
+    def ended(
+        self, rule: CompiledRule, identity: Identity, now: int, reason: Reason, values: Mapping[str, Any]
+    ) -> Event:
+        """The event of its end; `values` are those of the last evaluation."""
+        return self._event(rule, identity, now, reason, values)
+
+    def kept(self, rule: CompiledRule) -> OpenEpisode:
+        """As it is kept beyond a restart."""
+        return OpenEpisode(
+            rule.name, self.subject, self.id, self.onset, self.start, self.values, rule.classification, rule.digest
+        )
+
+    def is_complete(self, rule: CompiledRule) -> bool:
+        """Whether all demands are as the rule says."""
+        return not self.outdated and len(self.demands) >= len(rule.deploys)
+
+    def change(self, changed: Collection[str], gone: Collection[str]) -> None:
+        """The rule's deploy actions changed: demands of those that are gone go at once, the others hold for now."""
+        for action in gone:
+            self.demands.pop(action, None)
+        self.outdated = (self.outdated | set(changed)) - set(gone)
+
+    def render(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> int:
+        """Render what is not as the rule says; what cannot be rendered is tried at the next tick.
+
+        Returns how many demands changed.
+        """
+        changes = 0
+        for deploy in rule.deploys if self.variables is not None else ():
+            if deploy.action not in self.demands or deploy.action in self.outdated:
+                try:
+                    parameters = deploy.parameters.render(self.variables or {})
+                except InterpolationError as error:
+                    counters.errors += 1
+                    counters.last_error = f"action {deploy.action}: {error}"
+                    continue
+                self.demands[deploy.action] = self._demand(rule, identity, deploy, parameters)
+                self.outdated.discard(deploy.action)
+                changes += 1
+        return changes
+
+    def follow(self, rule: CompiledRule, variables: Mapping[str, Any], counters: RuleCounters) -> int:
+        """Evaluate anew the parameters of the actions that say so. Returns how many demands changed."""
+        changes = 0
+        for deploy in rule.deploys:
+            demand = self.demands.get(deploy.action)
+            if deploy.follow and demand is not None and deploy.action not in self.outdated:
+                parameters = followed(deploy, demand.parameters, variables, counters)
+                if parameters != demand.parameters:
+                    self.demands[deploy.action] = replace(demand, parameters=parameters)
+                    changes += 1
+        return changes
+
+    def _demand(self, rule: CompiledRule, identity: Identity, deploy: CompiledDeploy, parameters: Any) -> Demand:
+        return Demand(
+            rule=rule.name,
+            action=deploy.action,
+            template=deploy.template,
+            priority=deploy.priority,
+            parameters=parameters or {},
+            detector=identity.detector,
+            holder=identity.holder,
+            namespace=identity.namespace,
+            subject=self.subject.text,
+            subjects=self.subject.clients,
+            episode=self.id,
+            onset_time=self.onset,
+            start_time=self.start,
+            classification=rule.classification,
+            values=self.values,
+            rule_digest=rule.digest,
+        )
+
+    def _event(
+        self, rule: CompiledRule, identity: Identity, end: int | None, reason: Reason | None, values: Mapping[str, Any]
+    ) -> Event:
+        return Event(
+            holder=identity.holder,
+            rule=rule.name,
+            subject=self.subject.text,
+            subjects=self.subject.clients,
+            episode=self.id,
+            onset_time=self.onset,
+            start_time=self.start,
+            end_time=end,
+            reason=reason,
+            values=values,
+            classification=rule.classification,
+            models={model.name: model.runner.sha256 for model in rule.models if model.runner is not None},
+            element=self.subject.element,
+            dry_run=rule.dry_run,
+        )
