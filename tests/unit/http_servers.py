@@ -102,6 +102,7 @@ class Endpoint:
 
     def close(self) -> None:
         self.ended.set()
+        self._listener.shutdown(socket.SHUT_RDWR)  # a thread that waits in accept() keeps it open otherwise
         self._listener.close()
 
     def _run(self) -> None:

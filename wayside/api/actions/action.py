@@ -9,13 +9,14 @@ from pydantic import Field, model_validator
 
 from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
+from wayside.api.actions.notify import Notify
 from wayside.api.actions.plugin import ActionPlugin
 from wayside.api.actions.record import Record
 from wayside.api.actions.trigger import Trigger
 from wayside.api.actions.window import Window
 from wayside.api.base import JsonValue, Model, ObjectName, validations
 
-_KINDS = ("deploy", "record", "database", "trigger", "plugin")
+_KINDS = ("deploy", "record", "database", "trigger", "notify", "plugin")
 _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
@@ -34,6 +35,9 @@ class Action(Model):
     trigger: Trigger | None = Field(default=None, description="Have another system record while the episode lasts.")
     database: DatabaseAction | None = Field(
         default=None, description="Write the samples around the episode to the Detector's database (MongoDB)."
+    )
+    notify: Notify | None = Field(
+        default=None, description="Tell somebody, over HTTP, by an Alertmanager or on a Zenoh key."
     )
     plugin: ActionPlugin | None = Field(default=None, description="What an installed package does about it.")
 

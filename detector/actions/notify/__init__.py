@@ -1,0 +1,151 @@
+"""The notify action: somebody is told of a rule's episodes.
+
+Notify (the action's thread) ─▶ desk: EventDesk or AlertDesk ◀─ Courier (a thread of its own) ─▶ target
+                                  └▶ keeping: journal, dead letters
+
+What is told waits at the desk; the courier sends it, one request at a time, so that an endpoint that hangs costs
+nothing but what it is to be told.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar
+
+from pydantic import BaseModel
+
+from detector.actions.base import Action, Setting
+from detector.actions.episode import Completion, Episode
+from detector.actions.notify.alerting import AlertDesk, AlertTarget
+from detector.actions.notify.alerts import Batch
+from detector.actions.notify.courier import Courier
+from detector.actions.notify.events import EventDesk
+from detector.actions.notify.keeping import Keeping
+from detector.actions.notify.notice import Notice, Texts, texts
+from detector.actions.notify.outbox import Delivery, Message
+from detector.actions.notify.targets import HttpTarget, Target, ZenohTarget
+from wayside.api.actions import notify as api
+from wayside.api.actions.notify import Moment
+
+__all__ = ["Notify"]
+
+
+class Notify(Action[api.Notify]):
+    """Tells somebody. What takes time is done by the courier: here nothing waits but for the disk."""
+
+    Parameters: ClassVar[type[BaseModel]] = api.Notify
+
+    def __init__(self, parameters: api.Notify, setting: Setting) -> None:
+        super().__init__(parameters, setting)
+        self._keeping = Keeping(setting)
+        name = f"notify {setting.rule.name} {setting.action}"
+        field = f"EventRule {setting.rule.name}, action {setting.action}: notify"
+        self._work: _Events | _Alerts
+        if parameters.alertmanager is None:
+            self._work = _Events(parameters, setting, self._keeping, name, _target(parameters, setting, field))
+        else:
+            self._work = _Alerts(parameters, parameters.alertmanager, setting, self._keeping, name, field)
+
+    def started(self, episode: Episode) -> None:
+        """Tell of the start, unless another run of the action has."""
+        with self._work.at_desk():
+            kept = self._keeping.rendered(episode.id) if episode.resumed else None
+            rendered = texts(episode.rendered) if kept is None else kept
+            self._keeping.open(episode.id, rendered)
+            self._work.started(episode, rendered)
+
+    def ended(self, episode: Episode) -> None:
+        """Tell of the end."""
+        with self._work.at_desk():
+            self._work.ended(episode, self._keeping.rendered(episode.id) or texts(episode.rendered))
+
+    def completed(self, episode: Episode, completion: Completion) -> None:
+        """Nothing more will come of it."""
+        with self._work.at_desk():
+            if episode.ended is not None:
+                self._keeping.over(episode.id)
+            self._work.completed(episode)
+
+    def close(self) -> None:
+        """Try what waits once more, for a few seconds."""
+        keep = self.setting.closing.is_set()  # else the rule has no such action any more
+        self._work.close(keep)
+        self._keeping.close(keep)
+
+
+class _Events:
+    """Somebody is told by CloudEvents."""
+
+    def __init__(self, parameters: api.Notify, setting: Setting, keeping: Keeping, name: str, target: Target) -> None:
+        self._moments = parameters.moments
+        self._desk = EventDesk(parameters, setting, keeping)
+
+        def send(message: Message, give_up: Callable[[], bool]) -> Delivery:
+            return target.send(message.event, give_up)
+
+        self._courier = Courier(name, self._desk, send)
+
+    def at_desk(self) -> AbstractContextManager[None]:
+        return self._courier.at_desk()
+
+    def started(self, episode: Episode, rendered: Texts) -> None:
+        self._desk.opened(episode)
+        if not episode.resumed:
+            self._tell(Moment.STARTED, episode, episode.started, rendered)
+
+    def ended(self, episode: Episode, rendered: Texts) -> None:
+        if episode.ended is not None:
+            self._tell(Moment.ENDED, episode, episode.ended, rendered)
+
+    def completed(self, episode: Episode) -> None:
+        self._desk.ledger.close(episode.id)
+
+    def close(self, keep: bool) -> None:
+        self._courier.finish()
+        self._desk.leave(keep)
+
+    def _tell(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: Texts) -> None:
+        if moment in self._moments:
+            self._desk.add(Notice(episode.id, event, rendered, time.time()), time.monotonic())
+
+
+class _Alerts:
+    """Somebody is told by an Alertmanager."""
+
+    def __init__(
+        self,
+        parameters: api.Notify,
+        alertmanager: api.NotifyAlertmanager,
+        setting: Setting,
+        keeping: Keeping,
+        name: str,
+        field: str,
+    ) -> None:
+        self._desk = AlertDesk(parameters, alertmanager, setting, keeping)
+        self._courier: Courier[Batch] = Courier(name, self._desk, AlertTarget(alertmanager, field).send)
+
+    def at_desk(self) -> AbstractContextManager[None]:
+        return self._courier.at_desk()
+
+    def started(self, episode: Episode, rendered: Texts) -> None:
+        self._desk.opened(episode, rendered)
+
+    def ended(self, episode: Episode, rendered: Texts) -> None:
+        self._desk.over(episode)
+
+    def completed(self, episode: Episode) -> None:
+        """An alert is told to be over when its episode ends, and that is all."""
+
+    def close(self, keep: bool) -> None:
+        self._courier.finish()
+        self._desk.leave()
+
+
+def _target(parameters: api.Notify, setting: Setting, field: str) -> Target:
+    if parameters.http is not None:
+        return HttpTarget(parameters.http, f"{field}.http")
+    if parameters.zenoh is not None:
+        return ZenohTarget(parameters.zenoh, setting.messenger)
+    raise ValueError("the model lets nothing through without a target")

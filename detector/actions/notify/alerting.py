@@ -1,0 +1,124 @@
+"""The alerts of one action, from the episodes to the Alertmanager and back to what is reported."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+
+from detector.actions.base import Setting
+from detector.actions.episode import Episode, Outcome, OutcomeState
+from detector.actions.notify.alerts import Alert, Alerts, Batch, document, labels_of
+from detector.actions.notify.events import FULL, UNTOLD
+from detector.actions.notify.keeping import Keeping
+from detector.actions.notify.notice import Notice, Texts
+from detector.actions.notify.outbox import Delivery, Fate
+from detector.actions.notify.targets import Poster
+from wayside.api.actions.notify import Notify, NotifyAlertmanager
+
+_PATH = "/api/v2/alerts"
+
+
+class AlertDesk:
+    """What fires and what is over. Its lock is the courier's."""
+
+    def __init__(self, notify: Notify, alertmanager: NotifyAlertmanager, setting: Setting, keeping: Keeping) -> None:
+        self._alerts = Alerts(alertmanager.repeat.seconds, notify.give_up_after.seconds, notify.waiting)
+        self._setting = setting
+        self._keeping = keeping
+        self._episodes: dict[str, tuple[Episode, Texts]] = {}
+
+    def opened(self, episode: Episode, texts: Texts) -> None:
+        """An alert fires from now on."""
+        labels = labels_of(texts, episode.rule, self._setting.holder, episode.subject, episode.id, episode.element)
+        given = {"summary": texts.title, "description": texts.text}
+        annotations = {name: value for name, value in given.items() if value is not None}
+        now = time.time_ns()
+        alert = Alert(episode.id, labels, annotations, min(episode.start_time, now), time.monotonic())
+        self._episodes[episode.id] = episode, texts
+        if not self._alerts.fire(alert):
+            self._lose(alert, FULL)
+
+    def over(self, episode: Episode) -> None:
+        """It is to be told that it is over."""
+        if episode.id in self._episodes:
+            self._episodes[episode.id] = episode, self._episodes[episode.id][1]
+            now = time.time_ns()
+            end = now if episode.end_time is None else min(episode.end_time, now)
+            self._alerts.over(episode.id, end, time.monotonic())
+
+    def take(self, now: float) -> Batch | None:
+        """The alerts to send now."""
+        return self._alerts.take(now)
+
+    def wait(self, now: float) -> float | None:
+        """The seconds until alerts are due."""
+        return self._alerts.wait(now)
+
+    def hurry(self) -> None:
+        """What was not yet told is told once more."""
+        self._alerts.hurry()
+
+    def settle(self, sent: Batch, delivery: Delivery, now: float) -> None:
+        """What came of a request."""
+        told, given_up = self._alerts.settle(sent, delivery, now)
+        if delivery.fate is Fate.REFUSED:
+            self._setting.lose("times that alerts were refused", len(sent.alerts), delivery.why)
+        for alert in given_up:
+            self._lose(alert, delivery.why)
+        for alert in told:
+            self._told(alert)
+        done = {alert.episode for alert in (*told, *given_up)}
+        for alert in sent.alerts:
+            if alert.episode not in done and alert.episode in self._episodes:
+                said = "fires" if delivery.fate is Fate.DELIVERED else f"not delivered yet: {delivery.why}"
+                self._report(alert, OutcomeState.RUNNING, said)
+
+    def leave(self) -> None:
+        """The end. What was not heard is lost. What still fires lapses, or goes on after the next start."""
+        for alert in self._alerts.leave():
+            if alert.heard and alert.ends_at is None:
+                self._report(alert, OutcomeState.DONE, "it had not ended: its alert lapses, or the next start goes on")
+            else:
+                self._lose(alert, UNTOLD)
+
+    def _told(self, alert: Alert) -> None:
+        if alert.heard or alert.attempts == 1:
+            self._report(alert, OutcomeState.DONE, "")
+        else:
+            why = "it was heard of only when it was over, after failures: an Alertmanager tells nobody of such alerts"
+            self._setting.lose("alerts that nobody heard of", 1, why)
+            self._report(alert, OutcomeState.FAILED, why)
+        self._episodes.pop(alert.episode, None)
+
+    def _lose(self, alert: Alert, why: str) -> None:
+        known = self._episodes.pop(alert.episode, None)
+        if known is None:
+            return
+        episode, texts = known
+        event = episode.started if episode.ended is None else episode.ended
+        self._keeping.lose([Notice(episode.id, event, texts, time.time())], why, alert.attempts)
+        outcome = Outcome(OutcomeState.FAILED, f"not delivered: {why}", missing=1, details={"attempts": alert.attempts})
+        self._setting.report(episode, outcome)
+
+    def _report(self, alert: Alert, state: OutcomeState, message: str) -> None:
+        episode, _ = self._episodes[alert.episode]
+        remark = "; ".join(f"{name}: {why}" for name, why in sorted(episode.unrendered.items()))
+        told = f"{message} ({remark})" if message and remark else message or remark
+        self._setting.report(episode, Outcome(state, told, details={"attempts": alert.attempts}))
+
+
+class AlertTarget:
+    """Posts alerts."""
+
+    def __init__(self, alertmanager: NotifyAlertmanager, field: str) -> None:
+        self._poster = Poster(alertmanager, field)
+        self._url = alertmanager.url.rstrip("/").removesuffix(_PATH) + _PATH
+        self._repeat = alertmanager.repeat.seconds
+
+    def send(self, batch: Batch, give_up: Callable[[], bool]) -> Delivery:
+        """Try once."""
+        now = time.time_ns()
+        documents = [document(alert, alert.episode in batch.over, now, self._repeat) for alert in batch.alerts]
+        body = json.dumps(documents, separators=(",", ":"), ensure_ascii=False).encode()
+        return self._poster.post(self._url, {"Content-Type": "application/json"}, body, give_up)

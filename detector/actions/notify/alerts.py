@@ -1,0 +1,143 @@
+"""Alerts as an Alertmanager has them: what fires is told time and again, what is over is told until it is heard. Pure.
+
+An alert is known by its labels, and those of an episode never change: alertname (the rule), detector, subject, episode,
+the element of `each` where there is one, and the rule's own. Without word for four times `repeat` the Alertmanager
+takes it to be over: so nothing fires for ever when a detector is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from detector.actions.notify.notice import Texts
+from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_ASKED, Delivery, Fate
+from detector.cluster.backoff import Backoff
+from wayside.times import format_time
+
+BATCH = 100
+"""So many alerts go into one request."""
+_LAPSES = 4
+"""Times `repeat` after which an alert is over without word."""
+
+
+@dataclass(eq=False, slots=True)
+class Alert:
+    """One episode. Times of the outside world are nanoseconds since the epoch, `due` and `since` monotonic seconds."""
+
+    episode: str
+    labels: Mapping[str, str]
+    annotations: Mapping[str, str]
+    starts_at: int
+    due: float
+    ends_at: int | None = None
+    since: float = 0.0
+    """When it was over."""
+    heard: bool = False
+    """Whether it was ever delivered."""
+    attempts: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """The alerts of one request."""
+
+    alerts: Sequence[Alert]
+    over: frozenset[str]
+    """The episodes of those that are told to be over: while it is sent, more may end."""
+
+
+def labels_of(texts: Texts, rule: str, holder: str, subject: str, episode: str, element: str | None) -> dict[str, str]:
+    """An alert's labels; those that make it what it is come before the rule's own of the same name."""
+    own = {"alertname": rule, "detector": holder, "subject": subject, "episode": episode}
+    return {**texts.labels, **own, **({} if element is None else {"element": element})}
+
+
+def document(alert: Alert, over: bool, now: int, repeat: float) -> dict[str, Any]:
+    """As the Alertmanager's API v2 has it; `now` is nanoseconds since the epoch, `repeat` seconds."""
+    ends_at = alert.ends_at if over and alert.ends_at is not None else now + int(repeat * _LAPSES * 1e9)
+    return {
+        "labels": {name: value for name, value in alert.labels.items() if value},
+        "annotations": dict(alert.annotations),
+        "startsAt": format_time(alert.starts_at),
+        "endsAt": format_time(max(ends_at, alert.starts_at)),
+    }
+
+
+class Alerts:
+    """Those that fire, and those that are over and not yet told. `now` is in seconds of a monotonic clock."""
+
+    def __init__(self, repeat: float, give_up_after: float, capacity: int) -> None:
+        self._repeat, self._give_up_after, self._capacity = repeat, give_up_after, capacity
+        self._alerts: dict[str, Alert] = {}
+        self._pause = Backoff(FIRST, LONGEST)
+        self._paused_until = 0.0
+        self._last_tries: set[str] | None = None
+
+    def fire(self, alert: Alert) -> bool:
+        """False: there are as many already as may be."""
+        if len(self._alerts) >= self._capacity:
+            return False
+        self._alerts[alert.episode] = alert
+        return True
+
+    def over(self, episode: str, ends_at: int, now: float) -> None:
+        """The episode ended, if there is such an alert."""
+        alert = self._alerts.get(episode)
+        if alert is not None:
+            alert.ends_at, alert.since, alert.due = ends_at, now, now
+
+    def hurry(self) -> None:
+        """From now on, only what was not yet told is told, once more, without waiting for its time."""
+        self._last_tries = set()
+
+    def take(self, now: float) -> Batch | None:
+        """What to send now, in one request."""
+        if self._last_tries is not None:
+            untold = (alert for alert in self._alerts.values() if alert.ends_at is not None or not alert.heard)
+            chosen = [alert for alert in untold if alert.episode not in self._last_tries][:BATCH]
+            self._last_tries |= {alert.episode for alert in chosen}
+        elif now < self._paused_until:
+            return None
+        else:
+            chosen = [alert for alert in self._alerts.values() if alert.due <= now][:BATCH]
+        over = frozenset(alert.episode for alert in chosen if alert.ends_at is not None)
+        return Batch(chosen, over) if chosen else None
+
+    def wait(self, now: float) -> float | None:
+        """The seconds until `take` may have something; None: there are no alerts."""
+        due = min((alert.due for alert in self._alerts.values()), default=None)
+        return None if due is None else max(0.0, due - now, self._paused_until - now)
+
+    def settle(self, sent: Batch, delivery: Delivery, now: float) -> tuple[list[Alert], list[Alert]]:
+        """Those that are over and told, and those that are over and given up; none of them is here any more.
+
+        Those that fire go on: a refusal holds until the next time they are due.
+        """
+        if delivery.fate is Fate.AGAIN:
+            self._paused_until = now + max(min(delivery.asked, LONGEST_ASKED), self._pause.fail())
+        else:
+            self._pause.succeed()
+        told: list[Alert] = []
+        given_up: list[Alert] = []
+        for alert in sent.alerts:
+            alert.attempts += 1
+            if alert.episode in sent.over:
+                if delivery.fate is Fate.DELIVERED:
+                    told.append(alert)
+                elif delivery.fate is Fate.REFUSED or now - alert.since >= self._give_up_after:
+                    given_up.append(alert)
+                continue
+            alert.heard |= delivery.fate is Fate.DELIVERED
+            if alert.ends_at is None and delivery.fate is not Fate.AGAIN:
+                alert.due = now + self._repeat
+        for alert in (*told, *given_up):
+            self._alerts.pop(alert.episode, None)
+        return told, given_up
+
+    def leave(self) -> list[Alert]:
+        """All that are here; they are here no more."""
+        left = list(self._alerts.values())
+        self._alerts.clear()
+        return left

@@ -1,0 +1,35 @@
+"""Events that nobody was told of, in a file: one JSON object a line, with why.
+
+The file is bounded: when it is full it becomes `….old.jsonl`, in place of the one before, and a new one begins.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+SIZE = 10 << 20
+"""Bytes of one file."""
+
+
+class DeadLetters:
+    """Appends to a file. One thread at a time."""
+
+    def __init__(self, path: Path, size: int = SIZE) -> None:
+        self.path, self._size = path, size
+
+    def write(self, letter: Mapping[str, Any]) -> None:
+        """Append a letter. Raises OSError where the disk refuses, ValueError where it is no JSON."""
+        line = json.dumps(letter, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists() and self.path.stat().st_size + len(line) > self._size:
+            os.replace(self.path, self.path.with_suffix(".old.jsonl"))
+        with self.path.open("ab", buffering=0) as file:
+            begun = file.tell()
+            if file.write(line) != len(line):
+                file.truncate(begun)  # no half lines, should there be room again
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -1,0 +1,113 @@
+"""CloudEvents to tell of: kept, grouped, sent, and at last delivered or dead letters."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from detector.actions.base import Setting
+from detector.actions.episode import Episode
+from detector.actions.notify.grouping import Groups
+from detector.actions.notify.keeping import Keeping
+from detector.actions.notify.ledger import Ledger
+from detector.actions.notify.notice import Notice, event_of, event_of_group
+from detector.actions.notify.outbox import Budget, Delivery, Fate, Message, Outbox
+from detector.actions.notify.targets import encoded
+from wayside.api.actions.notify import Notify
+
+UNTOLD = "the detector ended, or the rule no longer has this action, before it was delivered"
+FULL = "more messages wait than the rule allows (waiting)"
+
+
+class EventDesk:
+    """What a rule has to tell by one action, from `add` to delivery. Its lock is the courier's."""
+
+    def __init__(self, notify: Notify, setting: Setting, keeping: Keeping) -> None:
+        rate, grouping = notify.rate, notify.grouping
+        budget = None if rate is None else Budget(rate.messages, rate.per.seconds)
+        self._outbox = Outbox(notify.waiting, notify.give_up_after.seconds, budget)
+        self._grouping = grouping
+        self._groups = None if grouping is None else Groups(grouping.by, grouping.wait.seconds)
+        self._action = setting.action
+        self._keeping = keeping
+        self._hurrying = False
+        self.ledger = Ledger(setting.report)
+        for notice in keeping.waiting():
+            self._admit(notice, time.monotonic())
+
+    def add(self, notice: Notice, now: float) -> None:
+        """Tell of this as well."""
+        self._keeping.keep(notice)
+        self._admit(notice, now)
+
+    def _admit(self, notice: Notice, now: float) -> None:
+        self.ledger.expect(notice.episode)
+        if self._groups is None:
+            self._post([notice])
+        else:
+            self._groups.add(notice, now)
+            self._close_groups(now)
+
+    def _close_groups(self, now: float) -> None:
+        if self._groups is not None:
+            for notices in self._groups.closed(now, everything=self._hurrying):
+                self._post(notices)
+
+    def _post(self, notices: Sequence[Notice]) -> None:
+        if self._grouping is None:
+            event = event_of(notices[0])
+        else:
+            event = event_of_group(notices, self._action, self._grouping.by, self._grouping.maximum)
+        message = Message(event, notices)
+        if not self._outbox.add(message):
+            self._lose(message, FULL)
+
+    def take(self, now: float) -> Message | None:
+        """The message to send now."""
+        self._close_groups(now)
+        return self._outbox.take(now)
+
+    def wait(self, now: float) -> float | None:
+        """The seconds until a message or a group is due."""
+        group = None if self._groups is None else self._groups.next_due()
+        waits = [self._outbox.wait(now), None if group is None else max(0.0, group - now)]
+        return min((wait for wait in waits if wait is not None), default=None)
+
+    def settle(self, sent: Message, delivery: Delivery, now: float) -> None:
+        """What came of an attempt."""
+        fate = self._outbox.settle(sent, delivery, now, time.time())
+        if fate is Fate.DELIVERED:
+            size = len(encoded(sent.event))
+            for notice in sent.notices:
+                self.ledger.delivered(notice.episode, size)
+            self._keeping.told(sent.notices)
+        elif fate is Fate.REFUSED:
+            attempts = f"after {sent.attempts} attempts, " if delivery.fate is Fate.AGAIN else ""
+            self._lose(sent, f"{attempts}{delivery.why}")
+        else:
+            for episode in sent.episodes:
+                self.ledger.retried(episode, delivery.why)
+
+    def hurry(self) -> None:
+        """No group waits any longer, and each message is tried once more."""
+        self._hurrying = True
+        self._close_groups(0.0)
+        self._outbox.hurry()
+
+    def leave(self, keep: bool) -> None:
+        """The end: what waits is told after the next start if it is to be kept and can be, and else lost."""
+        for message in self._outbox.leave():
+            if keep and all(map(self._keeping.keeps_notice, message.notices)):
+                for episode in message.episodes:
+                    self.ledger.kept(episode)
+            else:
+                self._lose(message, UNTOLD)
+
+    def _lose(self, message: Message, why: str) -> None:
+        self._keeping.lose(message.notices, why, message.attempts)
+        for notice in message.notices:
+            self.ledger.failed(notice.episode, why)
+
+    def opened(self, episode: Episode) -> None:
+        """There is this episode."""
+        self.ledger.open(episode)

@@ -1,0 +1,48 @@
+"""Events that belong in one message: they wait for each other, a bounded time and in bounded number. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from detector.actions.notify.notice import Notice
+
+MOST = 10_000
+"""So many events wait in all groups together; beyond, the oldest group is closed early."""
+
+
+@dataclass(slots=True)
+class _Group:
+    due: float
+    notices: list[Notice] = field(default_factory=list)
+
+
+class Groups:
+    """Open groups, by the values of the labels that events are grouped by. Times are seconds of any one clock."""
+
+    def __init__(self, by: Sequence[str], wait: float, most: int = MOST) -> None:
+        self._by, self._wait, self._most = tuple(by), wait, most
+        self._open: dict[tuple[str, ...], _Group] = {}
+        self._count = 0
+
+    def add(self, notice: Notice, now: float) -> None:
+        """Into its group, which is opened where there is none."""
+        key = tuple(notice.texts.labels.get(name, "") for name in self._by)
+        if key not in self._open:
+            self._open[key] = _Group(now + self._wait)
+        self._open[key].notices.append(notice)
+        self._count += 1
+
+    def closed(self, now: float, everything: bool = False) -> list[list[Notice]]:
+        """The groups whose time has come, in the order in which they were opened; they are open no more."""
+        found: list[list[Notice]] = []
+        for key, group in list(self._open.items()):
+            if everything or group.due <= now or self._count > self._most:
+                del self._open[key]
+                self._count -= len(group.notices)
+                found.append(group.notices)
+        return found
+
+    def next_due(self) -> float | None:
+        """When the next group's time comes; None: there is none."""
+        return min((group.due for group in self._open.values()), default=None)

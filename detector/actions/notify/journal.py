@@ -1,0 +1,150 @@
+"""What is not yet told, in a file: it outlives a kill -9.
+
+One JSON object a line: `{"put": key, "document": {…}}` or `{"drop": [keys]}`. What the system was given survives the
+process; a power cut may take the last seconds. A line that was cut by the end is skipped. The file is written anew, in
+one step, when it holds much that is dropped.
+
+A changed action works beside its predecessor for as long as that has episodes to complete: each has a file that it
+locks, and takes over those that nobody has locked.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import logging
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+_log = logging.getLogger(__name__)
+
+_FILES = 16
+"""An action has so many files at most: one, and those of predecessors that still work."""
+_SLACK = 1 << 20
+"""Bytes of what is dropped that a file may hold beside what is not."""
+
+
+class JournalError(Exception):
+    """There can be no journal; the text says why."""
+
+
+class Journal:
+    """Documents by key, as they were put. Not thread-safe."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        """Take over what earlier runs left in `folder` under `name`. Raises JournalError."""
+        self.live: dict[str, dict[str, Any]] = {}
+        """What was put and not dropped, oldest first."""
+        self.unreadable = 0
+        """Lines of earlier runs that are no JSON of ours, but for a last one that was cut."""
+        self._sizes: dict[str, int] = {}
+        self._live_bytes = self._written = 0
+        taken: list[tuple[Path, BinaryIO]] = []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for number in range(_FILES):
+                path = folder / f"{name}.{number}.jsonl"
+                if taken and not path.exists():
+                    continue
+                file = _locked(path)
+                if file is not None:
+                    taken.append((path, file))
+                    self._read(file)
+        except OSError as error:
+            raise JournalError(f"{folder} cannot be written ({error.strerror})") from error
+        if not taken:
+            raise JournalError(f"{folder} has {_FILES} journals of {name} in use")
+        self._path, self._file = taken[0]
+        try:
+            self._rewrite()
+            for path, file in taken[1:]:
+                path.unlink()
+                file.close()
+        except OSError as error:
+            raise JournalError(f"{folder} cannot be written ({error.strerror})") from error
+
+    def put(self, key: str, document: Mapping[str, Any]) -> None:
+        """Keep a document. Raises OSError where the disk refuses; it is then not kept."""
+        line = _line({"put": key, "document": document})
+        self._append(line)
+        self._remember(key, dict(document), len(line))
+
+    def drop(self, keys: Iterable[str]) -> None:
+        """Keep these no more. Raises OSError where the disk refuses: they come back after a restart, then."""
+        known = [key for key in keys if key in self.live]
+        if not known:
+            return
+        for key in known:
+            del self.live[key]
+            self._live_bytes -= self._sizes.pop(key)
+        self._append(_line({"drop": known}))
+        if self._written > 2 * self._live_bytes + _SLACK:
+            self._rewrite()
+
+    def close(self) -> None:
+        """Leave the file to the next run, or remove it where nothing is left in it. Raises OSError."""
+        if not self.live:
+            self._path.unlink(missing_ok=True)
+        self._file.close()
+
+    def _remember(self, key: str, document: dict[str, Any], size: int) -> None:
+        self._live_bytes += size - self._sizes.get(key, 0)
+        self.live[key], self._sizes[key] = document, size
+
+    def _append(self, line: bytes) -> None:
+        begun = self._file.tell()
+        if self._file.write(line) != len(line):
+            self._file.truncate(begun)  # no half lines, should there be room again
+            self._file.seek(begun)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._written += len(line)
+
+    def _read(self, file: BinaryIO) -> None:
+        file.seek(0)
+        for line in file:
+            try:
+                entry = json.loads(line)
+                if "put" in entry:
+                    self._remember(str(entry["put"]), dict(entry["document"]), len(line))
+                for key in entry.get("drop", ()):
+                    if self.live.pop(key, None) is not None:
+                        self._live_bytes -= self._sizes.pop(key)
+            except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+                self.unreadable += line.endswith(b"\n")
+
+    def _rewrite(self) -> None:
+        """Only what is live; the file keeps its lock, so it is replaced by one that is locked as well."""
+        lines = b"".join(_line({"put": key, "document": document}) for key, document in self.live.items())
+        draft = self._path.with_suffix(".new")
+        file = draft.open("w+b", buffering=0)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if file.write(lines) != len(lines):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.replace(draft, self._path)
+        except OSError:
+            file.close()
+            raise
+        self._file.close()
+        self._file, self._written = file, len(lines)
+
+
+def _locked(path: Path) -> BinaryIO | None:
+    """The file, made where there is none; None where somebody has it."""
+    file = path.open("a+b", buffering=0)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        return None
+    if not path.exists() or os.stat(path).st_ino != os.fstat(file.fileno()).st_ino:
+        file.close()  # it was removed or replaced between opening and locking
+        return None
+    return file
+
+
+def _line(entry: Mapping[str, Any]) -> bytes:
+    return json.dumps(entry, separators=(",", ":"), ensure_ascii=False).encode() + b"\n"

@@ -1,0 +1,150 @@
+"""What an action keeps on the state volume: what is not yet told, what is rendered for open episodes, dead letters.
+
+Where the Detector has no state volume, or its disk refuses, everything else goes on: what would not survive is counted,
+and so is what nobody was told of.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from detector.actions.base import Setting
+from detector.actions.notify.dead_letters import DeadLetters
+from detector.actions.notify.journal import Journal, JournalError
+from detector.actions.notify.notice import Notice, Texts, notice_from, texts
+from wayside.names import encode
+from wayside.times import format_seconds
+
+_log = logging.getLogger(__name__)
+
+FOLDER = "notify"
+"""In the folder of `spec.state`."""
+_NOTICE, _OPEN = "notice/", "open/"
+_LOST = "events that nobody was told of"
+_UNKEPT = "events that would not survive the detector's end"
+
+
+class Keeping:
+    """Not thread-safe."""
+
+    def __init__(self, setting: Setting) -> None:
+        self._setting = setting
+        self._journal: Journal | None = None
+        self._letters: DeadLetters | None = None
+        self._claimed: set[str] = set()
+        """The keys of episodes that are open in this run: others of before are over."""
+        detector = setting.surroundings().detector
+        state = detector.spec.state
+        if state is None:
+            return
+        folder = Path(state.path) / FOLDER
+        whose = (detector.namespace, setting.holder, setting.rule.name, setting.action)
+        name = "_".join(map(encode, whose))
+        self._letters = DeadLetters(folder / f"{name}.dead.jsonl")
+        try:
+            self._journal = Journal(folder, name)
+        except JournalError as error:
+            _log.error("what action %s of EventRule %s has to tell is not kept: %s", *whose[:1:-1], error)
+            setting.lose(_UNKEPT, 1, str(error))
+            return
+        if self._journal.unreadable:
+            setting.lose("lines of the journal that could not be read", self._journal.unreadable, "no JSON of ours")
+
+    def waiting(self) -> list[Notice]:
+        """What earlier runs did not tell, oldest first."""
+        found: list[Notice] = []
+        for key, document in list(self._kept(_NOTICE).items()):
+            try:
+                found.append(notice_from(document))
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                self._setting.lose(_LOST, 1, f"the journal's entry cannot be read: {type(error).__name__}")
+                self._drop([key])
+        return found
+
+    def keep(self, notice: Notice) -> None:
+        """Until `told`."""
+        self._put(_NOTICE + notice.id, notice.to_json())
+
+    def told(self, notices: Iterable[Notice]) -> None:
+        """These need not be kept any more."""
+        self._drop([_NOTICE + notice.id for notice in notices])
+
+    @property
+    def keeps(self) -> bool:
+        """Whether what waits at the end is there at the next start."""
+        return self._journal is not None
+
+    def keeps_notice(self, notice: Notice) -> bool:
+        """Whether this one is."""
+        return self._journal is not None and _NOTICE + notice.id in self._journal.live
+
+    def open(self, episode: str, rendered: Texts) -> None:
+        """Keep what was rendered for an episode until its end: after a restart it cannot be rendered again."""
+        key = _OPEN + episode
+        self._claimed.add(key)
+        self._put(key, rendered.to_json())
+
+    def rendered(self, episode: str) -> Texts | None:
+        """What was kept for it."""
+        document = None if self._journal is None else self._journal.live.get(_OPEN + episode)
+        return None if document is None else texts(document)
+
+    def over(self, episode: str) -> None:
+        """It has ended."""
+        self._claimed.discard(_OPEN + episode)
+        self._drop([_OPEN + episode])
+
+    def lose(self, notices: Iterable[Notice], why: str, attempts: int) -> None:
+        """Nobody will be told of these: they become dead letters, and are counted."""
+        lost = list(notices)
+        self._setting.lose(_LOST, len(lost), why)
+        for notice in lost:
+            letter = {
+                "created": format_seconds(notice.created),
+                "rule": self._setting.rule.name,
+                "action": self._setting.action,
+                "why": why,
+                "attempts": attempts,
+                "texts": notice.texts.to_json(),
+                "event": notice.event,
+            }
+            try:
+                if self._letters is None:
+                    _log.error("nobody was told of event %s: %s", notice.id, why)
+                else:
+                    self._letters.write(letter)
+            except (OSError, ValueError) as error:
+                self._setting.lose("dead letters that could not be written", 1, str(error))
+        self.told(lost)
+
+    def close(self, keep: bool) -> None:
+        """The last call. Without `keep` nothing is left for the next start."""
+        self._drop([key for key in self._kept(_OPEN) if not keep or key not in self._claimed])
+        if self._journal is not None:
+            try:
+                self._journal.close()
+            except OSError as error:
+                _log.error("the journal of action %s cannot be closed: %s", self._setting.action, error)
+
+    def _kept(self, prefix: str) -> Mapping[str, dict[str, Any]]:
+        live = {} if self._journal is None else self._journal.live
+        return {key: document for key, document in live.items() if key.startswith(prefix)}
+
+    def _put(self, key: str, document: Mapping[str, Any]) -> None:
+        if self._journal is None:
+            return
+        try:
+            self._journal.put(key, document)
+        except OSError as error:
+            self._setting.lose(_UNKEPT, 1, str(error))
+
+    def _drop(self, keys: list[str]) -> None:
+        if self._journal is None:
+            return
+        try:
+            self._journal.drop(keys)
+        except OSError as error:
+            self._setting.lose("entries of the journal that could not be dropped", len(keys), str(error))

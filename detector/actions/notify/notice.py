@@ -1,0 +1,132 @@
+"""What somebody is told of: one event of an episode, with the texts that the rule has for it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from wayside.api.actions.notify import Moment
+
+GROUP_TYPE = "dev.wayside.event.group"
+"""The type of the CloudEvent that stands for several."""
+
+
+@dataclass(frozen=True, slots=True)
+class Texts:
+    """What a rule says in words of an episode."""
+
+    title: str | None = None
+    text: str | None = None
+    labels: Mapping[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """As it goes into events and the journal: what is absent is left out."""
+        given = {"title": self.title, "text": self.text, "labels": dict(self.labels) or None}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+def texts(rendered: Mapping[str, Any]) -> Texts:
+    """From what was rendered; values that are no text become one."""
+    labels = rendered.get("labels")
+    return Texts(
+        _text(rendered.get("title")),
+        _text(rendered.get("text")),
+        {name: _text(value) or "" for name, value in labels.items()} if isinstance(labels, Mapping) else {},
+    )
+
+
+def _text(value: Any) -> str | None:
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return json.dumps(value, ensure_ascii=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """One event to tell of."""
+
+    episode: str
+    event: Mapping[str, Any]
+    """The CloudEvent as published on Zenoh."""
+    texts: Texts
+    created: float
+    """Seconds since the epoch."""
+
+    @property
+    def id(self) -> str:
+        """That of the event, which is the same however often it is told."""
+        return str(self.event["id"])
+
+    @property
+    def moment(self) -> Moment:
+        """Whether an episode started or ended."""
+        return Moment.STARTED if str(self.event["type"]).endswith(".started") else Moment.ENDED
+
+    def to_json(self) -> dict[str, Any]:
+        """For the journal."""
+        return {
+            "episode": self.episode,
+            "event": dict(self.event),
+            "texts": self.texts.to_json(),
+            "created": self.created,
+        }
+
+
+def notice_from(document: Mapping[str, Any]) -> Notice:
+    """What `to_json` gave. Raises KeyError, TypeError or ValueError where it is something else."""
+    event = document["event"]
+    if not isinstance(event, dict) or not isinstance(event["data"], dict) or not isinstance(event["type"], str):
+        raise ValueError("no event")
+    return Notice(str(document["episode"]), event, texts(document["texts"]), float(document["created"]))
+
+
+def event_of(notice: Notice) -> dict[str, Any]:
+    """The CloudEvent of a single event: as published on Zenoh, its data with the rule's texts."""
+    told = notice.texts.to_json()
+    data = {**notice.event["data"], **({"notification": told} if told else {})}
+    return {**notice.event, "data": data}
+
+
+def event_of_group(notices: Sequence[Notice], action: str, by: Sequence[str], maximum: int) -> dict[str, Any]:
+    """One CloudEvent for several events of a rule, in the order in which they came.
+
+    Its id follows from theirs: the same events always have the same. The texts are those of the first; `labels` has
+    those that the events have in common, which is those that they are grouped by.
+
+    Args:
+        notices: at least one.
+        action: the action's name in the rule.
+        by: the labels that they are grouped by.
+        maximum: so many are given in full.
+    """
+    first, last = notices[0], notices[-1]
+    ids = "\n".join(notice.id for notice in notices)
+    more = len(notices) - 1
+    labels = {name: first.texts.labels.get(name, "") for name in by}
+    text = first.texts.text
+    told = Texts(first.texts.title, f"{text} (and {more} more)" if text and more else text, labels).to_json()
+    starts = sum(notice.moment is Moment.STARTED for notice in notices)
+    return {
+        "specversion": "1.0",
+        "id": f"group.{hashlib.sha256(ids.encode()).hexdigest()[:32]}",
+        "source": first.event["source"],
+        "type": GROUP_TYPE,
+        "subject": f"{first.event['data']['rule']}/{action}",
+        "time": last.event["time"],
+        "datacontenttype": "application/json",
+        "data": {
+            "rule": first.event["data"]["rule"],
+            "action": action,
+            "count": len(notices),
+            "started": starts,
+            "ended": len(notices) - starts,
+            "events": [event_of(notice) for notice in notices[:maximum]],
+            "omitted": max(0, len(notices) - maximum),
+            **({"notification": told} if told else {}),
+        },
+    }

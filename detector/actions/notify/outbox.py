@@ -1,0 +1,164 @@
+"""Messages that wait to be delivered: which is next, when, and when it is given up. Pure: `now` comes in.
+
+A message that fails waits longer each time, and others pass it by, but never those of the same episode: the end is not
+told before the start. An endpoint that does not answer, or says that it is busy, is left alone as a whole for a while.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from detector.actions.notify.notice import Notice
+from detector.cluster.backoff import Backoff
+
+FIRST, LONGEST = 1.0, 300.0
+"""Seconds until the second attempt, and between two attempts at most."""
+LONGEST_ASKED = 3600.0
+"""Seconds that a Retry-After is heeded at most."""
+
+
+class Fate(Enum):
+    """What follows for a message."""
+
+    DELIVERED = "delivered"
+    AGAIN = "again"
+    REFUSED = "refused"
+    """It would be refused again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """What came of an attempt."""
+
+    fate: Fate
+    why: str = ""
+    asked: float = 0.0
+    """Seconds that the endpoint asks to be left alone, at least."""
+    whole: bool = False
+    """It is the endpoint that is away or busy, not this message that it does not like."""
+
+
+@dataclass(eq=False, slots=True)
+class Message:
+    """One CloudEvent to deliver, and the events that it tells of."""
+
+    event: Mapping[str, Any]
+    notices: Sequence[Notice]
+    backoff: Backoff = field(default_factory=lambda: Backoff(FIRST, LONGEST))
+    due: float = 0.0
+    attempts: int = 0
+
+    @property
+    def created(self) -> float:
+        """When the first of its events was told, in seconds since the epoch."""
+        return min(notice.created for notice in self.notices)
+
+    @property
+    def episodes(self) -> frozenset[str]:
+        """Those that it tells of."""
+        return frozenset(notice.episode for notice in self.notices)
+
+
+class Budget:
+    """So many messages in so much time: a bucket that fills evenly."""
+
+    def __init__(self, messages: int, per: float) -> None:
+        self._most, self._each = float(messages), per / messages
+        self._left, self._since = float(messages), 0.0
+
+    def wait(self, now: float) -> float:
+        """The seconds until the next message may go."""
+        self._left = min(self._most, self._left + max(0.0, now - self._since) / self._each)
+        self._since = now
+        return 0.0 if self._left >= 1 - 1e-9 else (1 - self._left) * self._each
+
+    def spend(self) -> None:
+        """One goes."""
+        self._left -= 1
+
+
+class Outbox:
+    """At most `capacity` messages. `now` is in seconds of a monotonic clock, `wall` in seconds since the epoch."""
+
+    def __init__(self, capacity: int, give_up_after: float, budget: Budget | None = None) -> None:
+        self._capacity, self._give_up_after, self._budget = capacity, give_up_after, budget
+        self._waiting: list[Message] = []
+        self._pause = Backoff(FIRST, LONGEST)
+        self._paused_until = 0.0
+        self._last_tries: set[int] | None = None
+        """Once the end is near: which messages were tried since."""
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def add(self, message: Message) -> bool:
+        """False: it found no place."""
+        if len(self._waiting) >= self._capacity:
+            return False
+        self._waiting.append(message)
+        return True
+
+    def hurry(self) -> None:
+        """From now on, each message is tried once more, without waiting for its time."""
+        self._last_tries = set()
+
+    def take(self, now: float) -> Message | None:
+        """The message to send now; tell `settle` what came of it before the next."""
+        if self._budget is not None and self._budget.wait(now) > 0:
+            return None
+        if self._last_tries is None and now < self._paused_until:
+            return None
+        for message in self._first_of_their_episodes():
+            if self._is_due(message, now):
+                if self._budget is not None:
+                    self._budget.spend()
+                if self._last_tries is not None:
+                    self._last_tries.add(id(message))
+                message.attempts += 1
+                return message
+        return None
+
+    def _first_of_their_episodes(self) -> Iterator[Message]:
+        """The messages that no earlier one about the same episode holds up."""
+        held: set[str] = set()
+        for message in self._waiting:
+            if not held & message.episodes:
+                yield message
+            held |= message.episodes
+
+    def _is_due(self, message: Message, now: float) -> bool:
+        if self._last_tries is not None:
+            return id(message) not in self._last_tries
+        return message.due <= now
+
+    def wait(self, now: float) -> float | None:
+        """The seconds after which `take` may have something; None: nothing waits."""
+        due = min((message.due for message in self._first_of_their_episodes()), default=None)
+        if due is None:
+            return None
+        wait = max(0.0, due - now, self._paused_until - now)
+        return wait if self._budget is None else max(wait, self._budget.wait(now))
+
+    def settle(self, message: Message, delivery: Delivery, now: float, wall: float) -> Fate:
+        """What became of the message that `take` gave: DELIVERED or REFUSED, and it waits no more; or AGAIN."""
+        if not delivery.whole:
+            self._pause.succeed()
+        fate = delivery.fate
+        if fate is Fate.AGAIN:
+            asked = min(delivery.asked, LONGEST_ASKED)
+            message.due = now + max(asked, message.backoff.fail())
+            if delivery.whole:
+                self._paused_until = now + max(asked, self._pause.fail())
+            if wall - message.created >= self._give_up_after:
+                fate = Fate.REFUSED
+        if fate is not Fate.AGAIN:
+            self._waiting.remove(message)
+        return fate
+
+    def leave(self) -> list[Message]:
+        """What still waits; it is here no more."""
+        left, self._waiting = self._waiting, []
+        return left
