@@ -36,8 +36,10 @@ WRITTEN = ("events.jsonl", "tasks.yaml", "manifests.yaml", "detector.log")
 """What comes out, beside the folder tasks."""
 DURATION_S = 22.5
 """Of the drive: by then all have parted, and the demo is no longer than it must be."""
-PATIENCE_S = 8.0
-"""How long after the drive the last applications are waited for."""
+PATIENCE_S = 60.0
+"""How long to wait, on a slow machine, for a start, for the last applications after the drive, and for an end."""
+LOOK_S = 1.0
+"""How long one attempt to reach the detector takes at most; then it is seen whether it still runs."""
 
 
 def main() -> int:
@@ -54,7 +56,7 @@ def main() -> int:
     )
     with _detector(output) as detector, _vehicles() as drive:
         expected = _expected()  # while both are starting
-        with _events() as events:
+        with _events(detector) as events:
             teller = Timeline(console, output / "tasks")
             until = None
             while until is None or (teller.running and time.monotonic() < until):
@@ -80,12 +82,13 @@ def _expected() -> list[str]:
 def _vehicles() -> Iterator[subprocess.Popen[bytes]]:
     """The drive; it begins as soon as the detector listens."""
     command = ["--connect", ENDPOINT, "--seed", str(DEMO_SEED), "--duration", str(DURATION_S)]
+    command += ["--wait", str(PATIENCE_S)]
     process = subprocess.Popen([sys.executable, str(HERE / "drive.py"), *command], stdout=subprocess.DEVNULL)
     try:
         yield process
     finally:
         process.terminate()
-        process.wait(10)
+        process.wait(PATIENCE_S)
 
 
 @contextmanager
@@ -100,28 +103,44 @@ def _detector(output: Path) -> Iterator[subprocess.Popen[bytes]]:
             yield process
         finally:
             process.send_signal(signal.SIGTERM)
-            process.wait(10)
+            process.wait(PATIENCE_S)
 
 
 @contextmanager
-def _events() -> Iterator[queue.Queue[dict[str, Any]]]:
-    """The CloudEvents that the detector publishes, as anybody on the network gets them."""
+def _events(detector: subprocess.Popen[bytes]) -> Iterator[queue.Queue[dict[str, Any]]]:
+    """The CloudEvents that the detector publishes, as anybody on the network gets them; none if it ends before."""
     events: queue.Queue[dict[str, Any]] = queue.Queue(1000)
     config = zenoh.Config()
     for key, value in {
         "connect/endpoints": [ENDPOINT],
-        "connect/timeout_ms": 10_000,  # the detector is just starting
+        "connect/timeout_ms": round(LOOK_S * 1000),
         "connect/exit_on_failure": True,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1},
         "listen/endpoints": [],
         "scouting/multicast/enabled": False,
     }.items():
         config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as session:
+    session = _session(config, detector)
+    if session is None:
+        yield events
+        return
+    with session:
         session.declare_subscriber(
             "wayside/events/**", lambda sample: events.put(json.loads(sample.payload.to_bytes()))
         )
         yield events
+
+
+def _session(config: zenoh.Config, detector: subprocess.Popen[bytes]) -> zenoh.Session | None:
+    """A session with the detector, which is just starting; None if it ends instead."""
+    patience = time.monotonic() + PATIENCE_S
+    while detector.poll() is None:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError:
+            if time.monotonic() >= patience:
+                raise
+    return None
 
 
 class Timeline:

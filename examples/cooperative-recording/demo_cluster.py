@@ -31,7 +31,8 @@ from tests.cluster.controlplane import ControlPlane  # noqa: E402
 from tests.cluster.crds import CRDS, apply_crds  # noqa: E402
 
 NAMESPACE = "wayside-demo"
-LINGERING_S = 6.0
+PATIENCE_S = 60.0
+"""How long to wait, on a slow machine, for a start, for the last applications after the drive, and for an end."""
 
 
 def main() -> int:
@@ -54,7 +55,9 @@ def main() -> int:
         stack.enter_context(_program("detector.cli", [*run, *told], output / "detector.log", environment))
         console.print(f"To look on from another terminal: export KUBECONFIG={kubeconfig}")
         console.print(f"                                  kubectl -n {NAMESPACE} get wayside,deployments")
-        drive = subprocess.Popen([sys.executable, str(HERE / "drive.py"), "--wait", "60"], stdout=subprocess.DEVNULL)
+        drive = subprocess.Popen(
+            [sys.executable, str(HERE / "drive.py"), "--wait", str(PATIENCE_S)], stdout=subprocess.DEVNULL
+        )
         stack.callback(drive.terminate)
         left = _tell(console, Api(kubeconfig, NAMESPACE), drive)
     console.print(f"See {output}: events.jsonl, detector.log, manager.log.")
@@ -103,25 +106,30 @@ def _program(module: str, arguments: list[str], log: Path, environment: dict[str
             yield
         finally:
             process.send_signal(signal.SIGTERM)
-            process.wait(15)
+            process.wait(PATIENCE_S)
 
 
 def _tell(console: Console, api: Api, drive: subprocess.Popen[bytes]) -> list[str]:
     """Print what changes until the drive is over and the last application is gone; what is left then."""
     begin, until = time.monotonic(), None
     seen: dict[str, str] = {}
-    while until is None or time.monotonic() < until:
+    while until is None or (_running(seen) and time.monotonic() < until):
         states = _states(api)
         for name in sorted(seen.keys() | states.keys()):
             if seen.get(name) != states.get(name):
                 console.print(f"{time.monotonic() - begin:5.1f} s  {name}  [bold]{states.get(name, 'gone')}[/]")
         seen = states
         if until is None and drive.poll() is not None:
-            until = time.monotonic() + LINGERING_S
+            until = time.monotonic() + PATIENCE_S
         time.sleep(0.2)
-    left = sorted(name for name in seen if name.startswith("Deployment"))
+    left = [name for name in _running(seen) if name.startswith("Deployment")]
     console.print(f"[red]left over:[/] {', '.join(left)}" if left else "All applications are gone.")
     return left
+
+
+def _running(states: dict[str, str]) -> list[str]:
+    """What is not over: all but tasks that have ended."""
+    return sorted(name for name, state in states.items() if state != "Finished")
 
 
 def _states(api: Api) -> dict[str, str]:
