@@ -82,7 +82,12 @@ def wait_sources(api: Api, region: str, sources: list[str]) -> tuple[Object, Obj
         labels=f"region={region}",
         what=f"the application of {region} is told {sources}",
     )
-    (deployment,) = api.list("Deployment", labels=f"region={region}")
+    (deployment,) = api.wait_list(  # made after the ConfigMap
+        "Deployment",
+        lambda found: len(found) == 1,
+        labels=f"region={region}",
+        what=f"the application of {region} is there",
+    )
     return task, instance, deployment
 
 
