@@ -15,6 +15,7 @@ from typing import Any, cast
 
 from application_manager.core import parameters, values
 from application_manager.core.claims import unknown_members
+from application_manager.core.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
 from application_manager.core.policy import Policy
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import API_VERSION, MANAGED_BY, MANAGED_BY_LABEL
@@ -24,6 +25,7 @@ INSTANCE_LABEL = "wayside.dev/instance"
 TEMPLATE_LABEL = "wayside.dev/template"
 
 _INSTANCE_VARIABLES = ("name", "key", "namespace")
+_WITH_CONFIGURATION = (*_INSTANCE_VARIABLES, "configMap")
 _ENVIRONMENT = Environment({"parameters": Kind.MAP, "instance": Kind.MAP})
 _RESERVED_METADATA = ("ownerReferences", "generateName", "uid", "resourceVersion", "managedFields", "finalizers")
 
@@ -62,8 +64,18 @@ class Renderer:
         self._keyed = template.spec.key is not None
         self._manifests: list[CompiledTemplate] = []
         problems: list[str] = []
-        known = {"parameters": tuple(sorted(template.spec.parameters)), "instance": _INSTANCE_VARIABLES}
+        configured = bool(template.spec.configuration)
+        members = _WITH_CONFIGURATION if configured else _INSTANCE_VARIABLES
+        known = {"parameters": tuple(sorted(template.spec.parameters)), "instance": members}
         check = partial(unknown_members, known)
+        self._configuration: Configuration | None = None
+        if configured:
+            if problem := policy.kind_problem(*CONFIG_MAP):
+                problems.append(f"spec.configuration: becomes a ConfigMap, but {problem}")
+            try:
+                self._configuration = Configuration(template.spec.configuration, _ENVIRONMENT, check)
+            except InterpolationError as error:
+                problems += [str(each) for each in (error, *error.others)]
         for index, manifest in enumerate(template.spec.manifests):
             path = f"spec.manifests[{index}]"
             kind_problem = policy.kind_problem(manifest["apiVersion"], manifest["kind"])
@@ -88,11 +100,14 @@ class Renderer:
         if problems:
             raise RenderError(problems)
         complete = parameters.with_defaults(spec.parameters, instance.spec.parameters)
-        variables = {
-            "parameters": {name: complete.get(name) for name in spec.parameters},
-            "instance": {"name": instance.name, "key": instance.spec.key, "namespace": instance.namespace},
-        }
+        about = {"name": instance.name, "key": instance.spec.key, "namespace": instance.namespace}
+        if self._configuration is not None:
+            about["configMap"] = config_map_name(instance.name)
+        variables = {"parameters": {name: complete.get(name) for name in spec.parameters}, "instance": about}
         manifests: list[Manifest] = []
+        if self._configuration is not None:
+            files, problems = self._configuration.render(variables)
+            manifests.append(_labelled(config_map(instance.name, files), instance))
         for index, compiled in enumerate(self._manifests):
             path = f"spec.manifests[{index}]"
             try:

@@ -170,6 +170,10 @@ class Lifecycle(Model):
 Manifest = Annotated[dict[str, Any], Field(json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})]
 
 
+FileName = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._a-zA-Z0-9]+$")]
+"""A file's name, as ConfigMaps allow it."""
+
+
 class ApplicationTemplateSpec(Model):
     """Parameters, identity and manifests of an application."""
 
@@ -183,10 +187,18 @@ class ApplicationTemplateSpec(Model):
         "Without a key the template has one instance. Immutable.",
     )
     lifecycle: Lifecycle = Field(default=Lifecycle(), description="How long instances live.")
+    configuration: dict[FileName, JsonValue] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="Files that the running application follows, by name, with ${…} as in manifests. They become a "
+        "ConfigMap, ${instance.configMap}, which changes without a rollout. A text is written as it is; a map or a "
+        "list as the extension says, .yaml or .json.",
+    )
     manifests: list[Manifest] = Field(
         min_length=1,
         max_length=64,
-        description="The objects of an instance, with ${…} over parameters and instance (name, key, namespace). "
+        description="The objects of an instance, with ${…} over parameters and instance (name, key, namespace, and "
+        "configMap where there is a configuration). "
         "apiVersion and kind are literal, the namespace is the template's, and with a key every name contains "
         "${instance.name}.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
