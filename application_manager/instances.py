@@ -83,6 +83,9 @@ class InstanceWork:
         await self._make(name, decision, instance)
 
     async def _make(self, name: Name, decision: Decision, existing: ApplicationInstance | None) -> None:
+        if decision.paused and existing is not None:
+            self._leave(name, decision, existing)
+            return
         wanted = drafting.draft(name, decision, existing)
         template = self.world.template((name[0], wanted.spec.template))
         rendering = drafting.objects(wanted, template, self.world.renderer)
@@ -126,6 +129,18 @@ class InstanceWork:
         self._note(name, instance, decision, applied, rendering.digest if applied.complete else known.digest)
         if applied.aspect.reason == "Waiting":
             self.again(name, time.time() + _LOOK_AGAIN)
+
+    def _leave(self, name: Name, decision: Decision, instance: ApplicationInstance) -> None:
+        """Note that the instance stays as it is, by a person's wish."""
+        known = self._known(name, instance)
+        message = "as it was when the instance was paused"
+        aspect = (
+            Aspect("Applied", True, "Applied", message)
+            if self._was_applied(name, instance) is not None
+            else Aspect("Applied", False, "Paused", "the instance was paused before all objects were applied")
+        )
+        applied = Applied(aspect, references(known.objects), complete=False)
+        self._note(name, instance, decision, applied, known.digest)
 
     def _known(self, name: Name, instance: ApplicationInstance) -> Known:
         """What was applied so far: our own record where it is newer than the status."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from application_manager.apply import Applied, Applier
 from application_manager.client import ApiError, Client, Object, Resource
+from application_manager.core.byhand import PAUSE_ANNOTATION
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import Decision
 from application_manager.core.readiness import not_ready
@@ -72,7 +73,10 @@ class InstanceStatusWork:
                 self.recorder.say(instance, Reason.LINGERING, note, now)
         # Why the workload is not ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message
-        self.tell(name, record.decision, Service(name[1], applied.aspect.holds, ready.holds, why_not))
+        if record.decision.withheld and applied.aspect.holds:
+            why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): it does not get the task's values"
+        serves = applied.aspect.holds and not record.decision.withheld
+        self.tell(name, record.decision, Service(name[1], serves, serves and ready.holds, why_not))
 
     def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:
         """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""

@@ -42,6 +42,10 @@ class Reason(StrEnum):
     LINGERING = "Lingering"
     RELEASED = "Released"
     TEMPLATE_INVALID = "TemplateInvalid"
+    PAUSED = "Paused"
+    RESUMED = "Resumed"
+    HELD = "Held"
+    NOT_HELD = "NotHeld"
 
 
 _OF_CONDITION = {
@@ -52,6 +56,10 @@ _OF_CONDITION = {
     ("Ready", "True"): Reason.READY,
     ("Ready", "False"): Reason.NOT_READY,
     ("Finished", "True"): Reason.FINISHED,
+    ("Paused", "True"): Reason.PAUSED,
+    ("Paused", "False"): Reason.RESUMED,
+    ("Held", "True"): Reason.HELD,
+    ("Held", "False"): Reason.NOT_HELD,
 }
 _WARNINGS = frozenset({Reason.REFUSED, Reason.HOLDER_LOST, Reason.NOT_APPLIED, Reason.TEMPLATE_INVALID})
 _EXPECTED = frozenset({"Waiting", "NotApplied", "NotReady"})  # reasons that come with every start

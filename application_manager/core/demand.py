@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from application_manager.core import parameters
+from application_manager.core import byhand, parameters
 from application_manager.core.claims import Claim, InvalidTemplate, Refusal, Refused, claim
 from application_manager.core.leases import LeaseView
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
@@ -57,6 +57,8 @@ class Decision:
         verdicts: of all tasks that claim the instance, by task name.
         release_time: when it goes, in seconds since 1970; None: it stays.
         next_change: when this decision changes by itself, in seconds since 1970; None: not at all.
+        paused: whether a person wants the instance and its objects left as they are.
+        withheld: whether the pause keeps merged values from the instance.
     """
 
     name: str
@@ -67,6 +69,8 @@ class Decision:
     verdicts: dict[str, Verdict]
     release_time: float | None
     next_change: float | None
+    paused: bool = False
+    withheld: bool = False
 
     @property
     def wanted(self) -> bool:
@@ -159,11 +163,12 @@ def decide(
     linger goes on while no demand comes, and begins anew after one came.
     """
     ordered = sorted(claims, key=lambda each: precedence(each.task))
+    paused = instance is not None and byhand.is_paused(instance)
     if instance is not None and not is_managed(instance):
         return _left_alone(instance, ordered)
     if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
         key = instance.spec.key if instance else None
-        return Decision(name, template_name, key, None, (), {}, None, None)
+        return Decision(name, template_name, key, None, (), {}, None, None, paused)
     verdicts: dict[str, Verdict] = {}
     changes: list[float] = []
     live: list[Claim] = []
@@ -188,7 +193,7 @@ def decide(
         )
     key = contributing[0].key if contributing else instance.spec.key if instance else None
     release_time = None
-    if not contributing and instance is not None:
+    if not contributing and instance is not None and not paused and not byhand.is_held(instance):
         linger = linger_of(instance, template).seconds  # from when we see that no demand is left
         release_time = now + linger if deadline is None else deadline
         changes.append(release_time)
@@ -196,11 +201,16 @@ def decide(
         name=name,
         template=template_name,
         key=key,
-        parameters=merged.parameters if contributing else None,
+        parameters=merged.parameters if contributing and not paused else None,
         tasks=tuple(each.task.name for each in contributing),
         verdicts=verdicts,
         release_time=release_time,
         next_change=min((change for change in changes if change > now), default=None),
+        paused=paused,
+        withheld=paused
+        and bool(contributing)
+        and instance is not None
+        and instance.spec.parameters != merged.parameters,
     )
 
 
@@ -222,7 +232,8 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     refused = Verdict(Standing.REFUSED, Refused.INSTANCE_NOT_MANAGED, message)
     verdicts = {each.task.name: refused for each in claims}
     spec = instance.spec
-    return Decision(instance.name, spec.template, spec.key, None, (), verdicts, None, None)
+    paused = byhand.is_paused(instance)
+    return Decision(instance.name, spec.template, spec.key, None, (), verdicts, None, None, paused)
 
 
 def written_deadline(instance: ApplicationInstance) -> float | None:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from application_manager.core import byhand
 from application_manager.core.conditions import Aspect, find, holds, updated
 from application_manager.core.demand import Decision, Standing, Verdict
 from wayside.api import ApplicationInstance, ApplicationTask
@@ -114,7 +115,7 @@ def instance_status(
         release_time=None if decision.release_time is None else format_seconds(decision.release_time),
         objects=list(objects),
         demands=demands(decision),
-        conditions=list(updated(old.conditions, (applied, ready), generation, now)),
+        conditions=list(updated(old.conditions, (applied, ready, *byhand.aspects(instance)), generation, now)),
     )
 
 

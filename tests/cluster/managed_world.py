@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from application_manager.core.byhand import is_held
 from application_manager.core.claims import InvalidTemplate
 from application_manager.core.demand import Outcome, Standing, demand, is_managed
 from application_manager.core.leases import LeaseView
@@ -66,10 +67,13 @@ def differences(api: Api, leases: Mapping[str, LeaseView], refused: Collection[s
     expected: set[tuple[str, str]] = set()
     for name, instance in instances.items():
         decision = outcome.instances[name]
+        if decision.paused:  # left as it is, whatever that may be
+            expected |= {key for key, raw in objects.items() if name in raw["metadata"]["labels"].values()}
+            continue
         if decision.wanted:
             if instance.spec.parameters != decision.parameters:
                 yield f"{name}: parameters {instance.spec.parameters}, not {decision.parameters}"
-        elif is_managed(instance):
+        elif is_managed(instance) and not is_held(instance):
             if instance.status is None or instance.status.release_time is None:
                 yield f"{name}: nobody demands it, and it does not linger"
             elif decision.release_time is not None and decision.release_time < time.time():

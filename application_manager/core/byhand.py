@@ -1,0 +1,52 @@
+"""What people say of an instance by annotations: leave it as it is (pause), or keep it running (hold). Pure.
+
+An annotation counts by being there, whatever its value, which may say who wants it and why; only `false` is as if it
+were absent. Both are conditions of the instance's status while they hold, and say so once more when they are gone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from application_manager.core.conditions import Aspect, find
+from wayside.api import ApplicationInstance
+
+PAUSE_ANNOTATION = "wayside.dev/pause"
+"""On an instance: neither it nor its objects are changed, pruned or released."""
+
+HOLD_ANNOTATION = "wayside.dev/hold"
+"""On an instance: it is not released though nobody demands it. Demands that come are served as ever."""
+
+_CONDITIONS = (
+    ("Paused", PAUSE_ANNOTATION, "the instance and its objects are left as they are"),
+    ("Held", HOLD_ANNOTATION, "the instance is kept, demanded or not"),
+)
+_BARE = frozenset({"", "true"})  # values that say nothing more
+
+
+def is_paused(instance: ApplicationInstance) -> bool:
+    """Whether the instance is to be left as it is."""
+    return _said(instance, PAUSE_ANNOTATION) is not None
+
+
+def is_held(instance: ApplicationInstance) -> bool:
+    """Whether the instance is to be kept though nobody demands it."""
+    return _said(instance, HOLD_ANNOTATION) is not None
+
+
+def aspects(instance: ApplicationInstance) -> Iterator[Aspect]:
+    """The conditions Paused and Held: True while the annotation is there, False once it is gone, absent before."""
+    known = instance.status.conditions if instance.status else ()
+    for type_, annotation, meaning in _CONDITIONS:
+        said = _said(instance, annotation)
+        if said is not None:
+            why = "" if said in _BARE else f" ({said})"
+            message = f"{meaning} until the annotation {annotation} is removed{why}"
+            yield Aspect(type_, True, f"{type_}ByAnnotation", message)
+        elif find(known, type_) is not None:
+            yield Aspect(type_, False, f"Not{type_}", f"there is no annotation {annotation}")
+
+
+def _said(instance: ApplicationInstance, annotation: str) -> str | None:
+    value = instance.metadata.annotations.get(annotation)
+    return None if value is None or value.strip().lower() == "false" else value.strip()

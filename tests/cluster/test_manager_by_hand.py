@@ -1,0 +1,117 @@
+"""People's annotations on instances: pause leaves one as it is, hold keeps one, and both are seen in its status."""
+
+from __future__ import annotations
+
+import pytest
+
+from application_manager.core.claims import instance_name
+from tests.cluster.api import Api, Object
+from tests.cluster.managed_world import condition, end, start_manager, task, template, wait_settled
+from tests.cluster.processes import Process, Processes
+
+NORTH = instance_name("app", "north")
+SCALED = {
+    "parameters": {"region": {"type": "string"}, "zones": {"type": "array", "items": "string", "merge": "Union"}},
+    "manifests": [
+        {
+            "apiVersion": "v1",
+            "kind": "ConfigMap",
+            "metadata": {"name": "${instance.name}"},
+            "data": {"z": "${parameters.zones}!"},
+        }
+    ],
+}
+
+
+@pytest.fixture
+def manager(processes: Processes, namespace: str) -> Process:
+    return start_manager(processes, namespace)
+
+
+def annotate(api: Api, annotation: str, value: str | None) -> None:
+    metadata = {"annotations": {f"wayside.dev/{annotation}": value}}
+    api.patch("ApplicationInstance", NORTH, {"metadata": metadata})
+
+
+def wait_condition(api: Api, type_: str, status: str, kind: str = "ApplicationInstance", name: str = NORTH) -> Object:
+    return api.wait_for(
+        kind, name, lambda raw: condition(raw, type_).get("status") == status, what=f"{type_} is {status}"
+    )
+
+
+def test_a_paused_instance_is_left_as_it_is_until_the_annotation_is_gone(api: Api, manager: Process) -> None:
+    api.create(template(**SCALED))
+    api.create(task("one", region="north", zones=["a"]))
+    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["a"]!', what="it runs")
+    wait_settled(api)
+    annotate(api, "pause", "anna looks at a fault")
+    paused = wait_condition(api, "Paused", "True")
+    assert "anna looks at a fault" in condition(paused, "Paused")["message"]
+
+    api.create(task("two", region="north", zones=["b"]))
+    waiting = api.wait_for(
+        "ApplicationTask",
+        "two",
+        lambda raw: "is paused" in condition(raw, "Applied").get("message", ""),
+        what="it waits",
+    )
+    assert condition(waiting, "Accepted")["status"] == "True"
+    api.patch("ConfigMap", NORTH, {"data": {"z": "by hand"}})
+    end(api, "one")
+    end(api, "two")
+    api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: raw["status"]["demands"]["count"] == 0, what="no demand is left"
+    )
+    manager.restart()
+    manager.wait_for_output("watching")
+    wait_settled(api)
+    assert api.get("ConfigMap", NORTH)["data"]["z"] == "by hand"
+    assert "releaseTime" not in api.get("ApplicationInstance", NORTH)["status"]
+
+    api.create(task("three", region="north", zones=["c"]))
+    annotate(api, "pause", None)
+    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["c"]!', what="the values are in again")
+    wait_condition(api, "Paused", "False")
+    wait_condition(api, "Applied", "True", "ApplicationTask", "three")
+    wait_settled(api)
+
+
+def test_a_held_instance_runs_on_though_nobody_demands_it(api: Api, manager: Process) -> None:
+    api.create(template(linger="1s"))
+    api.create(task("north"))
+    api.wait_for("Deployment", NORTH, lambda _: True, what="it runs")
+    annotate(api, "hold", "true")
+    wait_condition(api, "Held", "True")
+    end(api, "north")
+    api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: raw["status"]["demands"]["count"] == 0, what="no demand is left"
+    )
+    manager.restart()
+    manager.wait_for_output("watching")
+    wait_settled(api)
+    held = api.get("ApplicationInstance", NORTH)
+    assert "releaseTime" not in held["status"]
+    assert held["status"]["phase"] == "Applied"
+    annotate(api, "hold", None)
+    api.wait_gone("ApplicationInstance", NORTH)
+    api.wait_gone("Deployment", NORTH)
+
+
+def test_a_persons_task_and_a_detectors_are_demands_alike(api: Api, manager: Process) -> None:
+    api.create(template(**SCALED))
+    persons: Object = task("by-anna", region="north", zones=["a"])
+    detectors: Object = task("by-town", region="north", zones=["b"], holder="town")
+    event = {"id": "e", "rule": "r", "action": "x", "subject": "car1"} | dict.fromkeys(
+        ("onsetTime", "startTime"), "2026-01-02T03:04:05Z"
+    )
+    detectors["spec"] |= {"event": event, "priority": -1}
+    api.create(persons)
+    api.create(detectors)
+    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["a","b"]!', what="both count")
+    for name in ("by-anna", "by-town"):
+        wait_condition(api, "Applied", "True", "ApplicationTask", name)
+    end(api, "by-town")
+    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["a"]!', what="the person's counts alone")
+    end(api, "by-anna")
+    api.wait_gone("ApplicationInstance", NORTH)
+    wait_condition(api, "Finished", "True", "ApplicationTask", "by-anna")

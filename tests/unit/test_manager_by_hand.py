@@ -1,0 +1,72 @@
+"""Annotations of people: a paused instance is left as it is, a held one stays though nobody demands it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from application_manager.core.byhand import HOLD_ANNOTATION, PAUSE_ANNOTATION, aspects, is_held, is_paused
+from application_manager.core.conditions import Aspect
+from application_manager.core.demand import Decision, Standing, demand
+from application_manager.core.status import instance_status
+from tests.unit.manager_objects import NOW, instance, task, template
+from wayside.api import ApplicationInstance
+from wayside.api.applicationinstance import ApplicationInstanceStatus
+
+RATE = {"parameters": {"rate": {"type": "number", "merge": "Max"}}}
+
+
+def decided(existing: ApplicationInstance, *tasks: Any) -> Decision:
+    return demand([template(**RATE)], tasks, [existing], {}, NOW).instances["app"]
+
+
+def annotated(annotation: str, value: str = "true", **more: Any) -> ApplicationInstance:
+    return instance(annotations={annotation: value}, **more)
+
+
+@pytest.mark.parametrize(("value", "counts"), [("", True), ("true", True), ("anna, measuring", True), ("False", False)])
+def test_an_annotation_counts_whatever_its_value_but_for_false(value: str, counts: bool) -> None:
+    assert is_paused(annotated(PAUSE_ANNOTATION, value)) is counts
+    assert is_held(annotated(HOLD_ANNOTATION, value)) is counts
+
+
+def test_a_held_instance_is_not_released_and_lingers_from_when_the_hold_is_gone() -> None:
+    assert decided(annotated(HOLD_ANNOTATION, release_at=NOW - 5)).release_time is None
+    assert decided(instance()).release_time == NOW + 30
+
+
+def test_a_held_instance_serves_demands_as_ever() -> None:
+    decision = decided(annotated(HOLD_ANNOTATION), task("a", {"rate": 5}))
+    assert (decision.parameters, decision.tasks) == ({"rate": 5}, ("a",))
+
+
+def test_a_paused_instance_keeps_its_values_and_is_not_released() -> None:
+    paused = annotated(PAUSE_ANNOTATION, parameters={"rate": 3})
+    assert (decided(paused).release_time, decided(paused).paused, decided(paused).withheld) == (None, True, False)
+    decision = decided(paused, task("a", {"rate": 5}))
+    assert (decision.parameters, decision.paused, decision.withheld) == (None, True, True)
+    assert decision.verdicts["a"].standing is Standing.COUNTS
+    assert not decided(paused, task("a", {"rate": 3})).withheld
+
+
+def test_a_persons_instance_can_be_paused_too() -> None:
+    assert decided(annotated(PAUSE_ANNOTATION, by_person=True)).paused
+
+
+def test_the_status_says_who_keeps_it_and_once_more_when_that_is_over() -> None:
+    assert list(aspects(instance())) == []
+    held = annotated(HOLD_ANNOTATION, "anna, measuring")
+    (aspect,) = aspects(held)
+    assert (aspect.type, aspect.holds) == ("Held", True)
+    assert "anna, measuring" in aspect.message
+    well = Aspect("Applied", True, "Applied"), Aspect("Ready", True, "Ready")
+    status = instance_status(held, decided(held), *well, (), None, NOW)
+    assert {each.type: each.status for each in status.conditions} == {
+        "Applied": "True",
+        "Ready": "True",
+        "Held": "True",
+    }
+    later = instance().model_copy(update={"status": ApplicationInstanceStatus.model_validate(status)})
+    (aspect,) = aspects(later)
+    assert (aspect.type, aspect.holds, aspect.reason) == ("Held", False, "NotHeld")
