@@ -6,6 +6,7 @@ told before the start. An endpoint that does not answer, or says that it is busy
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -63,21 +64,22 @@ class Message:
 
 
 class Budget:
-    """So many messages in so much time: a bucket that fills evenly."""
+    """At most so many messages in any stretch of so much time."""
 
     def __init__(self, messages: int, per: float) -> None:
-        self._most, self._each = float(messages), per / messages
-        self._left, self._since = float(messages), 0.0
+        self._per = per
+        self._sent: deque[float] = deque(maxlen=messages)
+        """When the last ones went."""
 
     def wait(self, now: float) -> float:
         """The seconds until the next message may go."""
-        self._left = min(self._most, self._left + max(0.0, now - self._since) / self._each)
-        self._since = now
-        return 0.0 if self._left >= 1 - 1e-9 else (1 - self._left) * self._each
+        if len(self._sent) < (self._sent.maxlen or 0):
+            return 0.0
+        return max(0.0, self._sent[0] + self._per - now)
 
-    def spend(self) -> None:
+    def spend(self, now: float) -> None:
         """One goes."""
-        self._left -= 1
+        self._sent.append(now)
 
 
 class Outbox:
@@ -114,7 +116,7 @@ class Outbox:
         for message in self._first_of_their_episodes():
             if self._is_due(message, now):
                 if self._budget is not None:
-                    self._budget.spend()
+                    self._budget.spend(now)
                 if self._last_tries is not None:
                     self._last_tries.add(id(message))
                 message.attempts += 1
