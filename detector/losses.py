@@ -13,7 +13,7 @@ from dataclasses import KW_ONLY, dataclass
 
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
-from detector.engine.timing.timeline import DataTimeline
+from detector.engine.timing.data import DataTimeline
 from detector.streams.tally import Tally
 
 _log = logging.getLogger(__name__)

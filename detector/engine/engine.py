@@ -23,9 +23,12 @@ from detector.engine.queries.queries import BufferQueries
 from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals
 from detector.engine.signals.starts import Starts
+from detector.engine.timing.data import DataTimeline
 from detector.engine.timing.schedule import Only, Schedule
+from detector.engine.timing.steps import Gap, Insert, Step, Tick
 from detector.engine.timing.ticks import Ticks
-from detector.engine.timing.timeline import DataTimeline, Gap, Insert, Step, Tick, Timeline, WallTimeline
+from detector.engine.timing.timeline import Timeline
+from detector.engine.timing.wall import WallTimeline
 from wayside.api import Detector
 from wayside.api.detector import Clock
 from wayside.rules import CompiledRule, in_order

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
-from detector.engine.timing.timeline import DataTimeline
+from detector.engine.timing.data import DataTimeline
 from tests.unit.driving import (
     POSITION,
     SECOND,

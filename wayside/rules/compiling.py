@@ -25,14 +25,12 @@ from wayside.expressions import (
     Path,
     compile_template,
 )
-from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.actions import canonical, compile_actions
 from wayside.rules.compiled import (
     CompiledDeploy,
     CompiledPlugin,
     CompiledRule,
     CompiledSignal,
-    CompiledStream,
     CompiledSubject,
     PairSubject,
     episode_stream,
@@ -56,9 +54,7 @@ from wayside.rules.variables import (
     condition_environment,
     element_of,
     is_taken,
-    naming_environment,
     sample_environment,
-    stamp_environment,
 )
 
 
@@ -82,51 +78,6 @@ def compile_rule(
     if compiler.problems or compiled is None:
         raise RuleError(compiler.problems)
     return compiled
-
-
-def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> CompiledStream:
-    """The stream's own expressions.
-
-    Raises:
-        RuleError: with every problem of them.
-    """
-    problems = list(stream_problems(stream, index, fields))
-    if problems:
-        raise RuleError(problems)
-    stamp = None if stream.stamp is None else stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
-    client = compile_template(stream.client, naming_environment()) if stream.names_by_message else None
-    return CompiledStream(stream.name, stamp, client)
-
-
-def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
-    """What is wrong with a Detector's stream: its key, and its expressions."""
-    try:
-        KeyPattern.parse(stream.key)
-    except KeyPatternError as error:
-        yield RuleProblem(("spec", "streams", index, "key"), str(error))
-    if stream.names_by_message:
-        yield from _naming_problems(stream, ("spec", "streams", index, "client"), fields)
-    if stream.stamp is None:
-        return
-    path: FieldPath = ("spec", "streams", index, "stamp")
-    try:
-        expression = stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
-    except ExpressionError as error:
-        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
-        return
-    if fields is not None:
-        yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, "msg", fields))
-
-
-def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:
-    """What is wrong with a template that names the client by the message."""
-    try:
-        template = compile_template(stream.client, naming_environment())
-    except InterpolationError as error:
-        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
-        return
-    if fields is not None:
-        yield from (RuleProblem(path, text) for text in unknown_fields(template.paths, "msg", fields))
 
 
 class _RuleCompiler:

@@ -1,0 +1,243 @@
+"""Clock Data: a sample's time is the sender's stamp, and the samples themselves say how far time has come.
+
+Tick t is due once a stamp of at least t + lateness was seen. What it sees are the samples up to its time and none later.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from detector.engine.samples.liveliness import LIVELINESS
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
+from detector.engine.timing.steps import Gap, Insert, Step, Tick
+from detector.engine.timing.ticks import Ticks
+
+
+@dataclass(slots=True)
+class _Row:
+    """Samples in a row that agree with each other, but not with the time."""
+
+    client: str
+    first: int
+    last: int
+    received: int
+    several: bool = False
+    """Whether they are of more than one client."""
+
+
+class DataTimeline:
+    """Clock Data: time is the senders' stamps.
+
+    A sample waits until the tick that comes after it, and then enters in the order of the stamps: so the order in which
+    samples arrive does not matter as long as `lateness` covers it. One that is later than that enters at once.
+
+    A stamp more than `max_ahead` ahead of where the newest one would be by now (the receive times tell how long nothing
+    came), or so far behind that the buffer has no room for it, is dropped and counted. Time that really jumped (a pause
+    in a recording, a simulation that began again) shows in what follows: when samples in a row agree on another time,
+    that time holds from then on. Two are enough, if they are of two clients or there is only one; one client among
+    several must keep it up for `alone_after` while nobody contradicts.
+
+    A sample of a latched stream holds since long ago and says nothing of the time: it never moves it, and takes its
+    place at its stamp, or at the newest one where that is later.
+    """
+
+    def __init__(
+        self,
+        ticks: Ticks,
+        *,
+        start: int,
+        lateness: int,
+        max_ahead: int,
+        max_behind: int,
+        alone_after: int,
+        maximum_bytes: int,
+        stamp_of: Callable[[Arrival], int | None],
+        client_of: Callable[[Arrival], str | None],
+        latched: frozenset[str] = frozenset(),
+    ) -> None:
+        """Times are in nanoseconds; `start` stands for now until the first stamp is seen.
+
+        `maximum_bytes` bounds the payloads that wait; what comes when they are full is dropped and counted. `stamp_of`
+        and `client_of` give None where they cannot tell; the sample is then left out, and they count it. `latched` are
+        the names of the latched streams.
+        """
+        self._ticks = ticks
+        self._lateness = lateness
+        self._max_ahead = max_ahead
+        self.alone_after = alone_after
+        self.maximum_bytes = maximum_bytes
+        self._stamp_of = stamp_of
+        self._client_of = client_of
+        self._newest: int | None = None
+        self._newest_received = 0
+        self._ticked = False
+        self._waiting: list[tuple[int, int, Arrival]] = []
+        """A heap by stamp and order of arrival."""
+        self._waiting_bytes = 0
+        self._triggers: frozenset[str] = frozenset()
+        self._trigger_stamps: list[int] = []
+        """A heap: of what waits, the stamps of samples that are evaluated at their own times."""
+        self._number = 0
+        self._some_client: str | None = None
+        self._several_clients = False
+        self._row: _Row | None = None
+        self._early: list[tuple[int, Arrival]] = []
+        """Latched samples that came before there was a time, with their stamps."""
+        self.latched = latched
+        self.max_behind = max_behind
+        self.now = start
+        self.dropped_ahead = 0
+        self.dropped_late = 0
+        self.dropped_full = 0
+        self.last = ""
+        """Whose stamp was dropped last for its time, and how far off it was."""
+        self.jumps = 0
+
+    def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
+        """All that the arrivals make happen; `until`, a time of the wall, says nothing here."""
+        for arrival in arrivals:
+            if arrival.stream == LIVELINESS:
+                yield from self._token(arrival)
+                continue
+            client = self._client_of(arrival)
+            stamp = None if client is None else self._stamp_of(arrival)
+            if client is None or stamp is None:
+                continue
+            if arrival.stream in self.latched:
+                yield from self._hold(arrival, stamp)
+                continue
+            self._know(client)
+            newest = self._newest
+            if newest is None:
+                newest = stamp
+                yield self._begin(stamp, backwards=False)
+            elif newest - self.max_behind <= stamp <= newest + self._reach(arrival, self._newest_received):
+                self._row = None
+                if not self._ticked and newest - self._lateness <= stamp <= self.now:
+                    yield self._begin(stamp, backwards=False)  # the first to arrive was not the first
+                newest = max(newest, stamp)
+            elif self._jumped(arrival, client, stamp, newest):
+                self.jumps += 1
+                yield from self.rest()
+                backwards, newest = stamp < newest, stamp
+                yield self._begin(stamp, backwards)
+            else:
+                continue
+            if newest != self._newest:
+                self._newest, self._newest_received = newest, arrival.received
+            if stamp <= self.now:
+                yield Insert((arrival,), (stamp,))
+            else:
+                self._wait(arrival, stamp)
+            yield from self._run_up_to(newest - self._lateness)
+
+    def _run_up_to(self, limit: int) -> Iterator[Step]:
+        """The ticks up to there, those for samples included."""
+        while True:
+            tick = self._ticks.after(self.now)
+            trigger = self._next_trigger()
+            if trigger is not None and trigger <= min(tick, limit):
+                tick = trigger
+            elif tick > limit:
+                return
+            self.now, self._ticked = tick, True
+            sampled: list[Arrival] = []
+            for insert in self._release(tick):
+                yield insert
+                pairs = zip(insert.arrivals, insert.times or (), strict=True)
+                sampled += [each for each, time in pairs if time == tick and each.stream in self._ticks.triggers]
+            yield Tick(tick, sampled)
+
+    def _next_trigger(self) -> int | None:
+        """The earliest stamp of what waits that is evaluated at its own time."""
+        if self._triggers is not self._ticks.triggers:  # the rules changed
+            self._triggers = self._ticks.triggers
+            self._trigger_stamps = [stamp for stamp, _, each in self._waiting if each.stream in self._triggers]
+            heapq.heapify(self._trigger_stamps)
+        while self._trigger_stamps and self._trigger_stamps[0] <= self.now:
+            heapq.heappop(self._trigger_stamps)
+        return self._trigger_stamps[0] if self._trigger_stamps else None
+
+    def gap(self, time: int) -> Iterator[Step]:
+        """Steps and stalls of the wall clock do not touch the time of the data."""
+        yield from ()
+
+    def rest(self) -> Iterator[Step]:
+        """All that waits, at once: no tick of this axis comes any more."""
+        yield from self._release(None)
+
+    def _token(self, arrival: Arrival) -> Iterator[Step]:
+        """What happens to a token carries no stamp: it comes after all samples with the newest stamp so far."""
+        newest = self.now if self._newest is None else self._newest
+        if newest <= self.now or self._waiting_bytes >= self.maximum_bytes:
+            yield Insert((arrival,), (self.now,))
+        else:
+            self._wait(arrival, newest)
+
+    def _hold(self, arrival: Arrival, stamp: int) -> Iterator[Step]:
+        """A sample of a latched stream."""
+        if self._newest is None:
+            self._early.append((stamp, arrival))
+        elif (place := min(stamp, self._newest)) <= self.now:
+            yield Insert((arrival,), (place,))
+        else:
+            self._wait(arrival, place)
+
+    def _begin(self, stamp: int, backwards: bool) -> Gap:
+        """Time begins, or begins anew, with this stamp."""
+        early, self._early = self._early, []
+        for latched_stamp, arrival in early:
+            self._wait(arrival, min(latched_stamp, stamp))
+        self.now, self._ticked = stamp - 1, False
+        return Gap(self.now, backwards)
+
+    def _wait(self, arrival: Arrival, stamp: int) -> None:
+        if self._waiting_bytes >= self.maximum_bytes:
+            self.dropped_full += 1
+            return
+        self._number += 1
+        self._waiting_bytes += len(arrival.payload) + SAMPLE_OVERHEAD
+        heapq.heappush(self._waiting, (stamp, self._number, arrival))
+        if arrival.stream in self._triggers:
+            heapq.heappush(self._trigger_stamps, stamp)
+
+    def _release(self, until: int | None) -> Iterator[Insert]:
+        """What waits with a stamp up to `until` (None: all), in order."""
+        arrivals, times = [], []
+        while self._waiting and (until is None or self._waiting[0][0] <= until):
+            stamp, _, arrival = heapq.heappop(self._waiting)
+            self._waiting_bytes -= len(arrival.payload) + SAMPLE_OVERHEAD
+            arrivals.append(arrival)
+            times.append(stamp)
+        if arrivals:
+            yield Insert(arrivals, times)
+
+    def _know(self, client: str) -> None:
+        if self._some_client is None:
+            self._some_client = client
+        elif client != self._some_client:
+            self._several_clients = True
+
+    def _reach(self, arrival: Arrival, since: int) -> int:
+        """How far ahead of a stamp that was received then the arrival's may be."""
+        return self._max_ahead + max(0, arrival.received - since)
+
+    def _jumped(self, arrival: Arrival, client: str, stamp: int, newest: int) -> bool:
+        """Whether this sample, which does not fit, shows that time jumped; else it is dropped."""
+        row = self._row
+        if row is not None and -self._max_ahead <= stamp - row.last <= self._reach(arrival, row.received):
+            row.several = row.several or client != row.client
+            row.last, row.received = stamp, arrival.received
+            if row.several or not self._several_clients or abs(stamp - row.first) >= self.alone_after:
+                self._row = None
+                return True
+        else:
+            self._row = _Row(client, stamp, stamp, arrival.received)
+        self.last = f"{client} is {abs(stamp - newest) / 1e9:g} s {'ahead of' if stamp > newest else 'behind'} the rest"
+        if stamp > newest:
+            self.dropped_ahead += 1
+        else:
+            self.dropped_late += 1
+        return False

@@ -1,0 +1,37 @@
+"""What the engine does next: samples to insert, ticks to evaluate, gaps to say. A time axis makes them of arrivals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from detector.engine.samples.sample import Arrival
+
+
+@dataclass(frozen=True, slots=True)
+class Insert:
+    """Samples to insert, with their times."""
+
+    arrivals: Sequence[Arrival]
+    times: Sequence[int] | None
+    """None: the receive times."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Evaluate the rules that are due at this time."""
+
+    time: int
+    sampled: Sequence[Arrival] = ()
+    """The samples of exactly this time whose streams trigger evaluations."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Time went on (or back) to `time` without ticks."""
+
+    time: int
+    backwards: bool
+
+
+Step = Insert | Tick | Gap

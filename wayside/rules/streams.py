@@ -1,0 +1,59 @@
+"""The expressions of a Detector's streams: the sender's time, and whose a message is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from wayside.api.stream import Stream
+from wayside.api.wording import FieldPath
+from wayside.expressions import ExpressionError, InterpolationError, Kind, compile_template
+from wayside.keys import KeyPattern, KeyPatternError
+from wayside.rules.compiled import CompiledStream
+from wayside.rules.fields import Fields, unknown_fields
+from wayside.rules.problems import RuleError, RuleProblem
+from wayside.rules.variables import naming_environment, stamp_environment
+
+
+def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> CompiledStream:
+    """The stream's own expressions.
+
+    Raises:
+        RuleError: with every problem of them.
+    """
+    problems = list(stream_problems(stream, index, fields))
+    if problems:
+        raise RuleError(problems)
+    stamp = None if stream.stamp is None else stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
+    client = compile_template(stream.client, naming_environment()) if stream.names_by_message else None
+    return CompiledStream(stream.name, stamp, client)
+
+
+def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
+    """What is wrong with a Detector's stream: its key, and its expressions."""
+    try:
+        KeyPattern.parse(stream.key)
+    except KeyPatternError as error:
+        yield RuleProblem(("spec", "streams", index, "key"), str(error))
+    if stream.names_by_message:
+        yield from _naming_problems(stream, ("spec", "streams", index, "client"), fields)
+    if stream.stamp is None:
+        return
+    path: FieldPath = ("spec", "streams", index, "stamp")
+    try:
+        expression = stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
+    except ExpressionError as error:
+        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        return
+    if fields is not None:
+        yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, "msg", fields))
+
+
+def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:
+    """What is wrong with a template that names the client by the message."""
+    try:
+        template = compile_template(stream.client, naming_environment())
+    except InterpolationError as error:
+        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        return
+    if fields is not None:
+        yield from (RuleProblem(path, text) for text in unknown_fields(template.paths, "msg", fields))
