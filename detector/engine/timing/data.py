@@ -1,6 +1,6 @@
 """Clock Data: a sample's time is the sender's stamp, and the samples themselves say how far time has come.
 
-Tick t is due once a stamp of at least t + lateness was seen. What it sees are the samples up to its time and none later.
+Tick t is due once a stamp of at least t + lateness was seen. What it sees are the samples up to its time, none later.
 """
 
 from __future__ import annotations
