@@ -1,6 +1,6 @@
 """What a running detector answers to those who ask: its status, and what a rule with onDemand says.
 
-Two questions also change something: a rule is paused, or evaluated again.
+Some also change something: a rule is paused, or evaluated again; a recording begins, or ends.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from typing import TypeVar
 
 import msgspec
 
+from detector.actions.trigger.requests import RECORDINGS
 from detector.engine.episodes.demands import plain
 from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
+from detector.requested import Requested
 from detector.sources.supervision import SourceThread
 from detector.status.model import ActionStatus, Drops, Explanation, SourceStatus, Status, to_json
 from wayside.times import format_time
@@ -36,11 +38,16 @@ class Answers:
     """Answers requests, on whichever thread they come."""
 
     def __init__(
-        self, evaluator: Evaluator, outlet: Callable[[], LiveOutlet], sources: Callable[[], list[SourceThread]]
+        self,
+        evaluator: Evaluator,
+        outlet: Callable[[], LiveOutlet],
+        sources: Callable[[], list[SourceThread]],
+        requested: Requested,
     ) -> None:
         """`outlet` gives the outlet: the network that it has changes with the Detector, as do the `sources`."""
         self._evaluator = evaluator
         self._sources = sources
+        self._requested = requested
         self._outlet = outlet
         self._answers: Mapping[str, Callable[[Mapping[str, str]], bytes]] = {
             "status": self._status,
@@ -49,11 +56,14 @@ class Answers:
             "resume": lambda given: self._pause(given, paused=False),
         }
 
-    def answer(self, what: str, given: Mapping[str, str]) -> bytes:
+    def answer(self, what: str, given: Mapping[str, str], payload: bytes) -> bytes:
         """The answer as JSON. Raises ValueError where there is none; the text says why."""
+        if what == RECORDINGS:
+            return self._requested.answer(payload)
         answer = self._answers.get(what)
         if answer is None:
-            raise ValueError(f"a detector does not answer {what!r}: ask for one of {', '.join(self._answers)}")
+            known = ", ".join([*self._answers, RECORDINGS])
+            raise ValueError(f"a detector does not answer {what!r}: ask for one of {known}")
         return answer(given)
 
     def status(self) -> Status:

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from detector import inquiry
+from detector import inquiry, recordings
 from detector.actions.deploy.file_store import write_tasks_yaml
 from detector.assembly import DetectorError
 from detector.checking import check_documents, summary
@@ -165,6 +165,8 @@ def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folder
         raise typer.Exit(1)
     typer.echo(f"{summary(documents)}: nothing wrong", err=True)
 
+
+app.add_typer(recordings.app, name="recordings")
 
 for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume):
     app.command()(command)

@@ -93,6 +93,7 @@ def inquire(
     name: str | None,
     connect: list[str] | None,
     timeout: float,
+    payload: bytes | None = None,
 ) -> list[Asked]:
     """Ask the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
     config, holder = Zenoh(mode=ZenohMode.PEER), "*"
@@ -103,7 +104,7 @@ def inquire(
         config = config.model_copy(update={"connect": connect, "scouting": False, "mode": ZenohMode.CLIENT})
     if not config.connect and not config.scouting:
         refuse("give --connect ENDPOINT, or --detector FILE whose spec.zenoh says where the detector is")
-    return ask(config, name or holder, what, given, timeout)
+    return ask(config, name or holder, what, given, timeout, payload)
 
 
 def _reaching(zenoh: Zenoh) -> Zenoh:

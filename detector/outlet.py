@@ -13,6 +13,7 @@ from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.event_log import EventLog
+from detector.requested import with_requested
 from detector.state import StateFile
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
 from wayside.api import EventRule
@@ -70,7 +71,7 @@ class LiveOutlet:
 
     def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
         """Have the rules' actions at work."""
-        self.actions.follow(rules, surroundings)
+        self.actions.follow(with_requested(rules, surroundings.detector), surroundings)
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
         """Tell the actions."""

@@ -24,6 +24,7 @@ from detector.losses import Loss
 from detector.outlet import LiveOutlet
 from detector.plugins.processes import ProcessHost
 from detector.replay.intake_writer import IntakeWriter
+from detector.requested import Requested
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.sources.registry import plugin_problems
@@ -79,7 +80,9 @@ class Running:
             on_failure=self._fail,
             outages=self._plugins.outages,
         )
-        self.answers = Answers(self._evaluator, lambda: self._outlet, lambda: self._sources.threads)
+        requested = Requested(self._engine, self._evaluator.call)
+        self._outlet.actions.outcomes.heard = requested.heard
+        self.answers = Answers(self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested)
         self._server = None if metrics_port is None else _server(metrics_port, self.answers)
 
         self._evaluator.losses.watch(self._tally)

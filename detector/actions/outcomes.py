@@ -73,6 +73,8 @@ class Outcomes:
         """The runs that are neither done nor failed, with what was said last."""
         self._lost: Counter[tuple[Which, str]] = Counter()
         self._reasons: dict[tuple[Which, str], str] = {}
+        self.heard: Callable[[Which, str, Outcome], None] = lambda which, episode, outcome: None
+        """Told each outcome that counts, with the episode's id, on the thread that reports it."""
 
     def know(self, which: Which, kind: str) -> None:
         """There is this action, whether or not it is ever needed."""
@@ -101,6 +103,7 @@ class Outcomes:
                 del self._said[known]
                 tally.current.pop(episode.id, None)
                 _count(tally, outcome)
+        self.heard(which, episode.id, outcome)
         document = follow_up(self._holder, which, episode, outcome, self._now())
         key = f"wayside/actions/{self._holder}/{which.rule}/{episode.id}/{which.action}"
         self._publish(key, json.dumps(document, separators=(",", ":"), allow_nan=False).encode(), ENCODING)

@@ -63,6 +63,7 @@ def _parts(status: Status) -> Iterator[RenderableType]:
     yield rules
     for rule in status.rules:
         yield from _remarks(rule)
+    yield from _acting(status)
     if status.explanation is not None:
         yield from _explained(status.explanation)
         return
@@ -76,6 +77,33 @@ def _parts(status: Status) -> Iterator[RenderableType]:
         shown = ", ".join(f"{client.name} ({_ago(client.age)})" for client in status.clients[:_CLIENTS])
         more = status.client_count - _CLIENTS
         yield f"clients: {shown}" + (f" and {more} more" if more > 0 else "")
+
+
+def _acting(status: Status) -> Iterator[RenderableType]:
+    """What became of the actions' work, of the rules that are told about."""
+    told = {rule.name for rule in status.rules}
+    actions = [each for each in status.actions if each.rule in told or status.explanation is None]
+    if not actions:
+        return
+    table = _table("action", "kind", "running", "done", "failed", "samples", "missing", "size", "files")
+    for each in actions:
+        counts = (each.running, each.done, each.failed, each.samples, each.missing)
+        table.add_row(
+            f"{each.rule}/{each.action}",
+            each.kind,
+            *map(str, counts),
+            _size(each.bytes),
+            str(each.files),
+        )
+    yield table
+    for each in actions:
+        if each.last_file:
+            yield f"{each.rule}/{each.action}: the last file: {each.last_file}"
+        if each.last_failure:
+            yield f"{each.rule}/{each.action}: the last failure: {each.last_failure}"
+        for episode, message in each.current.items():
+            if message:
+                yield f"{each.rule}/{each.action}: episode {episode}: {message}"
 
 
 def _explained(explanation: Explanation) -> Iterator[RenderableType]:

@@ -15,8 +15,11 @@ import zenoh
 
 _log = logging.getLogger(__name__)
 
-Answer = Callable[[str, Mapping[str, str]], bytes]
-"""Takes what is asked for and its parameters, gives JSON. Raises ValueError where it cannot."""
+Answer = Callable[[str, Mapping[str, str], bytes], bytes]
+"""Takes what is asked for, its parameters and the query's payload (often none), gives JSON.
+
+Raises ValueError where it cannot.
+"""
 
 JSON = "application/json"
 
@@ -60,12 +63,13 @@ class Answering:
                 query.drop()  # type: ignore[no-untyped-call]  # ends the query, whatever was replied
 
     def _reply(self, query: zenoh.Query) -> None:
-        given = (part.partition("=") for part in str(query.parameters).split(";") if part)
-        parameters = {name: value for name, _, value in given}
+        parts = (part.partition("=") for part in str(query.parameters).split(";") if part)
+        parameters = {name: value for name, _, value in parts}
         asked = str(query.key_expr).rsplit("/", 1)[-1]
         what = "status" if asked.startswith("*") else asked
         try:
-            payload = self._answer(what, parameters)
+            given = query.payload
+            payload = self._answer(what, parameters, b"" if given is None else given.to_bytes())
         except ValueError as error:
             query.reply_err(str(error), encoding="text/plain")
             return

@@ -28,7 +28,9 @@ class Asked:
     payload: bytes
 
 
-def ask(config: Zenoh, holder: str, what: str, given: Mapping[str, str], timeout: float) -> list[Asked]:
+def ask(
+    config: Zenoh, holder: str, what: str, given: Mapping[str, str], timeout: float, payload: bytes | None = None
+) -> list[Asked]:
     """The answers of all detectors of that name (`*`: of any), within so many seconds.
 
     Raises:
@@ -44,7 +46,7 @@ def ask(config: Zenoh, holder: str, what: str, given: Mapping[str, str], timeout
             answers: list[Asked] = []
             refusals: list[str] = []
             left = max(0.1, end - time.monotonic())
-            for reply in session.get(selector, timeout=left, target=zenoh.QueryTarget.ALL):
+            for reply in session.get(selector, payload=payload, timeout=left, target=zenoh.QueryTarget.ALL):
                 if (ok := reply.ok) is not None:
                     answers.append(Asked(str(ok.key_expr), ok.payload.to_bytes()))
                 elif (error := reply.err) is not None:

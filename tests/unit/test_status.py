@@ -140,7 +140,7 @@ def endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def an_answer(what: str, given: object) -> bytes:
+def an_answer(what: str, given: object, payload: bytes) -> bytes:
     if what == "status":
         return f'{{"given": "{given}"}}'.encode()
     raise ValueError(f"does not answer {what!r}")

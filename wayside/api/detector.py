@@ -168,6 +168,15 @@ class DetectorSpec(Model):
                 raise ValueError(f"{field}: the name {twice[0]!r} is used twice: names must be unique")
         return self
 
+    @model_validator(mode="after")
+    def _streams_on_request(self) -> DetectorSpec:
+        allowed = None if self.recordings is None else self.recordings.on_request
+        for name in (allowed.streams or ()) if allowed is not None else ():
+            if self.stream(name) is None:
+                there = ", ".join(stream.name for stream in self.streams)
+                raise ValueError(f"recordings.onRequest.streams: there is no stream {name}, there is {there}")
+        return self
+
     def stream(self, name: str) -> Stream | None:
         """The stream of that name, if there is one."""
         return next((stream for stream in self.streams if stream.name == name), None)

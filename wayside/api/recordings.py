@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from wayside.api.base import Model, PositiveDuration, PositiveQuantity, Quantity
+from wayside.api.base import Model, ObjectName, PositiveDuration, PositiveQuantity, Quantity
 
 
 class WhenFull(StrEnum):
@@ -14,6 +14,22 @@ class WhenFull(StrEnum):
 
     DROP_OLDEST = "DropOldest"
     STOP = "Stop"
+
+
+class OnRequest(Model):
+    """Recordings that others ask for over Zenoh: a trigger of another detector, or anyone else who reaches it."""
+
+    streams: list[ObjectName] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=128,
+        description="The streams that may be recorded; latched ones always come with them. Default: all.",
+        json_schema_extra={"x-kubernetes-list-type": "set"},
+    )
+    maximum_duration: PositiveDuration = Field(
+        default=PositiveDuration("1h"), description="A recording ends after so long, even where more was asked for."
+    )
+    maximum_recordings: int = Field(default=8, ge=1, le=100, description="So many at a time; further ones are refused.")
 
 
 class Recordings(Model):
@@ -42,4 +58,7 @@ class Recordings(Model):
         default=WhenFull.DROP_OLDEST,
         description="DropOldest: the oldest recordings are deleted for new ones, but none in progress. Stop: what "
         "there is stays, and recordings that find no room end, marked as cut.",
+    )
+    on_request: OnRequest | None = Field(
+        default=None, description="Lets others ask for recordings. Default: nobody can."
     )

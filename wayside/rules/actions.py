@@ -10,6 +10,7 @@ from wayside.api import Detector
 from wayside.api.actions.action import Action
 from wayside.api.actions.window import Window, WindowClients
 from wayside.api.base import JsonValue
+from wayside.api.detector import DetectorSpec
 from wayside.api.eventrule import EventRuleSpec
 from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
@@ -95,13 +96,21 @@ def _window(compiler: Compiler, at: FieldPath, action: Action, window: Window) -
                 "buffer.duration",
             )
     everyone = window.clients is WindowClients.ALL or compiler.spec.scope.fleet is not None
+    clients = None if everyone else frozenset(window.with_clients)
+    return window_of(spec, streams, clients, window.before.ns, window.after.ns)
+
+
+def window_of(
+    spec: DetectorSpec, streams: Iterable[Stream], clients: frozenset[str] | None, before_ns: int = 0, after_ns: int = 0
+) -> CompiledWindow:
+    """The window of these streams; of the latched ones all come with it."""
     return CompiledWindow(
         frozenset(stream.name for stream in streams if not stream.latched),
         frozenset(stream.name for stream in spec.streams if stream.latched),
         frozenset(stream.name for stream in spec.streams if stream.latched and _of_one(stream)),
-        None if everyone else frozenset(window.with_clients),
-        window.before.ns,
-        window.after.ns,
+        clients,
+        before_ns,
+        after_ns,
     )
 
 

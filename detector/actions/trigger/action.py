@@ -35,7 +35,7 @@ _MOST = 1000
 _SILENCES = (1.0, 2.0, 5.0, 10.0)
 """Seconds that a silent system is left alone; the last one repeats."""
 
-_CLAIM = 10.0
+_CLAIM = 3.0
 """Seconds after the start in which an episode of the last run is resumed, if it is."""
 
 _LEAVE = 2.0

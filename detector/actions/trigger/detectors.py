@@ -20,7 +20,7 @@ from wayside.api.actions.trigger import Trigger
 from wayside.api.actions.window import WindowClients
 from wayside.api.base import Duration
 
-_RENEW = 10.0
+_RENEW = 5.0
 """Seconds: a detector that was restarted knows nothing of what it recorded, and goes on with the next start."""
 
 _HOLDER = re.compile(r"[A-Za-z0-9_.-]{1,253}")

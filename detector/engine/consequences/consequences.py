@@ -6,14 +6,15 @@ The engine notes what happens; the shell takes it and passes it on, to actions t
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.consequences.excerpts import EpisodeSample, Excerpt, Excerpts
+from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.rendering import Rendered
-from wayside.rules import CompiledAction, CompiledRule
+from wayside.rules import CompiledAction, CompiledRule, CompiledWindow
 
 REPLACED = "the action was changed or removed"
 
@@ -76,6 +77,8 @@ class Consequences:
         self._excerpts = Excerpts(buffer)
         self._running: dict[Run, Excerpt | None] = {}
         """With the excerpt, where the action has a window."""
+        self._requested: dict[Run, Event] = {}
+        """Of the runs, those that somebody asked for, with what they began with."""
         self._noted: list[Consequence] = []
 
     def note(self, rule: CompiledRule, event: Event) -> None:
@@ -99,6 +102,25 @@ class Consequences:
                 clients = None if window.clients is None else window.clients | frozenset(event.subjects)
                 excerpt = self._excerpts.begin(window, clients, event.onset_time - window.before_ns)
             self._running[run] = excerpt
+
+    def request(
+        self, run: Run, event: Event, window: CompiledWindow, clients: frozenset[str] | None, begin: int, until: int
+    ) -> None:
+        """Somebody asked for these samples: a run that belongs to no episode of a rule. Times are nanoseconds.
+
+        `event` says what it is about; `clients` None: all. It is over at `until` at the latest.
+        """
+        self._noted.append(Begun(run, event, Rendered(), resumed=False))
+        excerpt = self._excerpts.begin(window, clients, begin)
+        excerpt.until = until
+        self._running[run] = excerpt
+        self._requested[run] = event
+
+    def release(self, run: Run, until: int) -> None:
+        """Nobody needs what comes after `until` for that run; one that is over already stays so."""
+        excerpt = self._running.get(run)
+        if excerpt is not None and excerpt.until is not None:
+            excerpt.until = min(excerpt.until, until)
 
     def change(self, before: CompiledRule, rule: CompiledRule, open_starts: Iterable[Event]) -> None:
         """The rule has other actions than before, and these episodes go on."""
@@ -148,6 +170,9 @@ class Consequences:
 
     def _complete(self, run: Run, cut: str) -> None:
         excerpt = self._running.pop(run)
+        begun = self._requested.pop(run, None)
+        if begun is not None and excerpt is not None and not cut:
+            self._noted.append(Over(run, replace(begun, end_time=excerpt.until, reason=Reason.UNTIL)))
         if excerpt is not None:
             self._excerpts.stop(excerpt)
         self._noted.append(Completed(run, cut))

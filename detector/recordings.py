@@ -1,0 +1,131 @@
+"""`detector recordings start`, `stop` and `status`: what triggers ask of other detectors, by hand."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from typing import Annotated
+
+import msgspec
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from detector.actions.trigger.orders import Progress
+from detector.actions.trigger.requests import (
+    RECORDINGS,
+    RecordingReport,
+    RecordingRequest,
+    read_reports,
+    write_request,
+)
+from detector.inquiry import Connect, DetectorFile, Name, Timeout, inquire
+from wayside.api.wording import messages
+from wayside.commandline import refuse
+
+app = typer.Typer(help="Have running detectors record, where they allow it (spec.recordings.onRequest).")
+
+Id = Annotated[str, typer.Argument(help="The recording's id.", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, a line for each recording.")]
+
+_WIDTH = 160
+"""Columns of a table that goes into a pipe or a file."""
+
+
+@app.command()
+def start(
+    identity: Annotated[str | None, typer.Argument(help="An id of your choice. Default: a new one.")] = None,
+    stream: Annotated[list[str] | None, typer.Option(help="A stream; may be repeated. Default: all allowed.")] = None,
+    client: Annotated[list[str] | None, typer.Option(help="A client; may be repeated. Default: all.")] = None,
+    before: Annotated[str, typer.Option(help="From so long before now, as far as it is still there.")] = "0s",
+    maximum_duration: Annotated[str, typer.Option(help="It ends after so long at the latest.")] = "10m",
+    detector: DetectorFile = None,
+    name: Name = None,
+    connect: Connect = None,
+    as_json: Json = False,
+    timeout: Timeout = 3.0,
+) -> None:
+    """Begin a recording, and print its id."""
+    request = _request(
+        do="start",
+        id=identity or f"cli-{uuid.uuid4().hex[:12]}",
+        streams=stream or None,
+        clients=client or None,
+        before=before,
+        maximumDuration=maximum_duration,
+    )
+    if detector is None and name is None:
+        refuse("which detector is to record? Give --name NAME or --detector FILE")
+    _print(_asked(request, detector, name, connect, timeout), as_json)
+
+
+@app.command()
+def stop(
+    identity: Id,
+    after: Annotated[str, typer.Option(help="Until so long after now.")] = "0s",
+    detector: DetectorFile = None,
+    name: Name = None,
+    connect: Connect = None,
+    as_json: Json = False,
+    timeout: Timeout = 3.0,
+) -> None:
+    """End a recording."""
+    if detector is None and name is None:
+        refuse("which detector is to stop? Give --name NAME or --detector FILE")
+    _print(_asked(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
+
+
+@app.command()
+def status(
+    identity: Annotated[str | None, typer.Argument(help="Only this recording.")] = None,
+    detector: DetectorFile = None,
+    name: Name = None,
+    connect: Connect = None,
+    as_json: Json = False,
+    timeout: Timeout = 3.0,
+) -> None:
+    """Say what is recorded on request, and what was."""
+    _print(_asked(_request(id=identity), detector, name, connect, timeout), as_json)
+
+
+def _request(**given: object) -> RecordingRequest:
+    try:
+        return RecordingRequest.model_validate(given)
+    except ValidationError as error:
+        (path, text), *_ = messages(error, given)
+        refuse(f"{'.'.join(map(str, path))}: {text}")
+
+
+def _asked(
+    request: RecordingRequest,
+    detector: DetectorFile,
+    name: str | None,
+    connect: list[str] | None,
+    timeout: float,
+) -> list[tuple[str, RecordingReport]]:
+    """The reports, each with the name of the detector that gave it."""
+    answers = inquire(RECORDINGS, {}, detector, name, connect, timeout, write_request(request))
+    return [(answer.key.split("/")[2], report) for answer in answers for report in read_reports(answer.payload)]
+
+
+def _print(told: list[tuple[str, RecordingReport]], as_json: bool) -> None:
+    """Exits with 1 where a recording was refused or has failed."""
+    if as_json:
+        for holder, report in told:
+            answer = {"detector": holder, **{key: value for key, value in msgspec.to_builtins(report).items() if value}}
+            typer.echo(json.dumps(answer))
+    else:
+        console = Console()
+        if not console.is_terminal:
+            console = Console(width=_WIDTH)
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for column in ("detector", "recording", "state", "until", "samples", "bytes", "files", "message"):
+            table.add_column(column, overflow="fold")
+        for holder, report in told:
+            counts = (report.samples, report.bytes)
+            files = "\n".join(report.files)
+            table.add_row(holder, report.id, report.state.value, report.until, *map(str, counts), files, report.message)
+        console.print(table, highlight=False, markup=False)
+    if any(report.state in (Progress.REFUSED, Progress.FAILED) for _, report in told):
+        raise typer.Exit(1)

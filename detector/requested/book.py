@@ -1,0 +1,137 @@
+"""What is known of the recordings that others asked for: what a request leads to, and what is answered. Pure.
+
+A recording is known by the id that its requester chose, so that a request that is sent twice does nothing twice. Those
+that are over stay known for a while: who comes back is told what became of them, and a start that arrives after its own
+stop begins nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from detector.actions.episode import Outcome, OutcomeState
+from detector.actions.trigger.orders import Progress
+from detector.actions.trigger.requests import RecordingReport, RecordingRequest, time_text
+from wayside.api.recordings import OnRequest
+
+_REMEMBERED = 1000
+"""So many recordings that are over are known."""
+
+BY_ITSELF = "ended by its maximumDuration"
+
+
+@dataclass(slots=True)
+class Entry:
+    """One recording. Times are nanoseconds since the epoch, of the detector's time axis."""
+
+    id: str
+    state: Progress
+    streams: tuple[str, ...] = ()
+    since: int | None = None
+    until: int | None = None
+    stopped: bool = False
+    """Whether somebody asked for its end."""
+    message: str = ""
+    outcome: Outcome = field(default_factory=lambda: Outcome(OutcomeState.RUNNING))
+
+    def report(self) -> RecordingReport:
+        """What is told of it."""
+        said = self.outcome
+        return RecordingReport(
+            id=self.id,
+            state=self.state,
+            message=self.message or said.message,
+            streams=list(self.streams),
+            since=time_text(self.since),
+            until=time_text(self.until),
+            samples=said.samples,
+            bytes=said.bytes,
+            missing=said.missing,
+            files=list(said.files),
+        )
+
+
+class Book:
+    """The recordings by id. For one thread at a time."""
+
+    def __init__(self) -> None:
+        self._entries: dict[str, Entry] = {}
+
+    def start(
+        self, request: RecordingRequest, allowed: OnRequest | None, streams: Collection[str], now: int
+    ) -> tuple[RecordingReport, Entry | None]:
+        """What to answer; and the recording that is to begin, if one is.
+
+        `allowed` is None where nobody may ask; `streams` are those that the detector has.
+        """
+        identity = request.id or ""
+        known = self._entries.get(identity)
+        if known is not None:
+            return known.report(), None
+        refusal = self._refusal(request, allowed, streams)
+        if allowed is None or refusal:
+            return RecordingReport(identity, Progress.REFUSED, refusal), None
+        chosen = request.streams or allowed.streams or sorted(streams)
+        longest = min(request.maximum_duration.ns, allowed.maximum_duration.ns)
+        since = now - request.ago.ns - request.before.ns
+        entry = Entry(identity, Progress.RECORDING, tuple(chosen), since, now + longest)
+        self._entries[identity] = entry
+        self._forget()
+        return entry.report(), entry
+
+    def stop(self, request: RecordingRequest, now: int) -> tuple[RecordingReport, Entry | None]:
+        """What to answer; and the recording whose `until` has come closer, if one has."""
+        identity = request.id or ""
+        entry = self._entries.get(identity)
+        if entry is None:
+            message = "it was stopped before it was started"
+            self._entries[identity] = Entry(identity, Progress.UNKNOWN, stopped=True, message=message)
+            self._forget()
+            return RecordingReport(identity, Progress.UNKNOWN, "nothing is known of it here"), None
+        if entry.state is not Progress.RECORDING:
+            return entry.report(), None
+        entry.state, entry.stopped = Progress.ENDING, True
+        if entry.until is not None:
+            entry.until = min(entry.until, max(now - request.ago.ns + request.after.ns, entry.since or 0))
+        return entry.report(), entry
+
+    def status(self, identity: str | None) -> RecordingReport | list[RecordingReport]:
+        """What is known of one recording, or of all."""
+        if identity is None:
+            return [entry.report() for entry in self._entries.values() if entry.since is not None]
+        entry = self._entries.get(identity)
+        return RecordingReport(identity, Progress.UNKNOWN) if entry is None else entry.report()
+
+    def heard(self, identity: str, outcome: Outcome) -> None:
+        """What is said of the recording."""
+        entry = self._entries.get(identity)
+        if entry is None or entry.state.over:
+            return
+        entry.outcome = outcome
+        if outcome.state is OutcomeState.RUNNING:
+            return
+        entry.state = Progress.DONE if outcome.state is OutcomeState.DONE else Progress.FAILED
+        if entry.state is Progress.DONE and not entry.stopped:
+            entry.message = BY_ITSELF
+
+    def withdraw(self, identity: str) -> None:
+        """It could not be begun after all."""
+        self._entries.pop(identity, None)
+
+    def _refusal(self, request: RecordingRequest, allowed: OnRequest | None, streams: Collection[str]) -> str:
+        if allowed is None:
+            return "this detector records nothing on request: its spec.recordings.onRequest says who may ask for what"
+        open_ones = sum(not entry.state.over for entry in self._entries.values())
+        if open_ones >= allowed.maximum_recordings:
+            return f"{open_ones} recordings are under way, as many as recordings.onRequest.maximumRecordings allows"
+        may = streams if allowed.streams is None else allowed.streams
+        for name in request.streams or ():
+            if name not in may:
+                return f"stream {name} is none that may be recorded here: there is {', '.join(sorted(may))}"
+        return ""
+
+    def _forget(self) -> None:
+        over = [entry.id for entry in self._entries.values() if entry.state.over]
+        for identity in over[: max(0, len(over) - _REMEMBERED)]:
+            del self._entries[identity]

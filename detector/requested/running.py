@@ -1,0 +1,89 @@
+"""How a recording on request runs: by the record action of a rule that nobody wrote, with an episode of its own."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+from detector.actions.outcomes import Which
+from detector.engine.consequences.consequences import Consequences, Run
+from detector.engine.episodes.events import Event
+from detector.requested.book import Entry
+from wayside.api import API_VERSION, Detector, EventRule
+from wayside.names import FLEET, parse_subject
+from wayside.rules.actions import window_of
+
+REQUESTED = Which("_requested", "record")
+"""The rule and the action under which they run: no EventRule in a cluster can have that name."""
+
+
+def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[EventRule]:
+    """The rules whose actions are at work: with that of the recordings on request, where the Detector allows them."""
+    recordings = detector.spec.recordings
+    if recordings is None or recordings.on_request is None:
+        return list(rules)
+    rule = EventRule.model_validate(
+        {
+            "apiVersion": API_VERSION,
+            "kind": "EventRule",
+            "metadata": {"name": REQUESTED.rule, "namespace": detector.namespace},
+            "spec": {
+                "description": "Recordings that others asked for.",
+                "when": "false",
+                "actions": [{"name": REQUESTED.action, "record": {}}],
+            },
+        }
+    )
+    return [*rules, rule]
+
+
+def run_of(identity: str) -> Run:
+    """The run of a recording; its episode is a short name for the id, which may be long."""
+    digest = hashlib.sha256(identity.encode()).digest()[:10]
+    return Run(REQUESTED.rule, REQUESTED.action, base64.b32encode(digest).decode().lower())
+
+
+def begin(
+    consequences: Consequences,
+    entry: Entry,
+    detector: Detector,
+    holder: str,
+    clients: Sequence[str] | None,
+    cause: dict[str, Any],
+    now: int,
+) -> None:
+    """Have the recording's samples told from now on. `cause` is the requester's event; nothing in it is believed."""
+    subject, subjects = _about(cause)
+    data = cause.get("data")
+    classification = data.get("classification") if isinstance(data, dict) else None
+    run = run_of(entry.id)
+    event = Event(
+        holder=holder,
+        rule=run.rule,
+        subject=subject,
+        subjects=subjects,
+        episode=run.episode,
+        onset_time=now if entry.since is None else min(now, entry.since),
+        start_time=now,
+        end_time=None,
+        reason=None,
+        values={"request": entry.id, "event": cause},
+        classification=classification if isinstance(classification, dict) else None,
+    )
+    streams = [stream for stream in detector.spec.streams if stream.name in entry.streams]
+    wanted = None if clients is None else frozenset(clients)
+    window = window_of(detector.spec, streams, wanted)
+    consequences.request(run, event, window, wanted, event.onset_time, entry.until or now)
+
+
+def _about(cause: dict[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """Whom the requester's event is about; the subject stands in names of files."""
+    subject = cause.get("subject")
+    if isinstance(subject, str) and len(subject) <= 256:
+        try:
+            return subject, parse_subject(subject)[0]
+        except ValueError:
+            pass
+    return FLEET, ()
