@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
+from mcap.records import Channel
+from mcap.records import Message as McapMessage
 from mcap.summary import Summary
 
 from detector.replay.errors import DAMAGE, RecordingError
@@ -19,7 +21,11 @@ MAGIC = b"\x89MCAP0\r\n"
 _DAMAGE = (*DAMAGE, McapError, zstandard.ZstdError)
 
 
-def read_mcap(path: Path, wanted: Wanted) -> Iterator[Message]:
+Left = Callable[[Channel, McapMessage], bool]
+"""Whether a message is to be passed over."""
+
+
+def read_mcap(path: Path, wanted: Wanted, left: Left = lambda channel, message: False) -> Iterator[Message]:
     """The file's messages, in the order of their log times. Raises RecordingError if it is cut or damaged."""
     with path.open("rb") as file:
         try:
@@ -28,6 +34,8 @@ def read_mcap(path: Path, wanted: Wanted) -> Iterator[Message]:
             if not topics:
                 return
             for schema, channel, message in reader.iter_messages(topics):
+                if left(channel, message):
+                    continue
                 yield Message(
                     message.log_time,
                     key_of(channel.topic),

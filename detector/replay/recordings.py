@@ -12,6 +12,7 @@ from detector.replay.json_lines import read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
 from detector.replay.mcap_file import mcap_types, read_mcap
 from detector.replay.message import Message, RecordedType, Wanted
+from detector.replay.own_recording import is_own_recording, own_recording_types, read_own_recording
 from detector.replay.pcap import MAGICS as PCAP_MAGICS
 from detector.replay.pcap import read_pcap
 from detector.replay.rosbag1 import ROSBAG1_MAGIC, read_rosbag1, rosbag1_types
@@ -38,6 +39,7 @@ def types_of(path: Path) -> list[RecordedType]:
         read_mcap: mcap_types,
         read_rosbag1: rosbag1_types,
         read_rosbag2: rosbag2_types,
+        read_own_recording: own_recording_types,
     }
     types = kinds.get(_reader(path))
     return [] if types is None else types(path)
@@ -49,7 +51,7 @@ def _reader(path: Path) -> _Read:
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
             raise RecordingError(f"{path}: a folder without metadata.yaml is no rosbag2: give the recordings in it")
-        return read_rosbag2
+        return read_own_recording if is_own_recording(path) else read_rosbag2
     try:
         with path.open("rb") as file:
             head = file.read(4096)

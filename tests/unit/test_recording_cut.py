@@ -109,7 +109,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
     bench.action.started(an_episode())
     for first in range(0, len(SAMPLES), 40):
         bench.action.samples(an_episode(), SAMPLES[first : first + 40])
-        bench.action._open["episode1"].recording.flush()
+        bench.action._open["episode1"].series.flush()
     bench.action.completed(an_episode(), Completion())
     (file,) = mcap_files(bench.folder(an_episode()))
     contents = contents_of(file)
@@ -251,7 +251,7 @@ def test_a_sample_waits_no_longer_than_a_second(tmp_path: Path) -> None:
     bench.action.started(an_episode())
     bench.action.samples(an_episode(), SAMPLES[:5])
     deadline = time.monotonic() + 5
-    while bench.action._open["episode1"].recording.waiting and time.monotonic() < deadline:
+    while bench.action._open["episode1"].series.waiting and time.monotonic() < deadline:
         assert bench.action.wake() is not None
-    assert not bench.action._open["episode1"].recording.waiting
+    assert not bench.action._open["episode1"].series.waiting
     bench.action.close()

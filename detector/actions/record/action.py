@@ -20,6 +20,7 @@ from detector.actions.record.destination import Destination, Kept, NoRoomError, 
 from detector.actions.record.folder import Folder
 from detector.actions.record.recording import Recording, reason
 from detector.actions.record.recovery import REASON, recover
+from detector.actions.record.series import Series
 from wayside.api.actions import record as api
 
 log = logging.getLogger(__name__)
@@ -34,9 +35,8 @@ _EXPIRE_SECONDS = 30.0
 class _Open:
     """An episode that is being recorded."""
 
-    recording: Recording
+    series: Series
     episode: Episode
-    description: Description
     reported: float
 
 
@@ -51,47 +51,43 @@ class Record(Action[api.Record]):
         self._flushed = self._expired = -math.inf
 
     def started(self, episode: Episode) -> None:
-        """Begins a recording. Raises ActionError where there is no room for one."""
+        """Begins a recording. Raises ActionError where there is no room for one, unless another is tried later."""
         surroundings = self.setting.surroundings()
-        description = self._description(episode, surroundings)
-        before = self.parameters.before.ns
+        renew = self.parameters.renew_after
+        start = None if episode.resumed else episode.onset_time - self.parameters.before.ns
         try:
-            folder = Folder.create(self._destination(surroundings), description.rule, description.name, self._dropped)
-            recording = Recording(
-                folder,
-                description.told(),
-                self.parameters,
-                surroundings,
-                start=None if episode.resumed else episode.onset_time - before,
+            series = Series(
+                self._begin,
+                self._description(episode, surroundings),
+                start=start,
+                renew_after=None if renew is None else renew.ns,
             )
         except (NoRoomError, OSError) as error:
             raise ActionError(f"the recording cannot begin: {reason(error)}") from error
-        self._open[episode.id] = _Open(recording, episode, description, time.monotonic())
-        self.setting.report(episode, Outcome(OutcomeState.RUNNING))
+        self._open[episode.id] = _Open(series, episode, time.monotonic())
+        self.setting.report(episode, Outcome(OutcomeState.RUNNING, series.problem))
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
         """Adds them to the recording. What goes wrong ends it, and it is kept as cut."""
         current = self._open.get(episode.id)
         if current is None:  # its recording ended early: that is reported
-            self.setting.lose("samples to record", len(samples), "their recording ended early")
+            self._lose(len(samples))
             return
-        try:
-            current.recording.take(samples, self.setting.surroundings())
-        except (NoRoomError, OSError) as error:
-            self._finish(current, cut=reason(error))
+        current.series.take(samples, self.setting.surroundings())
+        self._settle(current)
 
     def ended(self, episode: Episode) -> None:
         """Samples of `after` may follow."""
-        if current := self._open.get(episode.id):
-            current.episode = episode
+        self._know(episode)
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """Completes the recording."""
-        if current := self._open.get(episode.id):
-            current.episode = episode
-            self._finish(current, cut=completion.cut, missing=completion.missing)
-        elif completion.missing:
-            self.setting.lose("samples to record", completion.missing, "their recording ended early")
+        current = self._know(episode)
+        if current is None:
+            self._lose(completion.missing)
+            return
+        current.series.finish(completion.cut, completion.missing)
+        self._settle(current, over=True)
 
     def wake(self) -> float | None:
         """Flushes what waits, says how far recordings are, and deletes those that are too old."""
@@ -103,53 +99,51 @@ class Record(Action[api.Record]):
             self._flushed = now
             for current in [*self._open.values()]:
                 self._flush(current, now)
-        waiting = any(current.recording.waiting for current in self._open.values())
+        waiting = any(current.series.waiting for current in self._open.values())
         return _FLUSH_SECONDS if waiting else _REPORT_SECONDS if self._open else _EXPIRE_SECONDS
 
     def close(self) -> None:
         """Completes what is still open, marked as cut."""
         for current in [*self._open.values()]:
-            self._finish(current, cut="the detector ended")
+            current.series.finish("the detector ended", 0)
+            self._settle(current, over=True)
+
+    def _know(self, episode: Episode) -> _Open | None:
+        """What is known of the episode now is what its recording tells."""
+        current = self._open.get(episode.id)
+        if current is not None:
+            current.episode = episode
+            current.series.description = replace(current.series.description, episode=episode)
+        return current
 
     def _flush(self, current: _Open, now: float) -> None:
-        try:
-            current.recording.flush()
-        except (NoRoomError, OSError) as error:
-            self._finish(current, cut=reason(error))
-            return
-        if now - current.reported >= _REPORT_SECONDS:
+        current.series.flush()
+        self._settle(current)
+        if now - current.reported >= _REPORT_SECONDS and not current.series.over:
             current.reported = now
-            recording = current.recording
-            outcome = Outcome(OutcomeState.RUNNING, samples=recording.written, bytes=recording.bytes)
-            self.setting.report(current.episode, outcome)
+            self.setting.report(current.episode, current.series.outcome(OutcomeState.RUNNING))
 
-    def _finish(self, current: _Open, cut: str = "", missing: int = 0) -> None:
-        """Completes a recording and reports what became of it: done is what is whole, anything else has failed."""
-        episode, recording = current.episode, current.recording
-        del self._open[episode.id]
-        told = replace(current.description, episode=episode).told()
-        try:
-            kept, told = recording.finish(told, cut, missing)
-        except OSError as error:
-            text = f"the recording cannot be completed, the next start tries again: {error}"
-            self.setting.report(episode, Outcome(OutcomeState.FAILED, text, missing=recording.given + missing))
-            log.error("rule %s, episode %s: %s", episode.rule, episode.id, text)
+    def _settle(self, current: _Open, *, over: bool = False) -> None:
+        """Says what became of a recording that is over: done is what is whole, anything else has failed."""
+        series, episode = current.series, current.episode
+        lost, series.lost = series.lost, 0
+        self._lose(lost)
+        if not (over or series.over):
             return
-        why = str(told.get("cut", ""))
-        if why:
-            log.error("rule %s, episode %s: the recording is cut: %s", episode.rule, episode.id, why)
-        self.setting.report(
-            episode,
-            Outcome(
-                OutcomeState.FAILED if why else OutcomeState.DONE,
-                why,
-                samples=recording.written if kept else 0,
-                bytes=kept.bytes if kept else 0,
-                missing=int(told.get("missing", 0)),
-                files=tuple(f"{episode.rule}/{kept.path.name}/{name}" for name in told["files"]) if kept else (),
-                details={"folder": str(kept.path)} if kept else {},
-            ),
-        )
+        del self._open[episode.id]
+        if series.problem:
+            log.error("rule %s, episode %s: the recording is cut: %s", episode.rule, episode.id, series.problem)
+        self.setting.report(episode, series.outcome(OutcomeState.FAILED if series.problem else OutcomeState.DONE))
+
+    def _lose(self, samples: int) -> None:
+        if samples:
+            self.setting.lose("samples to record", samples, "their recording ended early")
+
+    def _begin(self, description: Description, start: int | None) -> Recording:
+        """A new recording. Raises NoRoomError, OSError."""
+        surroundings = self.setting.surroundings()
+        folder = Folder.create(self._destination(surroundings), description.rule, description.name, self._dropped)
+        return Recording(folder, description.told(), self.parameters, surroundings, start=start)
 
     def _tidy(self) -> None:
         """What earlier runs left behind is completed, beside this thread; what is too old is deleted."""
@@ -195,4 +189,5 @@ class Record(Action[api.Record]):
             action=setting.action,
             episode=episode,
             continued=episode.resumed,
+            part=0 if self.parameters.renew_after is None else 1,
         )

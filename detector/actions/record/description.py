@@ -42,14 +42,21 @@ class Description:
     action: str
     episode: Episode
     continued: bool = False
-    """An earlier recording of the episode ended before its time; this one begins where the detector took it up."""
+    """There was an earlier recording of the episode."""
+
+    part: int = 0
+    """Counts the recordings of an episode that has several, from 1."""
 
     @property
     def name(self) -> str:
         """Of the folder, with nothing about how it ended."""
         start = re.sub("[:.]", "-", format_time(self.episode.start_time)[:23]) + "Z"
         parts = [start, self.rule, self.episode.subject[:_SUBJECT], self.action, encode(self.episode.id)[:16]]
-        return "_".join([*parts, "continued"] if self.continued else parts)
+        if self.episode.resumed:
+            parts.append("continued")
+        if self.part:
+            parts.append(f"part{self.part:04}")
+        return "_".join(parts)
 
     def told(self) -> dict[str, Any]:
         """All of it, as the description's file and the metadata have it."""
@@ -74,6 +81,7 @@ class Description:
             "metadata": dict(episode.rendered) or None,
             "unrendered": dict(episode.unrendered) or None,
             "continued": self.continued or None,
+            "part": self.part or None,
         }
         return {name: value for name, value in told.items() if value is not None}
 
@@ -85,7 +93,7 @@ def with_ending(told: Mapping[str, Any], **changes: JsonValue) -> dict[str, Any]
 
 _BEGINNING = (
     *("format", "holder", "detector", "rule", "generation", "action", "episode", "subject", "subjects", "element"),
-    *("onsetTime", "startTime", "classification", "values", "continued"),
+    *("onsetTime", "startTime", "classification", "values", "continued", "part"),
 )
 
 
@@ -96,7 +104,7 @@ def beginning(told: Mapping[str, Any]) -> dict[str, str]:
 
 def ending(told: Mapping[str, Any]) -> dict[str, str]:
     """What is known at the end."""
-    names = ("rule", "episode", "endTime", "reason", "samples", "missing", "cut")
+    names = ("rule", "episode", "endTime", "reason", "samples", "missing", "cut", "continues")
     return as_text({name: told[name] for name in names if name in told})
 
 

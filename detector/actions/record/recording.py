@@ -75,6 +75,7 @@ class Recording:
         self._schemas: dict[tuple[str, str], int] = {}
         self._first: int | None = None  # the earliest time in the file, but for latched streams
         self._file: McapFile | None = None
+        self._began: int | None = None
         self._closed_bytes = self._taken = self._lost = 0
         self.given = 0
         """Samples that it got, each message counted once."""
@@ -114,6 +115,18 @@ class Recording:
                 self._start = sample.time
                 self._release()
             self._take(sample)
+
+    def began_with(self, samples: Sequence[EpisodeSample]) -> int | None:
+        """When it begins if these come next, but for what is latched; nanoseconds. None: not yet."""
+        if self._began is None:
+            return min((sample.time for sample in samples if sample.stream not in self._topics), default=None)
+        return self._began
+
+    @property
+    def latched(self) -> list[EpisodeSample]:
+        """What was last said on latched streams, in order of time."""
+        known = sorted(self._latched.values(), key=lambda each: each.sample.time)
+        return [*(each.sample for each in known), *self._held]
 
     def flush(self) -> None:
         """Hands to the kernel what waits: it then outlives the process. Raises NoRoomError, OSError."""
@@ -213,6 +226,7 @@ class Recording:
         else:
             self._split(log_time, len(sample.payload))
             self._first = log_time if self._first is None else min(self._first, log_time)
+            self._began = log_time if self._began is None else self._began
         channel = self._channel(place)
         if channel is None:
             return

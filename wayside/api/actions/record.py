@@ -34,6 +34,11 @@ class Record(Window):
         default=Compression.NONE, description="None, Lz4 (fast), or Zstd (smaller). Readers need not be told."
     )
     split: Split = Field(default=Split(), description="When to go on in another file. Default: never.")
+    renew_after: PositiveDuration | None = Field(
+        default=None,
+        description="After this time the recording is completed, and the episode goes on in another: no sample is "
+        "missing or in both. For rules whose episodes never end. Default: one recording for each episode.",
+    )
     metadata: dict[Annotated[str, Field(min_length=1, max_length=63)], JsonValue] = Field(
         default_factory=dict,
         max_length=64,

@@ -1,0 +1,58 @@
+"""What the record action wrote: a rosbag2 that may hold JSON and other streams beside its ROS topics.
+
+Other readers pass those over, so its MCAP files are read here. In a split recording each file begins with what was last
+said on latched streams; such a message has the number that it had the first time, and is taken once.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from mcap.records import Channel
+from mcap.records import Message as McapMessage
+
+from detector.actions.record.description import DESCRIPTION, FORMAT
+from detector.replay.errors import RecordingError
+from detector.replay.mcap_file import mcap_types, read_mcap
+from detector.replay.message import Message, RecordedType, Wanted
+
+
+def is_own_recording(path: Path) -> bool:
+    """Whether the folder is a recording of the record action."""
+    try:
+        told = json.loads((path / DESCRIPTION).read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(told, dict) and told.get("format") == FORMAT
+
+
+def read_own_recording(path: Path, wanted: Wanted) -> Iterator[Message]:
+    """The messages, file by file, in the order of their times. Raises RecordingError where a file is not as it was."""
+    taken: set[tuple[str, str, int]] = set()
+
+    def repeated(channel: Channel, message: McapMessage) -> bool:
+        if channel.metadata.get("latched") != "true":
+            return False
+        about = channel.topic, channel.metadata.get("client", ""), message.sequence
+        if about in taken:
+            return True
+        taken.add(about)
+        return False
+
+    for file in _files(path):
+        yield from read_mcap(file, wanted, repeated)
+
+
+def own_recording_types(path: Path) -> list[RecordedType]:
+    """The message types that the files define. Raises RecordingError."""
+    return list(dict.fromkeys(each for file in _files(path) for each in mcap_types(file)))
+
+
+def _files(path: Path) -> list[Path]:
+    files = [path / name for name in json.loads((path / DESCRIPTION).read_bytes()).get("files", [])]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise RecordingError(f"{path}: {missing[0]} is missing, of the files that {DESCRIPTION} names")
+    return files
