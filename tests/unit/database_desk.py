@@ -119,8 +119,8 @@ def speeds(count: int, client: str = "car1", first: int = 0, pad: int = 0) -> li
     ]
 
 
-def wait_until(condition: Callable[[], bool], within: float = 20) -> None:
+def wait_until(condition: Callable[[], bool], within: float = 30, pause: float = 0.02) -> None:
     deadline = time.monotonic() + within
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.01)
+        time.sleep(pause)

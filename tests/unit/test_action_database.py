@@ -4,47 +4,19 @@ from __future__ import annotations
 
 import json
 import logging
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import pymongo
 import pytest
 
 from detector.actions import ActionError, EpisodeSample, OutcomeState
 from detector.actions.database.server import Redactor
-from tests.mongodb import MongoServer, running
 from tests.mongodb.way import Way
 from tests.unit.database_desk import Desk, speeds, wait_until
 from tests.unit.driving import START, a_stream
 
 SPEEDS = "json/speed"
-
-
-@pytest.fixture(scope="session")
-def server() -> Iterator[MongoServer]:
-    with running() as started:
-        yield started
-
-
-@pytest.fixture
-def name() -> str:
-    return f"t{uuid.uuid4().hex[:16]}"
-
-
-@pytest.fixture
-def database(server: MongoServer, name: str) -> Iterator[Any]:
-    with pymongo.MongoClient[dict[str, Any]](server.uri) as client:
-        yield client[name]
-        client.drop_database(name)
-
-
-@pytest.fixture
-def way(server: MongoServer) -> Iterator[Way]:
-    made = Way(server.host, server.port)
-    yield made
-    made.cut()
 
 
 MakeDesk = Callable[..., Desk]

@@ -53,6 +53,7 @@ class Documents:
     decoders: Mapping[str, Decoder]
     above: int | None
     """Binary fields of more bytes go to files; None: they stay."""
+    _near: dict[str, bool] = field(default_factory=dict)
     _last: dict[tuple[str, str], tuple[int, dict[bytes, int]]] = field(default_factory=dict)
 
     def make(self, sample: EpisodeSample) -> Made:
@@ -72,11 +73,7 @@ class Documents:
         }
         try:
             message = decoder.decode(sample.payload)
-            stamp = (
-                decoder.stamp_near(sample.payload, sample.received)
-                if isinstance(decoder, NearDecoder)
-                else decoder.stamp(sample.payload)
-            )
+            stamp = self._stamp(sample, decoder)
         except DecodeError as error:
             document |= {"error": str(error)[:1000], "payload": sample.payload}
             return self._fitting(stream, sample, document, identity, (), undecoded=True)
@@ -87,6 +84,14 @@ class Documents:
             message, files = detach(message, self.above, self._path(sample, identity))
         document["msg"] = message
         return self._fitting(stream, sample, document, identity, tuple(files), undecoded=False)
+
+    def _stamp(self, sample: EpisodeSample, decoder: Decoder) -> int | None:
+        near = self._near.get(sample.stream)
+        if near is None:  # asked once: the answer takes longer than all else
+            near = self._near[sample.stream] = isinstance(decoder, NearDecoder)
+        if near and isinstance(decoder, NearDecoder):
+            return decoder.stamp_near(sample.payload, sample.received)
+        return decoder.stamp(sample.payload)
 
     def _fitting(
         self,

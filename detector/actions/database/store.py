@@ -191,8 +191,11 @@ class Store:
                 self._bytes -= write.size
             self._lock.notify_all()
 
-    def _send(self, write: Write) -> bool:
-        """Write it, however often that takes; False where there is no more time."""
+    def _send(self, write: Write, patience: int = _SUSPECT) -> bool:
+        """Write it, however often that takes; False where there is no more time.
+
+        `patience`: after so many connections that ended with it, documents are looked for that are to blame.
+        """
         pause, broke = 0.05, 0
         while True:
             try:
@@ -202,7 +205,7 @@ class Store:
             except UnavailableError as error:
                 self._note_away(str(error))
                 broke = broke + 1 if error.broke and self._server.answers() else 0
-                if broke >= _SUSPECT:
+                if broke >= patience:
                     return self._divide(write, "the server ends the connection when it gets it")
                 if error.broke and broke:
                     pause = 0.05  # it is there
@@ -221,7 +224,7 @@ class Store:
     def _divide(self, write: Write, why: str) -> bool:
         """Find the documents that cannot be written among those that can."""
         if len(write.documents) > 1:
-            return all(self._send(half) for half in write.halves())
+            return all(self._send(half, 1 if len(half.documents) > 1 else _SUSPECT) for half in write.halves())
         if not self._reject(write, 0, why):
             return False
         if write.completes:

@@ -1,0 +1,39 @@
+"""A MongoDB server that the tests share, a database on it for each, and a way to it that can be cut."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from typing import Any
+
+import pymongo
+import pytest
+
+from tests.mongodb import MongoServer, running
+from tests.mongodb.way import Way
+
+
+@pytest.fixture(scope="session")
+def mongodb() -> Iterator[MongoServer]:
+    with running() as started:
+        yield started
+
+
+@pytest.fixture
+def name() -> str:
+    """Of a database that no other test uses."""
+    return f"t{uuid.uuid4().hex[:16]}"
+
+
+@pytest.fixture
+def database(mongodb: MongoServer, name: str) -> Iterator[Any]:
+    with pymongo.MongoClient[dict[str, Any]](mongodb.uri) as client:
+        yield client[name]
+        client.drop_database(name)
+
+
+@pytest.fixture
+def way(mongodb: MongoServer) -> Iterator[Way]:
+    made = Way(mongodb.host, mongodb.port)
+    yield made
+    made.cut()
