@@ -27,10 +27,15 @@ class ClosedError(Exception):
 
 
 class Wire:
-    """One end of the connection."""
+    """One end of the connection.
+
+    A message may come in pieces, between which the time of a `receive` ends: what has come is kept for the next one.
+    """
 
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
+        self._parts: list[bytes] = []
+        self._size: int | None = None
 
     def send(self, *message: Any, within: float | None = None) -> None:
         """Raises ClosedError, TimeoutError (after so many seconds), and TypeError or OverflowError for strange data."""
@@ -46,8 +51,10 @@ class Wire:
     def receive(self, within: float | None = None) -> list[Any]:
         """The next message. Raises ClosedError, TimeoutError (after so many seconds)."""
         until = None if within is None else time.monotonic() + within
-        (size,) = _LENGTH.unpack(self._exactly(_LENGTH.size, until))
-        message: list[Any] = _decode(self._exactly(size, until))
+        if self._size is None:
+            (self._size,) = _LENGTH.unpack(self._exactly(_LENGTH.size, until))
+        data, self._size = self._exactly(self._size, until), None
+        message: list[Any] = _decode(data)
         return message
 
     def close(self) -> None:
@@ -55,7 +62,7 @@ class Wire:
         self._socket.close()
 
     def _exactly(self, size: int, until: float | None) -> bytes:
-        parts, missing = [], size
+        missing = size - sum(map(len, self._parts))
         while missing:
             if until is not None:
                 left = until - time.monotonic()
@@ -72,6 +79,8 @@ class Wire:
                 raise ClosedError from error
             if not part:
                 raise ClosedError
-            parts.append(part)
+            self._parts.append(part)
             missing -= len(part)
-        return b"".join(parts)
+        data = b"".join(self._parts)
+        self._parts.clear()
+        return data

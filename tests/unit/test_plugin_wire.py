@@ -1,0 +1,53 @@
+"""What the detector and the process of a plugin tell each other arrives whole, however it is cut on the way."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Iterator
+
+import msgspec
+import pytest
+
+from detector.plugins.wire import ClosedError, Wire
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[socket.socket, Wire]]:
+    """The one end bare, the other as the detector has it."""
+    one, other = socket.socketpair()
+    with one, other:
+        yield one, Wire(other)
+
+
+def framed(*message: object) -> bytes:
+    data = msgspec.msgpack.encode(message)
+    return struct.pack(">I", len(data)) + data
+
+
+def test_a_message_that_comes_in_pieces_is_kept_while_nothing_more_comes_in_time(
+    ends: tuple[socket.socket, Wire],
+) -> None:
+    """A busy machine may well leave the reader no time between a message's length and its content."""
+    sender, wire = ends
+    for byte in framed("ready"):
+        with pytest.raises(TimeoutError):
+            wire.receive(0.001)
+        sender.send(bytes([byte]))
+    assert wire.receive(60) == ["ready"]
+    sender.send(framed("result", 7))
+    assert wire.receive(60) == ["result", 7]
+
+
+def test_messages_that_come_together_are_told_one_by_one(ends: tuple[socket.socket, Wire]) -> None:
+    sender, wire = ends
+    sender.send(framed("query", "newest") + framed("result", None))
+    assert [wire.receive(60), wire.receive(60)] == [["query", "newest"], ["result", None]]
+
+
+def test_who_hangs_up_amid_a_message_is_gone(ends: tuple[socket.socket, Wire]) -> None:
+    sender, wire = ends
+    sender.send(framed("ready")[:-1])
+    sender.shutdown(socket.SHUT_WR)
+    with pytest.raises(ClosedError):
+        wire.receive(60)
