@@ -197,19 +197,27 @@ def test_a_task_that_an_earlier_run_over_the_same_data_ended_is_made_anew(tmp_pa
 
 
 def test_an_outage_delays_and_loses_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    folder, aside = tmp_path / "tasks", tmp_path / "aside"
+    folder, there = tmp_path / "tasks", tmp_path / "there"
+    there.mkdir()
+    (away := tmp_path / "away").write_text("a file where the folder was: nothing can be read or written")
+
+    def turn(to: Path) -> None:
+        """The folder is this one, from one moment to the next."""
+        (new := tmp_path / "new").symlink_to(to)
+        new.replace(folder)
 
     async def drive() -> DeployCounts:
+        turn(there)
         async with reconciling(folder) as reconciler:
             reconciler.update(by_name(A), {})
-            await eventually(lambda: folder.exists() and A.name in ends(folder), "it is live")
-            folder.rename(aside)
-            folder.write_text("a file where the folder was: nothing can be read or written")
+            await eventually(lambda: A.name in ends(folder), "it is live")
+            turn(away)
             reconciler.update(by_name(B, C), {A.name: 5})
             await eventually(lambda: reconciler.counts.retried > 1, "the outage was met")
             reconciler.update(by_name(B), {C.name: 6})
-            folder.unlink()
-            aside.rename(folder)
+            retried = reconciler.counts.retried  # with one attempt that may have begun before
+            await eventually(lambda: reconciler.counts.retried > retried + 1, "it goes on")
+            turn(there)
             await eventually(lambda: ends(folder) == {A.name: format_time(5), B.name: None}, "all is made good")
         return reconciler.counts
 

@@ -236,7 +236,7 @@ def test_the_level_rises_with_each_long_look_and_falls_in_calm() -> None:
 
 
 class Recording:
-    """Keeps what the engine consumes and says."""
+    """Keeps what the engine consumes and says: recorder and outlet in one."""
 
     def __init__(self) -> None:
         self.records: list[Arrival | Control] = []
@@ -245,7 +245,10 @@ class Recording:
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
         self.records += arrivals
 
-    def follow(self, streams: Any) -> None:
+    def follow(self, streams_or_rules: Any, types_or_surroundings: Any) -> None:
+        pass
+
+    def consequences(self, consequences: Any) -> None:
         pass
 
     def control(self, time: int, document: Mapping[str, Any]) -> None:

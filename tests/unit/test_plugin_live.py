@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from detector.actions.base import Surroundings
 from detector.assembly import inlets, make_engine
+from detector.engine.consequences.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
@@ -26,6 +28,7 @@ from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from tests.unit.driving import a_detector
 from tests.unit.plugin_rules import plugin_rule, plugins
+from wayside.api import EventRule
 
 __all__ = ["plugins"]  # a fixture
 
@@ -42,6 +45,12 @@ class Kept:
 
     def events(self, events: Sequence[Event]) -> None:
         self.all += events
+
+    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+        pass
+
+    def consequences(self, consequences: Sequence[Consequence]) -> None:
+        pass
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
         pass
