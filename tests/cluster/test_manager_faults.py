@@ -62,10 +62,10 @@ def quiet(api: Api) -> dict[tuple[str, str], str]:
 
 
 def has_pods(raw: Object) -> bool:
-    """Whether the controllers have seen the Deployment as it is and made its pods, which never become available."""
+    """Whether the controllers have seen the Deployment as it is and made its pods."""
     status = raw.get("status", {})
     seen = status.get("observedGeneration") == raw["metadata"]["generation"]
-    return seen and status.get("updatedReplicas") == status.get("unavailableReplicas") == raw["spec"]["replicas"]
+    return bool(seen and status.get("updatedReplicas") == raw["spec"]["replicas"])
 
 
 def there(api: Api, name: str) -> Object:
