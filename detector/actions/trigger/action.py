@@ -18,6 +18,7 @@ from detector.actions.base import Action, ActionError, Setting
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
 from detector.actions.trigger.course import FOREVER, Course, Limits, Step
 from detector.actions.trigger.detectors import OtherDetector
+from detector.actions.trigger.endpoints import HttpEndpoint
 from detector.actions.trigger.journal import Journal
 from detector.actions.trigger.orders import Order, Report, System
 from detector.actions.trigger.ros2 import Ros2Services, problems
@@ -159,6 +160,8 @@ class Trigger(Action[api.Trigger]):
     def _make_system(self) -> System:
         if self.parameters.detector is not None:
             return OtherDetector(self.parameters, self.setting.messenger)
+        if self.parameters.http is not None:
+            return HttpEndpoint(self.parameters)
         return Ros2Services(self.parameters, self.setting.messenger, lambda: self.setting.surroundings().types)
 
     def _make_journal(self) -> Journal | None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from typing import Any
 
 from detector.actions.base import ActionError, Messenger
-from detector.actions.trigger.orders import Order, Report
+from detector.actions.trigger.orders import Order, Report, member
 from detector.actions.trigger.requests import (
     RECORDINGS,
     RecordingRequest,
@@ -41,7 +39,7 @@ class OtherDetector:
 
     def place(self, order: Order) -> str:
         """The other detector's holder."""
-        name = _member(order.rendered, "detector", "name")
+        name = member(order.rendered, "detector", "name")
         if not isinstance(name, str) or not _HOLDER.fullmatch(name):
             raise ActionError(f"detector.name: {name!r} is no detector's name: it has letters, digits, _, . and - only")
         return name
@@ -49,7 +47,7 @@ class OtherDetector:
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
         """Record; where it was confirmed before, nothing that was earlier."""
         wanted = self._wanted
-        subjects = _member(order.event, "data", "subjects")
+        subjects = member(order.event, "data", "subjects")
         clients = None
         if wanted.clients is WindowClients.SUBJECTS and subjects:
             clients = sorted({*subjects, *wanted.with_clients})
@@ -81,9 +79,3 @@ class OtherDetector:
         except (IndexError, ValueError) as error:
             raise ActionError(f"detector {name} answered something else: {error}") from error
         return Report(said.state, said.message, said.samples, said.bytes, said.missing, tuple(said.files))
-
-
-def _member(value: Any, *names: str) -> Any:
-    for name in names:
-        value = value.get(name) if isinstance(value, Mapping) else None
-    return value

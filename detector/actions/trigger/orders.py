@@ -74,3 +74,10 @@ class System(Protocol):
 
     def status(self, order: Order) -> Report:
         """How far it is."""
+
+
+def member(value: Any, *names: str) -> Any:
+    """What lies under these names in maps within maps; None where there is none."""
+    for name in names:
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value

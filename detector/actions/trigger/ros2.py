@@ -21,7 +21,7 @@ from typing import Any
 
 from detector.actions.base import ActionError, Messenger
 from detector.actions.trigger.composing import ServiceError
-from detector.actions.trigger.orders import Order, Progress, Report
+from detector.actions.trigger.orders import Order, Progress, Report, member
 from detector.actions.trigger.services import service
 from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.ros import RosTypes, types_with
@@ -112,9 +112,7 @@ class Ros2Services:
 
     @staticmethod
     def _request(name: str, order: Order) -> Mapping[str, Any]:
-        value: Any = order.rendered
-        for part in ("ros2", name, "request"):
-            value = value.get(part) if isinstance(value, Mapping) else None
+        value = member(order.rendered, "ros2", name, "request")
         return value if isinstance(value, Mapping) else {}
 
 

@@ -17,7 +17,7 @@ from wayside.api.base import Model, ObjectName, PositiveDuration, validations
 _VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
 _TOKEN = r"^[A-Za-z0-9!#$%&'*+.^_`|~-]+$"  # noqa: S105  RFC 9110, section 5.6.2: what a header's name is made of
 _OURS = ("host", "content-length", "content-type", "transfer-encoding", "connection", "expect", "te", "upgrade")
-_TLS_ONCE = "give tls or tlsSecret, not both"
+TLS_ONCE = "give tls or tlsSecret, not both"
 _VALUE_ONCE = "give exactly one of value, variable and secret"
 
 
@@ -76,7 +76,7 @@ class HttpHeader(Model):
 class HttpAccess(Model):
     """How an endpoint is entered. Its certificate is always checked; redirects are never followed."""
 
-    model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE))
+    model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE))
 
     headers: list[HttpHeader] = Field(
         default_factory=list,
@@ -100,7 +100,7 @@ class HttpAccess(Model):
     @model_validator(mode="after")
     def _given_once(self) -> HttpAccess:
         if self.tls is not None and self.tls_secret is not None:
-            raise ValueError(_TLS_ONCE)
+            raise ValueError(TLS_ONCE)
         names = [header.name.lower() for header in self.headers]
         if len(set(names)) < len(names):
             raise ValueError("headers: each name only once; upper and lower case are the same")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from wayside.api.actions.http import TLS_ONCE, HttpAccess, HttpUrl
 from wayside.api.actions.window import WindowClients
 from wayside.api.base import (
     ClientName,
@@ -123,7 +125,60 @@ class TriggerRos2(Model):
         return {name: call for name, call in (("start", self.start), ("stop", self.stop)) if call is not None}
 
 
-_SYSTEMS = ("detector", "ros2")
+class HttpMethod(StrEnum):
+    """What a request does."""
+
+    POST = "POST"
+    PUT = "PUT"
+    PATCH = "PATCH"
+    DELETE = "DELETE"
+
+
+class HttpCall(Model):
+    """One HTTP request. Its header Idempotency-Key is the recording's id and .start or .stop."""
+
+    method: HttpMethod = Field(default=HttpMethod.POST, description="POST, PUT, PATCH or DELETE.")
+    url: HttpUrl = Field(
+        description="Where to; {id} in it becomes the recording's id, e.g. https://recorder/recordings/{id}."
+    )
+    body: dict[str, JsonValue] | None = Field(
+        default=None,
+        description="What is sent as JSON, with ${…} over the rule's variables at the start of the episode. Default: "
+        "id, do (start or stop), maximumDuration and the CloudEvent of the start as event.",
+        json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
+    )
+
+    @field_validator("url")
+    @classmethod
+    def _fixed(cls, url: str) -> str:
+        if "${" in url:
+            raise ValueError("takes no ${…}, since values could lead elsewhere: write {id}, and put values into body")
+        return url
+
+
+class TriggerHttp(HttpAccess):
+    """Requests to an HTTP endpoint when the episode starts and ends."""
+
+    model_config = validations(
+        ("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE), ("has(self.start) || has(self.stop)", _CALL)
+    )
+
+    start: HttpCall | None = Field(default=None, description="Sent at the start.")
+    stop: HttpCall | None = Field(default=None, description="Sent at the end.")
+
+    @model_validator(mode="after")
+    def _any_call(self) -> TriggerHttp:
+        if self.start is None and self.stop is None:
+            raise ValueError(_CALL)
+        return self
+
+    @property
+    def calls(self) -> Mapping[str, HttpCall]:
+        """The calls by the field that says them."""
+        return {name: call for name, call in (("start", self.start), ("stop", self.stop)) if call is not None}
+
+
+_SYSTEMS = ("detector", "ros2", "http")
 _ONE = f"give exactly one of {', '.join(_SYSTEMS[:-1])} and {_SYSTEMS[-1]}"
 
 
@@ -136,16 +191,19 @@ class Trigger(Model):
 
     detector: TriggerDetector | None = Field(default=None, description="Another detector records.")
     ros2: TriggerRos2 | None = Field(default=None, description="Services of ROS 2 are called, e.g. of rosbag2.")
+    http: TriggerHttp | None = Field(default=None, description="An HTTP endpoint is told.")
     maximum_duration: PositiveDuration = Field(
         default=PositiveDuration("10m"),
         description="The recording ends after so long even where nobody stops it. Another detector sees to that "
-        "itself; ROS 2 services are then told by this one, if it still runs.",
+        "itself; ROS 2 services and HTTP endpoints are then told by this one, if it still runs.",
     )
     give_up_after: PositiveDuration = Field(
         default=PositiveDuration("5m"),
         description="A start or stop that is not confirmed is sent again, for so long.",
     )
-    timeout: PositiveDuration = Field(default=PositiveDuration("3s"), description="How long one answer may take.")
+    timeout: PositiveDuration = Field(
+        default=PositiveDuration("3s"), description="How long one answer may take over Zenoh."
+    )
 
     @model_validator(mode="after")
     def _one_system(self) -> Trigger:
@@ -158,5 +216,7 @@ class Trigger(Model):
         """What is rendered for each episode."""
         if self.detector is not None:
             return {"detector": {"name": self.detector.name}}
-        assert self.ros2 is not None  # noqa: S101  one of them is given
-        return {"ros2": {name: {"request": call.request} for name, call in self.ros2.calls.items()}}
+        if self.ros2 is not None:
+            return {"ros2": {name: {"request": call.request} for name, call in self.ros2.calls.items()}}
+        assert self.http is not None  # noqa: S101  one of them is given
+        return {"http": {name: {"body": call.body} for name, call in self.http.calls.items() if call.body is not None}}

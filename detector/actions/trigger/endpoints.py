@@ -1,0 +1,88 @@
+"""An HTTP endpoint that records: told by a request at the start and one at the end.
+
+It tells a request that is sent again by the header Idempotency-Key. What it answers counts: a start that it refuses for
+good is not sent again, and a stop of what is not there (404, 410) is as good as done.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+
+from yarl import URL
+
+from detector.actions.base import ActionError
+from detector.actions.http import HttpClient, HttpError, Verdict, judge
+from detector.actions.trigger.orders import Order, Progress, Report, member
+from wayside.api.actions.trigger import HttpCall, Trigger
+from wayside.names import encode
+
+_GONE = (404, 410)
+_CONFLICT = 409
+
+
+class HttpEndpoint:
+    """Tells an HTTP endpoint to record."""
+
+    renew: float | None = None
+    ends_by_itself = False
+
+    def __init__(self, parameters: Trigger) -> None:
+        assert parameters.http is not None  # noqa: S101  that is what it is made for
+        self._wanted = parameters.http
+        self._maximum = parameters.maximum_duration
+        self.timeout = parameters.http.timeout.seconds
+        self._client = HttpClient(parameters.http, "trigger.http")
+        self._unanswered: set[str] = set()
+        """The recordings whose start went out and was not answered."""
+
+    def place(self, order: Order) -> str:
+        """Scheme, host and port of the first request."""
+        url = URL(next(iter(self._wanted.calls.values())).url, encoded=True)
+        return f"{url.scheme}://{url.host}:{url.port}"
+
+    def start(self, order: Order, ago: float, *, again: bool) -> Report:
+        """Send `start`."""
+        if self._wanted.start is None:
+            return Report(Progress.RECORDING)
+        try:
+            status, verdict, told = self._send("start", self._wanted.start, order)
+        except ActionError:
+            self._unanswered.add(order.id)
+            raise
+        repeated = again or order.id in self._unanswered
+        self._unanswered.discard(order.id)
+        if verdict is Verdict.DONE or (status == _CONFLICT and repeated):
+            return Report(Progress.RECORDING)
+        return Report(Progress.FAILED, told)
+
+    def stop(self, order: Order, ago: float) -> Report:
+        """Send `stop`."""
+        if self._wanted.stop is None:
+            return Report(Progress.DONE)
+        status, verdict, told = self._send("stop", self._wanted.stop, order)
+        if verdict is Verdict.DONE:
+            return Report(Progress.DONE)
+        return Report(Progress.DONE if status in _GONE else Progress.REFUSED, told)
+
+    def status(self, order: Order) -> Report:
+        """Nothing more is to be known than what the requests said."""
+        return Report(Progress.DONE)
+
+    def _send(self, name: str, call: HttpCall, order: Order) -> tuple[int, Verdict, str]:
+        """The status, what follows from it and what was said. Raises ActionError where it is worth another attempt."""
+        body = member(order.rendered, "http", name, "body")
+        if body is None:
+            body = {"id": order.id, "do": name, "maximumDuration": str(self._maximum), "event": order.event}
+        headers = {"Content-Type": "application/json", "Idempotency-Key": f"{order.id}.{name}"}
+        url = call.url.replace("{id}", encode(order.id))
+        end = time.monotonic() + self.timeout
+        try:
+            text = json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
+            answer = self._client.send(call.method.value, url, headers, text, give_up=lambda: time.monotonic() >= end)
+        except (HttpError, ValueError) as error:
+            raise ActionError(str(error)) from error
+        verdict, told = judge(answer)
+        if verdict is Verdict.AGAIN:
+            raise ActionError(f"{self.place(order)} {told}")
+        return answer.status, verdict, f"{self.place(order)} {told}"
