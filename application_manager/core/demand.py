@@ -12,9 +12,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from application_manager.core import byhand, parameters
+from application_manager.core import byhand
 from application_manager.core.claims import Claim, InvalidTemplate, Refusal, Refused, claim
 from application_manager.core.leases import LeaseView
+from application_manager.core.merging import Contribution, merge
+from application_manager.core.parameters import with_defaults
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle, LossPolicy
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Duration
@@ -59,6 +61,7 @@ class Decision:
         next_change: when this decision changes by itself, in seconds since 1970; None: not at all.
         paused: whether a person wants the instance and its objects left as they are.
         withheld: whether the pause keeps merged values from the instance.
+        capped: a word about each merged sum that is held at its parameter's bound.
     """
 
     name: str
@@ -71,6 +74,7 @@ class Decision:
     next_change: float | None
     paused: bool = False
     withheld: bool = False
+    capped: tuple[str, ...] = ()
 
     @property
     def wanted(self) -> bool:
@@ -107,7 +111,7 @@ def demand(
     existing = {each.name: each for each in instances}
     claimed: dict[str, list[Claim]] = {}
     verdicts: dict[str, Verdict] = {}
-    for task in tasks:
+    for task in {each.name: each for each in tasks}.values():
         verdict = claim_or_verdict(by_name.get(task.spec.template), task)
         if isinstance(verdict, Claim):
             claimed.setdefault(verdict.instance, []).append(verdict)
@@ -182,7 +186,8 @@ def decide(
         else:
             verdicts[each.task.name] = lapse
     declared = template.spec.parameters if template else {}
-    merged = parameters.merge(declared, [parameters.Contribution(each.task.name, each.parameters) for each in live])
+    merged = merge(declared, [Contribution(each.task.name, each.parameters) for each in live])
+    values = with_defaults(declared, merged.parameters)
     contributing = [each for each in live if each.task.name not in merged.conflicts]
     for each in live:
         conflict = merged.conflicts.get(each.task.name)
@@ -201,16 +206,14 @@ def decide(
         name=name,
         template=template_name,
         key=key,
-        parameters=merged.parameters if contributing and not paused else None,
+        parameters=values if contributing and not paused else None,
         tasks=tuple(each.task.name for each in contributing),
         verdicts=verdicts,
         release_time=release_time,
         next_change=min((change for change in changes if change > now), default=None),
         paused=paused,
-        withheld=paused
-        and bool(contributing)
-        and instance is not None
-        and instance.spec.parameters != merged.parameters,
+        withheld=paused and bool(contributing) and instance is not None and instance.spec.parameters != values,
+        capped=merged.capped if contributing else (),
     )
 
 

@@ -1,4 +1,4 @@
-"""What tasks say, checked against what the template asks for, and merged into one value for each parameter.
+"""What tasks say, checked against what the template asks for.
 
 Pure. A task whose values do not fit is refused as a whole, and then contributes nothing to any parameter.
 """
@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
-from application_manager.core import values
+from application_manager.core import patterns, values
 from wayside.api.applicationtask import MAXIMUM_PARAMETER_BYTES
-from wayside.api.applicationtemplate import Merge, Parameter
+from wayside.api.parameter import Parameter
 
 Parameters = Mapping[str, Any]
 """Parameter names to JSON values."""
@@ -62,6 +61,8 @@ def _unknown(name: str, template: str, declared: Mapping[str, Parameter]) -> str
 
 def _problem(parameter: Parameter, value: Any) -> str | None:
     problem = parameter.problem(value)
+    if problem is None and parameter.pattern is not None:
+        problem = patterns.mismatch(parameter.pattern, value)
     return f"{problem}: {_remedy(parameter)}" if problem else None
 
 
@@ -73,85 +74,19 @@ def _remedy(parameter: Parameter) -> str:
         if limit is not None
     ]
     choice = f"one of {', '.join(values.shown(each) for each in parameter.enum)}" if parameter.enum else ""
-    return "give " + " ".join(part for part in (f"a value of type {kind}", " and ".join(bounds), choice) if part)
+    match = f"matching {parameter.pattern}" if parameter.pattern else ""
+    return "give " + " ".join(part for part in (f"a value of type {kind}", " and ".join(bounds), choice, match) if part)
 
 
-@dataclass(frozen=True, slots=True)
-class Contribution:
-    """The values of one task."""
-
-    task: str
-    parameters: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Conflict:
-    """A task that differs from an earlier one in a parameter on which all must agree."""
-
-    parameter: str
-    value: Any
-    other: Any
-    other_task: str
-
-    def message(self) -> str:
-        """The refusal, with field, value and remedy."""
-        return (
-            f"spec.parameters.{self.parameter}: {values.shown(self.value)} differs from {values.shown(self.other)} of "
-            f"task {self.other_task}, and its merge strategy is Same: give the same value, wait until that task ends, "
-            "or let the template's key tell the two apart"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Merged:
-    """One set of parameters for the instance, and the tasks that could not take part."""
-
-    parameters: dict[str, Any]
-    conflicts: dict[str, Conflict]
-
-
-def merge(declared: Mapping[str, Parameter], contributions: Sequence[Contribution]) -> Merged:
-    """Merge the tasks' values, which fit the template, in the order given: the first of them has precedence."""
-    agreed: dict[str, tuple[str, Any, str]] = {}  # name → canonical value, value, task
-    taken: list[Contribution] = []
-    conflicts: dict[str, Conflict] = {}
-    for each in contributions:
-        conflict = _conflict(declared, agreed, each)
-        if conflict is not None:
-            conflicts[each.task] = conflict
-            continue
-        taken.append(each)
-        for name, value in each.parameters.items():
-            if declared[name].merge is Merge.SAME and name not in agreed:
-                agreed[name] = (values.canonical(value), value, each.task)
-    result: dict[str, Any] = {}
+def template_problems(declared: Mapping[str, Parameter]) -> list[str]:
+    """What is wrong with the patterns of the parameters that a template declares; its model has checked all else."""
+    found = []
     for name, parameter in declared.items():
-        said = [each.parameters[name] for each in taken if name in each.parameters]
-        if said:
-            result[name] = _merged(parameter.merge, said)
-    return Merged(with_defaults(declared, result), conflicts)
-
-
-def _conflict(
-    declared: Mapping[str, Parameter], agreed: Mapping[str, tuple[str, Any, str]], each: Contribution
-) -> Conflict | None:
-    for name, value in sorted(each.parameters.items()):
-        if declared[name].merge is not Merge.SAME or name not in agreed:
+        if parameter.pattern is None:
             continue
-        text, other, task = agreed[name]
-        if values.canonical(value) != text:
-            return Conflict(name, value, other, task)
-    return None
-
-
-def _merged(strategy: Merge, said: Sequence[Any]) -> Any:
-    match strategy:
-        case Merge.SAME | Merge.HIGHEST_PRIORITY:
-            return said[0]
-        case Merge.MAX:
-            return max(said)
-        case Merge.MIN:
-            return min(said)
-        case Merge.UNION:
-            items = {values.canonical(item): item for each in said for item in each}
-            return sorted(items.values(), key=values.sort_key)
+        problem = patterns.pattern_problem(parameter.pattern)
+        if problem:
+            found.append(f"spec.parameters.{name}.pattern: {problem}")
+        elif parameter.default is not None and (problem := patterns.mismatch(parameter.pattern, parameter.default)):
+            found.append(f"spec.parameters.{name}.default: {problem}: correct one of the two")
+    return found

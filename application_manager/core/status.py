@@ -115,8 +115,24 @@ def instance_status(
         release_time=None if decision.release_time is None else format_seconds(decision.release_time),
         objects=list(objects),
         demands=demands(decision),
-        conditions=list(updated(old.conditions, (applied, ready, *byhand.aspects(instance)), generation, now)),
+        conditions=list(
+            updated(
+                old.conditions,
+                (applied, ready, *_capped(old.conditions, decision), *byhand.aspects(instance)),
+                generation,
+                now,
+            )
+        ),
     )
+
+
+def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:
+    """The condition Capped, from when a merged sum went beyond its bounds for the first time."""
+    if decision.capped:
+        return [Aspect("Capped", True, "SumBeyondBounds", "; ".join(decision.capped))]
+    if find(known, "Capped") is not None:
+        return [Aspect("Capped", False, "WithinBounds", "all merged values are as the tasks say")]
+    return []
 
 
 def demands(decision: Decision) -> Demands:

@@ -235,13 +235,13 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "ApplicationTemplate",
         "a union of numbers",
         {f"{PARAMETER}.merge": "Union"},
-        r"spec\.parameters\[?.?rateHz\]?: .*merge Union needs type array",
+        r"spec\.parameters\[?.?rateHz\]?: .*merge Union and Intersection need type array",
     ),
     (
         "ApplicationTemplate",
         "a maximum of strings",
         {"spec.parameters.region.merge": "Max"},
-        r"merge Max and Min need type number or integer",
+        r"merge Max, Min and Sum need type number or integer",
     ),
     (
         "ApplicationTemplate",
@@ -249,6 +249,9 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         {"spec.parameters.region.minimum": 1},
         r"minimum and maximum need type number or integer",
     ),
+    ("ApplicationTemplate", "any of texts", {"spec.parameters.region.merge": "Any"}, r"All and Any need type boolean"),
+    ("ApplicationTemplate", "bounds that exclude all", {f"{PARAMETER}.maximum": 0}, r"minimum is above maximum"),
+    ("ApplicationTemplate", "a pattern of numbers", {f"{PARAMETER}.pattern": "^a"}, r"pattern needs type string"),
     ("ApplicationTemplate", "items of a number", {f"{PARAMETER}.items": "string"}, r"items needs type array"),
     (
         "ApplicationTemplate",

@@ -5,137 +5,18 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from wayside.api.base import (
     Condition,
     Duration,
     Expression,
     Identifier,
-    JsonValue,
     Kind,
     Model,
     conditions_field,
-    validations,
 )
-
-
-class ParameterType(StrEnum):
-    """The JSON type of a parameter; integer is a number without a fraction."""
-
-    STRING = "string"
-    NUMBER = "number"
-    INTEGER = "integer"
-    BOOLEAN = "boolean"
-    ARRAY = "array"
-    OBJECT = "object"
-
-
-class ItemType(StrEnum):
-    """The JSON type of an array's items."""
-
-    STRING = "string"
-    NUMBER = "number"
-    INTEGER = "integer"
-    BOOLEAN = "boolean"
-
-
-class Merge(StrEnum):
-    """How the values of several tasks become one."""
-
-    SAME = "Same"
-    UNION = "Union"
-    MAX = "Max"
-    MIN = "Min"
-    HIGHEST_PRIORITY = "HighestPriority"
-
-
-class Parameter(Model):
-    """One input of the template."""
-
-    # That a required parameter has no default is said by the manager: to the CRD's CEL, `default` has no type.
-    model_config = validations(
-        ("!has(self.merge) || self.merge != 'Union' || self.type == 'array'", "merge Union needs type array"),
-        (
-            "!has(self.merge) || !(self.merge in ['Max', 'Min']) || self.type in ['number', 'integer']",
-            "merge Max and Min need type number or integer",
-        ),
-        (
-            "(!has(self.minimum) && !has(self.maximum)) || self.type in ['number', 'integer']",
-            "minimum and maximum need type number or integer",
-        ),
-        ("!has(self.items) || self.type == 'array'", "items needs type array"),
-    )
-
-    type: ParameterType = Field(description="The JSON type.")
-    items: ItemType | None = Field(default=None, description="The type of an array's items; any where absent.")
-    description: str = Field(default="", max_length=1024, description="What the parameter means, with its unit.")
-    required: bool = Field(default=False, description="Whether each task must give it.")
-    default: JsonValue = Field(default=None, description="The value where no task gives one.")
-    minimum: float | None = Field(default=None, description="The smallest value of a number.")
-    maximum: float | None = Field(default=None, description="The largest value of a number.")
-    enum: list[JsonValue] | None = Field(
-        default=None,
-        max_length=64,
-        description="The values allowed.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
-    )
-    merge: Merge = Field(
-        default=Merge.SAME,
-        description="Same: tasks must agree; one that differs is refused, reason Conflict. Union: all items of the "
-        "arrays, sorted. Max, Min: of the numbers. HighestPriority: the value of the first task by priority.",
-    )
-
-    @model_validator(mode="after")
-    def _coherent(self) -> Parameter:
-        numeric = self.type in (ParameterType.NUMBER, ParameterType.INTEGER)
-        if self.merge is Merge.UNION and self.type is not ParameterType.ARRAY:
-            raise ValueError(f"merge Union needs type array, not {self.type}")
-        if self.merge in (Merge.MAX, Merge.MIN) and not numeric:
-            raise ValueError(f"merge {self.merge} needs type number or integer, not {self.type}")
-        if not numeric and (self.minimum is not None or self.maximum is not None):
-            raise ValueError(f"minimum and maximum need type number or integer, not {self.type}")
-        if self.items is not None and self.type is not ParameterType.ARRAY:
-            raise ValueError(f"items needs type array, not {self.type}")
-        if self.required and self.default is not None:
-            raise ValueError("a required parameter has no default: remove one of required and default")
-        if self.default is not None:
-            problem = self.problem(self.default)
-            if problem:
-                raise ValueError(f"default: {problem}")
-        return self
-
-    def problem(self, value: JsonValue) -> str | None:
-        """Why the value does not fit the parameter, or None if it does."""
-        if not _has_type(value, self.type):
-            return f"{value!r} is not of type {self.type}"
-        if self.items is not None:
-            for index, item in enumerate(value):
-                if not _has_type(item, ParameterType(self.items)):
-                    return f"item {index}, {item!r}, is not of type {self.items}"
-        if self.minimum is not None and value < self.minimum:
-            return f"{value!r} is below the minimum of {self.minimum:g}"
-        if self.maximum is not None and value > self.maximum:
-            return f"{value!r} is above the maximum of {self.maximum:g}"
-        if self.enum is not None and value not in self.enum:
-            return f"{value!r} is none of {', '.join(map(repr, self.enum))}"
-        return None
-
-
-def _has_type(value: JsonValue, type_: ParameterType) -> bool:
-    match type_:
-        case ParameterType.STRING:
-            return isinstance(value, str)
-        case ParameterType.NUMBER:
-            return isinstance(value, int | float) and not isinstance(value, bool)
-        case ParameterType.INTEGER:
-            return isinstance(value, int | float) and not isinstance(value, bool) and float(value).is_integer()
-        case ParameterType.BOOLEAN:
-            return isinstance(value, bool)
-        case ParameterType.ARRAY:
-            return isinstance(value, list)
-        case ParameterType.OBJECT:
-            return isinstance(value, dict)
+from wayside.api.parameter import Parameter
 
 
 class LossPolicy(StrEnum):
