@@ -209,7 +209,7 @@ class TestKubectl:
             ("eventrule.spec.scope.pairs.within", "Metres."),
             ("eventrule.spec.when", "an episode starts when it holds"),
             ("detector.spec.streams.key", "captures the client's name"),
-            ("applicationtemplate.spec.parameters.merge", "Union: all items"),
+            ("applicationtemplate.spec.parameters.merge", "Union, Intersection: the items"),
             ("applicationtask.spec.endTime", "Absent while the demand holds"),
             ("applicationinstance.status.releaseTime", "the end of its linger"),
         ],
