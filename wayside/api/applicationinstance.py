@@ -78,8 +78,8 @@ class ApplicationInstanceStatus(Model):
     demands: Demands = Field(default=Demands(), description="The live tasks that it serves.")
     conditions: list[Condition] = conditions_field(
         "Applied: all objects are as the template says. Ready: its workloads are ready. Capped: a merged Sum is held "
-        "at its parameter's bound. Paused, Held: a person wants it left as it is (annotation wayside.dev/pause), or kept "
-        "without demand (wayside.dev/hold)."
+        "at its parameter's bound. Paused, Held: a person wants it left as it is (annotation wayside.dev/pause), or "
+        "kept without demand (wayside.dev/hold)."
     )
 
 

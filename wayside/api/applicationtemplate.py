@@ -12,6 +12,7 @@ from wayside.api.base import (
     Duration,
     Expression,
     Identifier,
+    JsonValue,
     Kind,
     Model,
     conditions_field,
