@@ -50,8 +50,8 @@ class Process:
         (self.folder / "detector.yaml").write_text(json.dumps(detector.to_json()))
         (self.folder / "rules.yaml").write_text("\n---\n".join(json.dumps(rule.to_json()) for rule in rules))
 
-    def start(self) -> None:
-        files = ["--detector", "detector.yaml", "--rules", "rules.yaml", "--metrics-port", str(self.port)]
+    def start(self, *options: str) -> None:
+        files = [*options, "--detector", "detector.yaml", "--rules", "rules.yaml", "--metrics-port", str(self.port)]
         log = (self.folder / "log").open("w")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "detector.cli", "run", *files], cwd=self.folder, stderr=log
