@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from application_manager.apply import Applied, Applier
@@ -16,6 +16,7 @@ from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core.byhand import PAUSE_ANNOTATION
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import Decision
+from application_manager.core.pods import Trouble
 from application_manager.core.readiness import not_ready
 from application_manager.core.status import Service, difference, instance_status
 from application_manager.recorder import Reason, Recorder
@@ -23,6 +24,8 @@ from application_manager.store import Name
 from application_manager.world import Served, World
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus
+
+_TROUBLES_SHOWN = 3
 
 log = logging.getLogger(__name__)
 
@@ -71,12 +74,15 @@ class InstanceStatusWork:
             if old.release_time is None and new.release_time is not None:
                 note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
                 self.recorder.say(instance, Reason.LINGERING, note, now)
-        # Why the workload is not ready stays with the instance: it changes often, and the tasks may be many.
+        # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message
+        reason = ""
+        if applied.aspect.holds and not ready.holds and (troubles := self.world.pods.troubles(name)):
+            why_not, reason = _text(troubles), ready.reason
         if record.decision.withheld and applied.aspect.holds:
             why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): it does not get the task's values"
         serves = applied.aspect.holds and not record.decision.withheld
-        self.tell(name, record.decision, Service(name[1], serves, serves and ready.holds, why_not))
+        self.tell(name, record.decision, Service(name[1], serves, serves and ready.holds, why_not, reason))
 
     def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:
         """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
@@ -100,5 +106,13 @@ class InstanceStatusWork:
         if not applied.objects:
             return Aspect("Ready", False, "NotApplied", "nothing is applied yet")
         if missing:
-            return Aspect("Ready", False, "NotReady", "; ".join(missing))
+            troubles = self.world.pods.troubles((instance.namespace, instance.name))
+            reason = troubles[0].reason.value if troubles else "NotReady"
+            return Aspect("Ready", False, reason, ": ".join(filter(None, ("; ".join(missing), _text(troubles)))))
         return Aspect("Ready", True, "Ready", "all workloads are ready")
+
+
+def _text(troubles: Sequence[Trouble]) -> str:
+    """The most telling troubles, as a condition says them."""
+    more = f"; and {len(troubles) - _TROUBLES_SHOWN} more" if len(troubles) > _TROUBLES_SHOWN else ""
+    return "; ".join(each.text for each in troubles[:_TROUBLES_SHOWN]) + more

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from application_manager.client import ApiError, Client, Resource, Unreachable
-from application_manager.core.rendering import INSTANCE_LABEL
+from application_manager.core.labelling import INSTANCE_LABEL
 from application_manager.router import Router
 from application_manager.starting import until_answered
 from application_manager.world import World

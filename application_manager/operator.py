@@ -14,7 +14,7 @@ from typing import Any
 import kopf
 
 from application_manager.client import LEASES, Object, Resource
-from application_manager.core.rendering import INSTANCE_LABEL
+from application_manager.core.labelling import INSTANCE_LABEL
 from wayside.leases import holder_of
 
 News = Callable[[Object], None]

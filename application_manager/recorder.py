@@ -18,6 +18,7 @@ from typing import Any
 
 from application_manager.client import EVENTS, ApiError, Client, Unreachable
 from application_manager.core.conditions import changed
+from application_manager.core.pods import TroubleReason
 from wayside.api.base import Condition, Kind
 from wayside.times import format_seconds
 
@@ -46,6 +47,11 @@ class Reason(StrEnum):
     RESUMED = "Resumed"
     HELD = "Held"
     NOT_HELD = "NotHeld"
+    IMAGE_PULL_FAILED = "ImagePullFailed"
+    CONTAINER_FAILED = "ContainerFailed"
+    CRASH_LOOP = "CrashLoop"
+    POD_FAILED = "PodFailed"
+    UNSCHEDULABLE = "Unschedulable"
 
 
 _OF_CONDITION = {
@@ -61,7 +67,11 @@ _OF_CONDITION = {
     ("Held", "True"): Reason.HELD,
     ("Held", "False"): Reason.NOT_HELD,
 }
-_WARNINGS = frozenset({Reason.REFUSED, Reason.HOLDER_LOST, Reason.NOT_APPLIED, Reason.TEMPLATE_INVALID})
+_TROUBLES = frozenset(Reason(each.value) for each in TroubleReason)
+_OWN_REASONS = frozenset({Reason.HOLDER_LOST, Reason.TEMPLATE_INVALID}) | _TROUBLES
+"""Reasons of conditions that are those of their Events too."""
+
+_WARNINGS = frozenset({Reason.REFUSED, Reason.HOLDER_LOST, Reason.NOT_APPLIED, Reason.TEMPLATE_INVALID}) | _TROUBLES
 _EXPECTED = frozenset({"Waiting", "NotApplied", "NotReady"})  # reasons that come with every start
 
 
@@ -94,7 +104,7 @@ class Recorder:
         was_true = {each.type for each in old if each.status == "True"}
         for each in changed(old, new):
             reason = _OF_CONDITION.get((each.type, each.status))
-            if each.reason in (Reason.HOLDER_LOST, Reason.TEMPLATE_INVALID):
+            if each.reason in _OWN_REASONS:
                 reason = Reason(each.reason)
             expected = each.status == "False" and each.type not in was_true and each.reason in _EXPECTED
             if reason is not None and not expected:

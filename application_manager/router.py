@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 from application_manager.apply import Applier
 from application_manager.client import Object
+from application_manager.core.labelling import INSTANCE_LABEL
 from application_manager.core.readiness import not_ready
-from application_manager.core.rendering import INSTANCE_LABEL
 from application_manager.rulework import RuleKey
 from application_manager.store import Entry, Name, kind_of, name_of
-from application_manager.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, TASK, TEMPLATE, World
+from application_manager.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, POD, TASK, TEMPLATE, World
 from wayside.api import ApplicationInstance
 from wayside.leases import holder_of
 
@@ -85,7 +85,11 @@ class Router:
                 self.template((name[0], entry.model.spec.template))
         elif kind in _RULES:
             self._rules(name[0])
+        elif kind == POD and _is_a_workloads(raw):
+            if self.world.pods.forget(raw):
+                self._ask_for_owner(raw)
         else:
+            self.world.pods.forget(raw)
             self.applier.forget(raw)
             self._ask_for_owner(raw)
 
@@ -133,6 +137,11 @@ class Router:
             self.template((name[0], entry.model.spec.template))
 
     def _child(self, old: Entry | None, entry: Entry) -> None:
+        if kind_of(entry.raw) == POD:
+            if self.world.pods.note(entry.raw):
+                self._ask_for_owner(entry.raw)
+            if _is_a_workloads(entry.raw):
+                return  # that its pods are ready, a workload says itself
         self.applier.note(entry.raw)
         if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
             self._ask_for_owner(entry.raw)
@@ -173,3 +182,9 @@ class Router:
 def _written(entry: Entry) -> tuple[object, object]:
     """What people write of a rule or a detector."""
     return entry.raw["spec"], entry.raw["metadata"].get("labels")
+
+
+def _is_a_workloads(pod: Object) -> bool:
+    """Whether the pod belongs to a workload, and not to the instance itself."""
+    owners = pod["metadata"].get("ownerReferences") or ()
+    return any(each.get("controller") and each["kind"] != ApplicationInstance.__name__ for each in owners)

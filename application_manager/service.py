@@ -33,7 +33,7 @@ from application_manager.store import Name
 from application_manager.tasks import TaskWork
 from application_manager.templates import TemplateWork
 from application_manager.workqueue import Key, WorkQueue
-from application_manager.world import INSTANCE, OWN_KINDS, TASK, TEMPLATE, World
+from application_manager.world import INSTANCE, OWN_KINDS, POD, TASK, TEMPLATE, World
 
 JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
 _INSTANCE_WORKERS = 16
@@ -134,7 +134,8 @@ class Manager:
             observe=self._router.observe,
         )
         own = [resources[kind] for kind in OWN_KINDS]
-        children = [resources[kind] for kind in sorted(options.policy.kinds) if kind in resources]
+        # Pods always: those of workloads tell why they do not run.
+        children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
         self._listing = Listing(
             world=self._world,
             client=client,
@@ -234,7 +235,7 @@ class Manager:
 async def _discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
     """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and said."""
     found: dict[KindKey, Resource] = {}
-    for version in sorted({each[0] for each in (*OWN_KINDS, *policy.kinds)}):
+    for version in sorted({each[0] for each in (*OWN_KINDS, POD, *policy.kinds)}):
         found |= await until_answered(partial(client.discover, version))
     lacking = [kind_text(kind) for kind in OWN_KINDS if kind not in found]
     if lacking:

@@ -14,6 +14,7 @@ from application_manager.core.leases import HealthyTime, LeaseBook, LeaseView
 from application_manager.core.policy import KindKey, Policy
 from application_manager.core.rendering import Renderer, RenderError
 from application_manager.core.status import Service
+from application_manager.podbook import PodBook
 from application_manager.store import Name, Store
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 
@@ -25,6 +26,7 @@ INSTANCE: Final[KindKey] = (API_VERSION, "ApplicationInstance")
 EVENT_RULE: Final[KindKey] = (API_VERSION, "EventRule")
 DETECTOR: Final[KindKey] = (API_VERSION, "Detector")
 OWN_KINDS: Final = (TEMPLATE, INSTANCE, TASK, DETECTOR, EVENT_RULE)
+POD: Final[KindKey] = ("v1", "Pod")
 LEASE: Final[KindKey] = ("coordination.k8s.io/v1", "Lease")
 
 
@@ -67,6 +69,7 @@ class World:
     policy: Policy
     store: Store = field(default_factory=lambda: Store(OWN_KINDS))
     claims: ClaimBook = field(default_factory=ClaimBook)
+    pods: PodBook = field(default_factory=PodBook)
     leases: LeaseBook = field(default_factory=LeaseBook)
     healthy: HealthyTime = field(default_factory=HealthyTime)
     served: dict[Name, Served] = field(default_factory=dict)

@@ -16,13 +16,11 @@ from typing import Any, cast
 from application_manager.core import parameters, values
 from application_manager.core.claims import unknown_members
 from application_manager.core.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
+from application_manager.core.labelling import labelled
 from application_manager.core.policy import Policy
 from wayside.api import ApplicationInstance, ApplicationTemplate
-from wayside.api.base import API_VERSION, MANAGED_BY, MANAGED_BY_LABEL
+from wayside.api.base import API_VERSION
 from wayside.expressions import CompiledTemplate, Environment, InterpolationError, Kind, compile_template
-
-INSTANCE_LABEL = "wayside.dev/instance"
-TEMPLATE_LABEL = "wayside.dev/template"
 
 _INSTANCE_VARIABLES = ("name", "key", "namespace")
 _WITH_CONFIGURATION = (*_INSTANCE_VARIABLES, "configMap")
@@ -107,7 +105,7 @@ class Renderer:
         manifests: list[Manifest] = []
         if self._configuration is not None:
             files, problems = self._configuration.render(variables)
-            manifests.append(_labelled(config_map(instance.name, files), instance))
+            manifests.append(labelled(config_map(instance.name, files), instance))
         for index, compiled in enumerate(self._manifests):
             path = f"spec.manifests[{index}]"
             try:
@@ -119,7 +117,7 @@ class Renderer:
             found = [f"{path}.{field}: {problem}" for field, problem in self._problems(manifest, instance)]
             problems += found
             if not found:
-                manifests.append(_labelled(self._policy.completed(manifest), instance))
+                manifests.append(labelled(self._policy.completed(manifest), instance))
         problems += _duplicates(manifests)
         if problems:
             raise RenderError(problems)
@@ -176,19 +174,6 @@ def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
 def object_key(manifest: Mapping[str, Any]) -> tuple[str, str, str]:
     """What tells the objects of one instance apart: apiVersion, kind and name."""
     return manifest["apiVersion"], manifest["kind"], manifest["metadata"]["name"]
-
-
-def _labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
-    metadata = manifest["metadata"]
-    own = {
-        MANAGED_BY_LABEL: MANAGED_BY,
-        INSTANCE_LABEL: instance.name,
-        TEMPLATE_LABEL: instance.spec.template,
-    }
-    return {
-        **manifest,
-        "metadata": {**metadata, "namespace": instance.namespace, "labels": {**(metadata.get("labels") or {}), **own}},
-    }
 
 
 def _duplicates(manifests: list[Manifest]) -> list[str]:

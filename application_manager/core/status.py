@@ -27,12 +27,18 @@ _NAMES_SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """What an instance has given to its tasks so far."""
+    """What an instance has given to its tasks so far.
+
+    Attributes:
+        problem: why it is not applied or not ready, in words; empty where only time is lacking.
+        reason: the problem's word for programs, where it keeps the instance from being ready.
+    """
 
     instance: str
     applied: bool
     ready: bool
     problem: str = ""
+    reason: str = ""
 
 
 def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None, now: float) -> ApplicationTaskStatus:
@@ -72,7 +78,10 @@ def _latched(
     known: Sequence[Condition], type_: str, now_holds: bool, reason: str, otherwise: str, service: Service
 ) -> Aspect:
     if now_holds or holds(known, type_):
-        return Aspect(type_, True, reason, f"instance {service.instance} was {type_.lower()}")
+        since = f"; now: {service.problem}" if service.problem and not now_holds else ""
+        return Aspect(type_, True, reason, f"instance {service.instance} was {type_.lower()}{since}")
+    if service.applied and service.reason:
+        otherwise = service.reason
     return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {type_.lower()} yet")
 
 

@@ -9,7 +9,6 @@ import pytest
 from application_manager.claimbook import ClaimBook
 from application_manager.core.conditions import Aspect, changed, updated
 from application_manager.core.demand import Standing, Verdict
-from application_manager.core.readiness import not_ready
 from application_manager.core.status import Service, difference, finished_since, task_status
 from application_manager.store import Entry
 from tests.unit.manager_objects import NOW, task, template
@@ -54,6 +53,16 @@ def test_applied_and_ready_of_a_task_stay_true_once_they_were() -> None:
     assert later.phase is TaskPhase.PENDING
 
 
+def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it_was_ready() -> None:
+    pulling = Service("app", True, False, "image app:1 cannot be pulled: not found", "ImagePullFailed")
+    waiting = task_status(task("a"), COUNTS, pulling, NOW)
+    ready = next(each for each in waiting.conditions if each.type == "Ready")
+    assert (ready.status, ready.reason, ready.message) == ("False", "ImagePullFailed", pulling.problem)
+    served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, Service("app", True, True), NOW)})
+    later = next(each for each in task_status(served, COUNTS, pulling, NOW).conditions if each.type == "Ready")
+    assert (later.status, later.message) == ("True", f"instance app was ready; now: {pulling.problem}")
+
+
 def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
     served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, None, NOW)})
     done = task_status(served, Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 7)
@@ -93,26 +102,3 @@ def test_the_difference_is_a_merge_patch() -> None:
 )
 def test_times_of_all_precisions_are_read(text: str) -> None:
     assert int(parse_seconds(text)) == 1777890030
-
-
-@pytest.mark.parametrize(
-    ("live", "expected"),
-    [
-        ({"kind": "ConfigMap"}, None),
-        ({"kind": "Deployment", "spec": {"replicas": 2}}, "has 0 of 2 pods available"),
-        ({"kind": "Deployment", "spec": {"replicas": 2}, "status": {"availableReplicas": 2}}, None),
-        ({"kind": "Deployment", "metadata": {"generation": 2}, "spec": {}}, "has not been looked at"),
-        ({"kind": "Deployment", "spec": {"replicas": 0}}, None),
-        ({"kind": "StatefulSet", "status": {"availableReplicas": 1}}, None),
-        ({"kind": "DaemonSet"}, "is not scheduled yet"),
-        ({"kind": "DaemonSet", "status": {"desiredNumberScheduled": 3, "numberAvailable": 1}}, "has 1 of 3"),
-        ({"kind": "Pod", "status": {"conditions": [{"type": "Ready", "status": "True"}]}}, None),
-        ({"kind": "Pod", "status": {"phase": "Pending"}}, "is not ready"),
-        ({"kind": "Job", "status": {"ready": 1}}, None),
-        ({"kind": "Job", "status": {"conditions": [{"type": "Failed", "status": "True"}]}}, "has failed"),
-        ({"kind": "Job"}, "has no pod that runs"),
-    ],
-)
-def test_ready_means_that_the_workload_is(live: dict[str, Any], expected: str | None) -> None:
-    problem = not_ready({"metadata": {}, **live})
-    assert problem == expected if expected is None else expected in str(problem)

@@ -1,0 +1,158 @@
+"""Ready means that the workload does its work; what keeps its pods from running is said of the task in words.
+
+There is no kubelet here: the test writes what one writes into the status of a pod.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from application_manager.core.claims import instance_name
+from tests.cluster.api import Api, Object
+from tests.cluster.managed_world import condition, deployment, start_manager, task, template, wait_settled
+from tests.cluster.pods import running
+from tests.cluster.processes import Process, Processes
+
+NORTH = instance_name("app", "north")
+PODS = f"wayside.dev/instance={NORTH}"
+
+
+@pytest.fixture
+def manager(processes: Processes, namespace: str) -> Process:
+    return start_manager(processes, namespace)
+
+
+def its_pod(api: Api) -> str:
+    (found,) = api.wait_list(
+        "Pod", lambda found: len(found) == 1, labels=PODS, what="the pod bears the instance's label"
+    )
+    return str(found["metadata"]["name"])
+
+
+def kubelet_says(api: Api, pod: str, **status: Any) -> None:
+    api.patch("Pod", pod, {"status": status}, subresource="status")
+
+
+def container(state: Object, **more: Any) -> list[Object]:
+    whole = {"name": "main", "image": "app:1", "imageID": "", "ready": False, "restartCount": 0, "state": state}
+    return [whole | more]
+
+
+def waiting(reason: str, message: str) -> list[Object]:
+    return container({"waiting": {"reason": reason, "message": message}})
+
+
+def wait_ready_says(api: Api, kind: str, name: str, *, status: str = "False", reason: str, text: str) -> None:
+    def holds(raw: Object) -> bool:
+        found = condition(raw, "Ready")
+        return (found.get("status"), found.get("reason")) == (status, reason) and text in found["message"]
+
+    api.wait_for(kind, name, holds, what=f"Ready={status} of {kind} {name}, reason {reason}, says {text!r}")
+
+
+def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api: Api, manager: Process) -> None:
+    api.create(template(image="registry.example/app:9"))
+    api.create(task("north"))
+    pod = its_pod(api)
+
+    def said(reason: str, text: str) -> None:
+        wait_ready_says(api, "ApplicationTask", "north", reason=reason, text=text)
+        wait_ready_says(api, "ApplicationInstance", NORTH, reason=reason, text=text)
+
+    unscheduled = {
+        "type": "PodScheduled",
+        "status": "False",
+        "reason": "Unschedulable",
+        "message": "0/3 nodes are free",
+    }
+    kubelet_says(api, pod, conditions=[unscheduled])
+    said("Unschedulable", "no node takes the pod: 0/3 nodes are free")
+    kubelet_says(
+        api, pod, conditions=[unscheduled | {"status": "True"}], containerStatuses=waiting("ErrImagePull", "not found")
+    )
+    said("ImagePullFailed", "image registry.example/app:9 cannot be pulled: not found")
+    ended = {"exitCode": 137, "reason": "OOMKilled"}
+    crashed = container({"waiting": {"reason": "CrashLoopBackOff"}}, lastState={"terminated": ended}, restartCount=2)
+    kubelet_says(api, pod, containerStatuses=crashed)
+    said(
+        "CrashLoop", "container main crashes: it ended with exit code 137, killed for taking more memory than its limit"
+    )
+
+    api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")
+    wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="was ready")
+    wait_ready_says(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
+    ready = [
+        each | {"status": "False"}
+        for each in api.get("Pod", pod)["status"]["conditions"]
+        if each["type"] != "PodScheduled"
+    ]
+    kubelet_says(api, pod, containerStatuses=crashed, conditions=ready)
+    wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="now: container main crashes")
+    wait_ready_says(api, "ApplicationInstance", NORTH, reason="CrashLoop", text="has 0 of 1 pods available")
+    warned = [each["reason"] for each in api.list("Event.events.k8s.io") if each["type"] == "Warning"]
+    assert sorted(set(warned) - {"FailedScheduling"}) == ["CrashLoop", "ImagePullFailed", "Unschedulable"]
+    wait_settled(api)
+
+
+def test_a_new_version_that_does_not_run_is_not_ready_though_the_old_one_still_does(
+    api: Api, manager: Process, kubelet: None
+) -> None:
+    api.create(template())
+    api.create(task("north"))
+    wait_ready_says(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
+    changed = deployment(image="app:2")
+    changed["spec"]["minReadySeconds"] = (
+        3600  # so that the new version's pod, which the test makes ready, is not available
+    )
+    api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [changed]}})
+    wait_ready_says(api, "ApplicationInstance", NORTH, reason="NotReady", text=f"Deployment {NORTH} ")
+
+
+def test_other_kinds_are_judged_by_what_they_say(api: Api, manager: Process) -> None:
+    claim = {
+        "apiVersion": "v1",
+        "kind": "PersistentVolumeClaim",
+        "metadata": {"name": "${instance.name}-data"},
+        "spec": {"accessModes": ["ReadWriteOnce"], "resources": {"requests": {"storage": "1Gi"}}},
+    }
+    outside = {
+        "apiVersion": "v1",
+        "kind": "Service",
+        "metadata": {"name": "${instance.name}-out"},
+        "spec": {"type": "LoadBalancer", "ports": [{"port": 80}]},
+    }
+    containers = [{"name": "main", "image": "app:1"}]
+    job = {
+        "apiVersion": "batch/v1",
+        "kind": "Job",
+        "metadata": {"name": "${instance.name}"},
+        "spec": {"backoffLimit": 0, "template": {"spec": {"restartPolicy": "Never", "containers": containers}}},
+    }
+    api.create(template(manifests=[claim, outside, job]))
+    api.create(task("north"))
+
+    def wait_instance(*texts: str, status: str = "False") -> None:
+        api.wait_for(
+            "ApplicationInstance",
+            NORTH,
+            lambda raw: (
+                condition(raw, "Ready").get("status") == status
+                and all(each in condition(raw, "Ready")["message"] for each in texts)
+            ),
+            what=f"Ready={status} says {texts}",
+        )
+
+    lacks_address = f"Service {NORTH}-out has no address"
+    wait_instance("has no pod that runs", f"PersistentVolumeClaim {NORTH}-data is not bound", lacks_address)
+    pod = its_pod(api)
+    api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")
+    api.patch("PersistentVolumeClaim", f"{NORTH}-data", {"status": {"phase": "Bound"}}, subresource="status")
+    wait_instance(lacks_address)
+    balancer = {"loadBalancer": {"ingress": [{"ip": "192.0.2.1"}]}}
+    api.patch("Service", f"{NORTH}-out", {"status": balancer}, subresource="status")
+    wait_instance(status="True")
+    failed = container({"terminated": {"exitCode": 2, "reason": "Error"}}, ready=False)
+    kubelet_says(api, pod, phase="Failed", containerStatuses=failed)
+    wait_instance(f"Job {NORTH} has failed", "container main failed: it ended with exit code 2")

@@ -1,0 +1,181 @@
+"""What keeps a pod from running is said in words, the same ones while a kubelet tries and tries again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from application_manager.core.labelling import INSTANCE_LABEL
+from application_manager.core.pods import Trouble, TroubleReason, summary, trouble
+from application_manager.core.policy import Policy
+from application_manager.core.rendering import Renderer
+from application_manager.podbook import PodBook
+from tests.unit.manager_objects import DEPLOYMENT, instance, template
+
+CAUSE = 'failed to resolve reference "app:1": app:1: not found'
+
+
+def pod(name: str = "app-1", **status: Any) -> dict[str, Any]:
+    return {
+        "apiVersion": "v1",
+        "kind": "Pod",
+        "metadata": {"name": name, "namespace": "site", "labels": {INSTANCE_LABEL: "app"}},
+        "spec": {
+            "initContainers": [{"name": "first", "image": "setup:2"}],
+            "containers": [{"name": "main", "image": "app:1"}],
+        },
+        "status": {"phase": "Pending", **status},
+    }
+
+
+def container(state: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {
+        "containerStatuses": [{"name": "main", "image": "", "ready": False, "restartCount": 0, "state": state, **more}]
+    }
+
+
+def waiting(reason: str, message: str = "") -> dict[str, Any]:
+    return container({"waiting": {"reason": reason, "message": message}})
+
+
+def said(status: dict[str, Any]) -> tuple[str, str] | None:
+    found = trouble(pod(**status))
+    return (found.reason.value, found.message) if found else None
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        waiting("ErrImagePull", f"rpc error: code = NotFound desc = {CAUSE}"),
+        waiting(
+            "ImagePullBackOff",
+            f'Back-off pulling image "app:1": ErrImagePull: rpc error: code = NotFound desc = {CAUSE}',
+        ),
+    ],
+)
+def test_an_image_that_cannot_be_pulled_gives_the_same_words_at_each_attempt(status: dict[str, Any]) -> None:
+    assert said(status) == ("ImagePullFailed", f"image app:1 cannot be pulled: {CAUSE}")
+
+
+def test_an_image_whose_cause_is_not_told_is_named_with_the_kubelets_word() -> None:
+    back_off = waiting("ImagePullBackOff", 'Back-off pulling image "app:1"')
+    assert said(back_off) == ("ImagePullFailed", "image app:1 cannot be pulled: ImagePullBackOff")
+
+
+def test_an_init_containers_image_is_named_too() -> None:
+    init = [{"name": "first", "state": {"waiting": {"reason": "InvalidImageName", "message": "no name"}}}]
+    assert said({"initContainerStatuses": init}) == ("ImagePullFailed", "image setup:2 cannot be pulled: no name")
+
+
+ENDED = {"exitCode": 3, "reason": "Error", "finishedAt": "2026-01-01T00:00:00Z"}
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        container({"terminated": ENDED}),
+        container({"waiting": {"reason": "CrashLoopBackOff"}}, lastState={"terminated": ENDED}, restartCount=3),
+        container({"running": {}}, lastState={"terminated": ENDED}, restartCount=4),
+    ],
+)
+def test_a_container_that_crashes_gives_the_same_words_between_and_during_its_attempts(status: dict[str, Any]) -> None:
+    found = trouble(pod(**status))
+    assert found is not None
+    assert (found.reason, found.message) == (
+        TroubleReason.CRASH_LOOP,
+        "container main crashes: it ended with exit code 3",
+    )
+    assert found.hint == "its log: kubectl logs -n site app-1 -c main --previous"
+
+
+def test_a_container_that_is_ready_again_is_no_trouble() -> None:
+    assert said(container({"running": {}}, lastState={"terminated": ENDED}, ready=True)) is None
+
+
+def test_want_of_memory_and_a_containers_last_words_are_told() -> None:
+    killed = container({"terminated": {"exitCode": 137, "reason": "OOMKilled"}})
+    assert "exit code 137, killed for taking more memory than its limit" in str(said(killed))
+    speaks = container({"terminated": {**ENDED, "message": "no\nmap"}})
+    assert str(said(speaks)).endswith("exit code 3: no map')")
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [
+        (
+            waiting("CreateContainerConfigError", 'secret "key" not found'),
+            ("ContainerFailed", 'container main cannot be started: secret "key" not found'),
+        ),
+        (
+            {"conditions": [{"type": "PodScheduled", "status": "False", "message": "0/3 nodes are available"}]},
+            ("Unschedulable", "no node takes the pod: 0/3 nodes are available"),
+        ),
+        (
+            {"phase": "Failed", "reason": "Evicted", "message": "The node was low on memory."},
+            ("PodFailed", "a pod failed: The node was low on memory."),
+        ),
+        (waiting("ContainerCreating"), None),
+        ({}, None),
+        ({"phase": "Succeeded", **container({"terminated": {"exitCode": 0}})}, None),
+    ],
+)
+def test_other_troubles_and_none(status: dict[str, Any], expected: tuple[str, str] | None) -> None:
+    assert said(status) == expected
+
+
+def test_what_is_not_restarted_has_failed_and_does_not_crash() -> None:
+    once = pod(phase="Failed", **container({"terminated": ENDED}))
+    once["spec"]["restartPolicy"] = "Never"
+    found = trouble(once)
+    assert found is not None
+    assert (found.reason, found.message) == (
+        TroubleReason.POD_FAILED,
+        "container main failed: it ended with exit code 3",
+    )
+
+
+def test_a_pod_that_goes_is_no_trouble() -> None:
+    going = pod(**waiting("ErrImagePull"))
+    going["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:00Z"
+    assert trouble(going) is None
+
+
+def test_the_same_trouble_of_many_pods_is_told_once_and_the_most_telling_first() -> None:
+    unschedulable = Trouble(TroubleReason.UNSCHEDULABLE, "no node")
+    crashes = [Trouble(TroubleReason.CRASH_LOOP, "it crashes", f"log of {name}") for name in ("b", "a")]
+    assert summary([unschedulable, *crashes]) == [crashes[1], unschedulable]
+
+
+def test_the_book_knows_an_instances_troubles_and_whether_news_change_them() -> None:
+    book, of = PodBook(), ("site", "app")
+    assert not book.note(pod())
+    assert book.note(pod(**waiting("ErrImagePull", "no")))
+    assert not book.note(pod("app-2", **waiting("ErrImagePull", "no")))
+    assert [each.message for each in book.troubles(of)] == ["image app:1 cannot be pulled: no"]
+    assert not book.forget(pod("app-2"))
+    assert book.note(pod())
+    assert book.troubles(of) == []
+
+
+def test_pods_of_every_workload_bear_the_label_by_which_they_are_found() -> None:
+    pods = DEPLOYMENT["spec"]["template"]
+    job = {
+        "apiVersion": "batch/v1",
+        "kind": "Job",
+        "metadata": {"name": "j"},
+        "spec": {"template": {"spec": pods["spec"]}},
+    }
+    cron = {
+        **job,
+        "kind": "CronJob",
+        "metadata": {"name": "c"},
+        "spec": {"schedule": "@daily", "jobTemplate": {"spec": job["spec"]}},
+    }
+    wrong = {**job, "metadata": {"name": "w"}, "spec": {"template": {"metadata": {"labels": "none"}, "spec": {}}}}
+    rendered = Renderer(template(manifests=[DEPLOYMENT, job, cron, wrong]), Policy()).render(instance()).manifests
+    deployed, ran, scheduled, as_written = (each["spec"] for each in rendered)
+    assert deployed["template"]["metadata"]["labels"] == {"app": "app", INSTANCE_LABEL: "app"}
+    assert ran["template"]["metadata"]["labels"] == {INSTANCE_LABEL: "app"}
+    assert scheduled["jobTemplate"]["spec"]["template"]["metadata"]["labels"] == {INSTANCE_LABEL: "app"}
+    assert as_written["template"]["metadata"]["labels"] == "none"
