@@ -103,9 +103,8 @@ def test_a_new_version_that_does_not_run_is_not_ready_though_the_old_one_still_d
     api.create(task("north"))
     wait_ready_says(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
     changed = deployment(image="app:2")
-    changed["spec"]["minReadySeconds"] = (
-        3600  # so that the new version's pod, which the test makes ready, is not available
-    )
+    # Its pod becomes ready here, but not available.
+    changed["spec"]["minReadySeconds"] = 500
     api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [changed]}})
     wait_ready_says(api, "ApplicationInstance", NORTH, reason="NotReady", text=f"Deployment {NORTH} ")
 
