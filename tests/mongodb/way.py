@@ -6,12 +6,15 @@ import socket
 import threading
 from contextlib import suppress
 
+from tests.mongodb import MongoServer
+
 
 class Way:
     """Forwards connections from a port of its own."""
 
-    def __init__(self, host: str, port: int) -> None:
-        self._to = (host, port)
+    def __init__(self, server: MongoServer) -> None:
+        self._server = server
+        self._to = (server.host, server.port)
         self._listener: socket.socket | None = None
         self.port = 0
         self._open: set[socket.socket] = set()
@@ -24,7 +27,10 @@ class Way:
 
     @property
     def uri(self) -> str:
-        return f"mongodb://127.0.0.1:{self.port}/?directConnection=true"
+        """The server's, by this way: with its credentials and options."""
+        login, at, rest = self._server.uri.partition("://")[2].rpartition("@")
+        options = rest.partition("?")[2]
+        return f"mongodb://{login}{at}127.0.0.1:{self.port}/?{options}{'&' if options else ''}directConnection=true"
 
     def restore(self) -> None:
         """Let connections through."""

@@ -34,6 +34,6 @@ def database(mongodb: MongoServer, name: str) -> Iterator[Any]:
 
 @pytest.fixture
 def way(mongodb: MongoServer) -> Iterator[Way]:
-    made = Way(mongodb.host, mongodb.port)
+    made = Way(mongodb)
     yield made
     made.cut()

@@ -291,6 +291,56 @@ def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
     assert numbers(database) == list(range(2000))
 
 
+def test_a_scenario_whose_documents_are_not_all_there_is_not_called_complete(desk: MakeDesk, database: Any) -> None:
+    keep = desk()
+    episode = keep.begin()
+    keep.take(episode, speeds(1000))
+    wait_until(lambda: len(numbers(database)) == 1000)
+    database[SPEEDS].delete_one({"msg.v": 7})
+    keep.finish(episode)
+    outcome = keep.outcome()
+    assert outcome.state is OutcomeState.FAILED
+    assert "only 999 of 1000 documents in json/speed" in outcome.message
+    assert scenario(database)["complete"] is False
+
+
+def test_what_somebody_removed_from_the_spool_costs_its_scenario_and_no_other(
+    desk: MakeDesk, database: Any, way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("detector.actions.database.spool.SEGMENT", 1000)
+    keep = desk(spool=2**26)
+    way.cut()
+    first, second = keep.begin("e1"), keep.begin("e2")
+    keep.take(first, speeds(2000))
+    wait_until(lambda: len(list((tmp_path / "spool").glob("*.spool"))) >= 3)
+    keep.take(second, speeds(1000))
+    keep.finish(second)
+    keep.finish(first)
+    largest = sorted((tmp_path / "spool").glob("*.spool"), key=lambda each: each.stat().st_size)
+    doomed = min(largest[-2:])  # the first thousand of the first episode
+    doomed.unlink()
+    way.restore()
+    assert keep.outcome("e2").state is OutcomeState.DONE
+    assert keep.outcome("e1").state is OutcomeState.FAILED
+    assert scenario(database)["complete"] is False
+    assert keep.losses.total() > 0
+
+
+def test_open_episodes_say_that_the_database_is_away(desk: MakeDesk, way: Way) -> None:
+    keep = desk(spool=2**26)
+    episode = keep.begin()
+    way.cut()
+
+    def told(away: bool) -> bool:
+        keep.take(episode, speeds(1000))
+        last = keep.last()
+        return last is not None and last.message.startswith("the database is away") is away
+
+    wait_until(lambda: told(True))
+    way.restore()
+    wait_until(lambda: told(False))
+
+
 SECRET = "s3cr3t/p@ss word"
 
 

@@ -8,14 +8,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from detector.streams.codecs.cdr import CdrDecoder
 from tests.mongodb.way import Way
 from tests.unit.database_desk import wait_until
 from tests.unit.driving import a_rule, a_stream
 from tests.unit.recording_bench import mcap_files, read_with_mcap
+from tests.unit.ros_messages import cdr, point_cloud
 from tests.unit.running import PATIENCE, Process
 
+CLOUDS = a_stream("points", encoding="cdr", type="sensor_msgs/msg/PointCloud2")
+READ = CdrDecoder("sensor_msgs/msg/PointCloud2")
 FAST = {"name": "v", "stream": "speed", "value": "msg.v"}
 EVERY = {"every": "100ms"}
 
@@ -26,6 +31,13 @@ def process(tmp_path: Path, way: Way, monkeypatch: pytest.MonkeyPatch) -> Iterat
     process = Process(tmp_path)
     yield process
     assert process.stop() == 0
+
+
+def a_cloud() -> bytes:
+    """A message of about 1 MB, unlike any other."""
+    message = point_cloud(87_000)
+    message.data[:] = np.frombuffer(os.urandom(message.data.size), np.uint8)
+    return cdr(message)
 
 
 def place(process: Process) -> dict[str, Any]:
@@ -52,7 +64,7 @@ def test_the_database_has_the_samples_that_the_recording_has(process: Process, n
     ]
     one = a_rule("one", signals=[FAST], when="v > 10", evaluation=EVERY, actions=actions)
     two = a_rule("two", signals=[FAST], when="v > 20", evaluation=EVERY, actions=actions)
-    streams = (a_stream("speed"), a_stream("points", encoding="raw"))
+    streams = (a_stream("speed"), CLOUDS)
     process.write(one, two, streams=streams, **place(process))
     process.start()
     for number in range(300):
@@ -60,7 +72,7 @@ def test_the_database_has_the_samples_that_the_recording_has(process: Process, n
         process.send("car1", {"v": v, "n": number})
         process.send("car2", {"v": 0, "n": number})
         if number % 30 == 0:
-            process.send("car1", os.urandom(300_000), "points")
+            process.send("car1", a_cloud(), "points")
         if number in (100, 150):  # so that each rule sees it
             wanted = 1 if number == 100 else 2
             process.status_when(lambda status, wanted=wanted: sum(r.open for r in status.rules) == wanted)
@@ -85,7 +97,10 @@ def test_the_database_has_the_samples_that_the_recording_has(process: Process, n
 
 def payload_of(process: Process, document: dict[str, Any]) -> Any:
     if document["stream"] == "points":
-        return (process.folder / "files" / document["msg"]["file"]).read_bytes()
+        file = (process.folder / "files" / document["msg"]["data"]["file"]).read_bytes()
+        head, _, points = file.partition(b"DATA binary\n")
+        assert b"FIELDS x y z" in head
+        return points
     return (document["msg"]["v"], document["msg"]["n"])
 
 
@@ -93,7 +108,9 @@ def read_keys(file: Path) -> list[tuple[str, Any]]:
     return [
         (
             each.topic.lstrip("/"),
-            each.payload if each.topic.endswith("points") else tuple(json.loads(each.payload).values()),
+            READ.decode(each.payload)["data"]
+            if each.topic.endswith("points")
+            else tuple(json.loads(each.payload).values()),
         )
         for each in read_with_mcap(file)
     ]

@@ -62,6 +62,7 @@ def test_a_sample_has_the_same_id_whoever_makes_its_document_and_no_two_have_the
         sample(b"1"),  # with clock Data a client may say the same twice at one time
         sample(b"2"),
         sample(b"1", START + 1),
+        sample(b"1"),  # late, and once more
         sample(b"1", client="car2"),
         sample(b"1", stream="blob"),
     ]

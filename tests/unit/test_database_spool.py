@@ -80,13 +80,13 @@ def test_a_record_that_a_crash_cut_off_is_left_out(tmp_path: Path) -> None:
     (segment,) = tmp_path.glob("*.spool")
     os.truncate(segment, segment.stat().st_size - 1)
     spool = Spool(tmp_path, 2**20)
-    assert not spool.damaged
+    assert spool.damaged == 10
     assert spool.append(b"three")
     assert records(spool) == [b"one", b"three"]
     spool.close()
 
 
-def test_damage_in_the_middle_is_told_also_after_another_restart_until_all_behind_it_is_done(
+def test_a_damaged_segment_loses_what_is_behind_the_damage_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "SEGMENT", 30)
@@ -94,17 +94,28 @@ def test_damage_in_the_middle_is_told_also_after_another_restart_until_all_behin
     for number in range(8):
         spool.append(b"record %d" % number)
     spool.close()
-    first = sorted(tmp_path.glob("*.spool"))[0]
+    first = min(tmp_path.glob("*.spool"))
     content = bytearray(first.read_bytes())
     content[-1] ^= 1
     first.write_bytes(content)
     spool = Spool(tmp_path, 2**20)
-    assert "00000001.spool" in spool.damaged
-    spool = reopened(spool, tmp_path)
-    assert "00000001.spool" in spool.damaged
+    assert spool.damaged == 16
     assert records(spool) == [b"record %d" % number for number in range(8) if number != 1]
-    spool.forget_damage()
-    assert not reopened(spool, tmp_path).damaged
+
+
+def test_a_segment_that_somebody_removed_is_given_up_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SEGMENT", 30)
+    spool = Spool(tmp_path, 2**20)
+    for number in range(6):
+        spool.append(b"record %d" % number)
+    min(tmp_path.glob("*.spool")).unlink()
+    with pytest.raises(FileNotFoundError):
+        spool.first()
+    assert spool.give_up() == 2
+    assert records(spool) == [b"record %d" % number for number in range(2, 6)]
+    assert spool.bytes == 0
 
 
 def test_a_disk_that_takes_half_a_record_leaves_the_queue_as_it_was(

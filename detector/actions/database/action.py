@@ -44,6 +44,7 @@ class _Batch:
 class _Work:
     """One scenario that is being written."""
 
+    episode: Episode
     scenario: Scenario
     documents: Documents
     undecoded: int = 0
@@ -63,6 +64,7 @@ class Database(Action[DatabaseAction]):
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
         self._awake = False
+        self._told_away = False
 
     def started(self, episode: Episode) -> None:
         """Make the scenario known in the database, as one that is not complete."""
@@ -79,7 +81,7 @@ class Database(Action[DatabaseAction]):
             above = (self.parameters.files or Attachments()).above.bytes
         streams = {stream.name: stream for stream in around.detector.spec.streams}
         place = f"{database}/{rule.name}/{name}"
-        self._works[episode.id] = _Work(scenario, Documents(name, place, streams, around.decoders, above))
+        self._works[episode.id] = _Work(episode, scenario, Documents(name, place, streams, around.decoders, above))
         if self._store is not None:
             metadata: Mapping[str, JsonValue] = episode.rendered.get("metadata") or {}
             for write in scenarios.begin(scenario, episode, metadata):
@@ -183,6 +185,7 @@ class Database(Action[DatabaseAction]):
                 self._connect()
             except ActionError as error:
                 _log.error("action %s of EventRule %s: %s", self.setting.action, self.setting.rule.name, error)
+        self._tell_whether_away()
         if not self._batches:
             return None
         left = self._due - time.monotonic()
@@ -191,6 +194,14 @@ class Database(Action[DatabaseAction]):
         for collection in list(self._batches):
             self._flush(collection)
         return None
+
+    def _tell_whether_away(self) -> None:
+        """Say of each open episode that its documents have to wait, or no longer have to."""
+        away = self._store.away if self._store is not None else ""
+        if bool(away) != self._told_away:
+            self._told_away = bool(away)
+            for work in self._works.values():
+                self._report(work.episode, OutcomeState.RUNNING, away and f"the database is away: {away}")
 
     def close(self) -> None:
         """Let go of the queue; the last action that does waits for it, a few seconds."""
@@ -240,8 +251,8 @@ class Database(Action[DatabaseAction]):
         }
         if work.undecoded:
             details["undecoded"] = work.undecoded
-        if self._store is not None and self._store.away:
-            details["away"] = self._store.away
+        if self._store is not None:
+            details["waitingBytes"] = self._store.waiting
         lost = sum(scenario.lost.values()) if completion is None else scenarios.missing(scenario, completion)
         files = (str(self._folder.path / work.documents.place),) if scenario.files and self._folder else ()
         samples = sum(scenario.messages.values())

@@ -6,6 +6,7 @@ A document's id is made of the scenario and the sample alone, so however often i
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,6 +22,10 @@ from wayside.api.stream import Stream
 
 LARGEST = 16 * 2**20 - 2**14
 """MongoDB takes documents of 16 MiB; a little is left for what servers add."""
+
+
+_RECENT = 256
+"""Among so many times of a client's stream, samples that are the same are told apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,8 @@ class Documents:
     above: int | None
     """Binary fields of more bytes go to files; None: they stay."""
     _near: dict[str, bool] = field(default_factory=dict)
-    _last: dict[tuple[str, str], tuple[int, dict[bytes, int]]] = field(default_factory=dict)
+    _recent: dict[tuple[str, str], dict[int, Counter[bytes]]] = field(default_factory=dict)
+    """Of each client's stream, what its samples of the last times were."""
 
     def make(self, sample: EpisodeSample) -> Made:
         """The sample's document."""
@@ -134,12 +140,14 @@ class Documents:
         digest.update("\0".join(said).encode())
         name = digest.digest()
         lane = (sample.client, sample.stream)
-        at, seen = self._last.get(lane, (None, {}))
-        if at != sample.time:
-            seen = {}
-            self._last[lane] = (sample.time, seen)
-        number = seen.get(name, 0)
-        seen[name] = number + 1
+        times = self._recent.setdefault(lane, {})
+        seen = times.get(sample.time)
+        if seen is None:
+            seen = times[sample.time] = Counter()
+            if len(times) > _RECENT:
+                del times[next(iter(times))]
+        number = seen[name]
+        seen[name] += 1
         if number:
             name = hashlib.blake2b(name + number.to_bytes(4, "big"), digest_size=12).digest()
         return sample.time.to_bytes(8, "big", signed=True) + name

@@ -144,7 +144,7 @@ def finish(scenario: Scenario, episode: Episode, completion: Completion, detecto
     return [
         *writes,
         _change(scenario, SCENARIOS, find, {"$set": known}),
-        Write(scenario.database, SCENARIOS, changes=[last], completes=scenario.id),
+        Write(scenario.database, SCENARIOS, changes=[last], completes=scenario.id, expected=dict(scenario.messages)),
     ]
 
 
@@ -175,9 +175,8 @@ def reject(database: str, scenario: str, why: str) -> Write:
 
 def give_up(write: Write, why: str) -> Write:
     """In place of the request that would have made a scenario complete."""
-    change = {"$set": {"state": INCOMPLETE, "cut": why}}
-    find = {"_id": write.completes}
-    return Write(write.database, SCENARIOS, changes=[{"find": find, "change": change, "many": False}])
+    change = {"find": {"_id": write.completes}, "change": {"$set": {"state": INCOMPLETE, "cut": why}}, "many": False}
+    return Write(write.database, SCENARIOS, changes=[change])
 
 
 def _change(

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import unquote_plus
 
-from bson.errors import InvalidDocument
+import pymongo
+from bson.errors import BSONError
 from bson.raw_bson import RawBSONDocument
 from pymongo import MongoClient, UpdateMany, UpdateOne, WriteConcern
 from pymongo.errors import (
     AutoReconnect,
     BulkWriteError,
-    ConfigurationError,
     ConnectionFailure,
     DocumentTooLarge,
     NetworkTimeout,
@@ -29,6 +30,10 @@ from detector.actions.database.work import Write
 _DUPLICATE = 11000
 _SECONDS = 10.0
 """How long one request may take before the connection counts as broken."""
+
+
+_COUNTING = 60.0
+"""How long it may take to count a scenario's documents."""
 
 
 class UnavailableError(Exception):
@@ -108,19 +113,40 @@ class Server:
 
         Raises UnavailableError, RefusedError.
         """
+        with self._told():
+            try:
+                return self._insert(write) if write.documents else self._change(write)
+            except BulkWriteError as error:
+                return 0, self._refused(error.details, inserting=bool(write.documents))
+
+    def lacks(self, write: Write) -> str:
+        """What the scenario that the request completes does not have of its documents; empty where it has all.
+
+        Raises UnavailableError, RefusedError.
+        """
+        with self._told(), pymongo.timeout(_COUNTING):
+            for collection, count in sorted(write.expected.items()):
+                found = self._client[write.database][collection].count_documents({"scenario": write.completes})
+                if found < count:
+                    return f"the database has only {found} of {count} documents in {collection}"
+        return ""
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """The driver's errors as ours."""
         try:
-            return self._insert(write) if write.documents else self._change(write)
-        except BulkWriteError as error:
-            return 0, self._refused(error.details, inserting=bool(write.documents))
-        except (DocumentTooLarge, InvalidDocument) as error:
+            yield
+        except DocumentTooLarge as error:
             raise RefusedError(self.redact(error)) from None
         except ConnectionFailure as error:
             broke = isinstance(error, AutoReconnect) and not isinstance(
                 error, NetworkTimeout | NotPrimaryError | ServerSelectionTimeoutError
             )
             raise UnavailableError(self._short(error), broke=broke) from None
-        except (PyMongoError, ConfigurationError) as error:
+        except PyMongoError as error:
             raise UnavailableError(self._short(error)) from None
+        except (BSONError, OverflowError, ValueError, TypeError) as error:
+            raise RefusedError(self.redact(error)) from None
 
     def _insert(self, write: Write) -> tuple[int, list[Refused]]:
         collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]

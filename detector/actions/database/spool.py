@@ -12,6 +12,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 _HEAD = struct.Struct("<II")
@@ -21,6 +22,14 @@ SEGMENT = 8 * 2**20
 
 class SpoolError(Exception):
     """The folder cannot be used; the text says why and what to do."""
+
+
+@dataclass(slots=True)
+class _Segment:
+    path: Path
+    bytes: int = 0
+    records: int = 0
+    """That are not done."""
 
 
 class Spool:
@@ -40,29 +49,29 @@ class Spool:
         except OSError as error:
             reason = error.strerror or type(error).__name__
             raise SpoolError(f"the spool {folder} cannot be used: {reason}: correct its path") from None
-        self._damage = folder / "damaged"
-        self.damaged = self._damage.read_text() if self._damage.exists() else ""
-        """What of an earlier run's records could not be read; empty where all could."""
+        self._tail: int | None = None
+        self.damaged = 0
+        """Bytes of an earlier run's segments that could not be read."""
         self.records = 0
         self.bytes = 0
-        self._segments: list[Path] = sorted(folder.glob("*.spool"))
+        self._segments = [_Segment(path) for path in sorted(folder.glob("[0-9]*.spool"))]
         self._offset = 0
-        self._tail: int | None = None
-        self._length = 0
-        self._take_stock()
+        self._current: bytes | None = None
+        try:
+            self._take_stock()
+        except OSError as error:
+            self.close()
+            raise SpoolError(f"{error.filename} in the spool cannot be read: {error.strerror}: remove it") from None
 
     def _take_stock(self) -> None:
-        for number, segment in enumerate(self._segments):
-            whole, records = _sound(segment)
-            size = segment.stat().st_size
-            if whole < size:
-                last = number == len(self._segments) - 1
-                if not last:  # at the end of all, it is what a crash cut off
-                    self.damaged = f"part of the spool could not be read: {segment.name} behind its first {whole} bytes"
-                    self._damage.write_text(self.damaged)
-                os.truncate(segment, whole)
-            self.records += records
-            self.bytes += whole
+        for segment in self._segments:
+            segment.bytes, segment.records = _sound(segment.path)
+            size = segment.path.stat().st_size
+            if segment.bytes < size:
+                self.damaged += size - segment.bytes
+                os.truncate(segment.path, segment.bytes)
+            self.records += segment.records
+            self.bytes += segment.bytes
 
     def append(self, record: bytes) -> bool:
         """Keep a record; False where there is no room. What is appended is kept once `sync` was called.
@@ -72,19 +81,21 @@ class Spool:
         size = _HEAD.size + len(record)
         if self.bytes + size > self._capacity:
             return False
-        if self._tail is None or self._length >= SEGMENT:
+        if self._tail is None or self._segments[-1].bytes >= SEGMENT:
             self._next_segment()
         assert self._tail is not None  # noqa: S101  made just now
+        segment = self._segments[-1]
         content = _HEAD.pack(len(record), zlib.crc32(record)) + record
         try:
             written = 0
             while written < size:
                 written += os.write(self._tail, memoryview(content)[written:])
         except OSError:
-            os.ftruncate(self._tail, self._length)
-            os.lseek(self._tail, self._length, os.SEEK_SET)
+            os.ftruncate(self._tail, segment.bytes)
+            os.lseek(self._tail, segment.bytes, os.SEEK_SET)
             raise
-        self._length += size
+        segment.bytes += size
+        segment.records += 1
         self.bytes += size
         self.records += 1
         return True
@@ -95,46 +106,52 @@ class Spool:
             os.fsync(self._tail)
 
     def first(self) -> bytes | None:
-        """The oldest record, which stays; None where there is none."""
-        while self._segments:
-            segment = self._segments[0]
-            with segment.open("rb") as file:
+        """The oldest record, which stays; None where there is none. Raises OSError."""
+        while self._current is None and self._segments:
+            with self._segments[0].path.open("rb") as file:
                 file.seek(self._offset)
                 head = file.read(_HEAD.size)
                 if len(head) == _HEAD.size:
-                    return file.read(_HEAD.unpack(head)[0])
-            if self._tail is not None and len(self._segments) == 1:
-                self._close_tail()
-            self._remove(segment)
-        return None
+                    self._current = file.read(_HEAD.unpack(head)[0])
+                    continue
+            self._remove()
+        return self._current
 
     def done(self) -> None:
-        """The oldest record is not needed any more."""
+        """The oldest record is not needed any more. Raises OSError."""
         record = self.first()
         if record is None:
             return
         self._offset += _HEAD.size + len(record)
+        self._current = None
+        self._segments[0].records -= 1
         self.records -= 1
-        self.first()  # removes a segment that is empty now
+        if self._offset >= self._segments[0].bytes:
+            self._remove()
 
-    def forget_damage(self) -> None:
-        """All that could be concerned by it is done."""
-        self.damaged = ""
-        self._damage.unlink(missing_ok=True)
+    def give_up(self) -> int:
+        """Leave out the oldest segment, since it cannot be read; gives the number of records that are lost."""
+        lost = self._segments[0].records
+        self.records -= lost
+        self._current = None
+        self._remove()
+        return lost
 
-    def _remove(self, segment: Path) -> None:
-        self.bytes -= segment.stat().st_size
-        segment.unlink()
+    def _remove(self) -> None:
+        segment = self._segments[0]
+        if len(self._segments) == 1:
+            self._close_tail()
+        self.bytes -= segment.bytes
         del self._segments[0]
         self._offset = 0
+        segment.path.unlink(missing_ok=True)
 
     def _next_segment(self) -> None:
         self._close_tail()
-        number = 1 + (int(self._segments[-1].stem) if self._segments else 0)
+        number = 1 + (int(self._segments[-1].path.stem) if self._segments else 0)
         path = self._folder / f"{number:012d}.spool"
         self._tail = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        self._length = 0
-        self._segments.append(path)
+        self._segments.append(_Segment(path))
         folder = os.open(self._folder, os.O_RDONLY)
         try:
             os.fsync(folder)

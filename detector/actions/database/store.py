@@ -37,6 +37,9 @@ _PATIENCE = 10
 _LAST_TRY = 0.5
 """At the end, a server that is away gets so many seconds more."""
 
+_ANEW = 1.0
+"""After an unexpected error the queue rests so many seconds."""
+
 Confirm = Callable[[bool, str], None]
 """Told that a scenario is complete in the database, or that it is not, and why."""
 
@@ -61,10 +64,10 @@ class Store:
         self._deadline = 0.0
         self._confirms: dict[str, Confirm] = {}
         self._seen: set[Any] = set()
-        self._inherited = 0 if spool is None else spool.records
-        """So many records at the head of the spool are an earlier run's."""
-        if self._inherited:
-            _log.info("database: %d requests of an earlier run wait in the spool", self._inherited)
+        if spool is not None and spool.damaged:
+            lose("bytes of the database's spool", spool.damaged, "a crash or the disk damaged them")
+        if spool is not None and spool.records:
+            _log.info("database: %d requests of an earlier run wait in the spool", spool.records)
         self.written = 0
         """Documents that are in the database."""
         self._thread = threading.Thread(target=self._work, name="database", daemon=True)
@@ -76,9 +79,9 @@ class Store:
         return self._away
 
     @property
-    def spooled(self) -> int:
-        """How many bytes wait on disk."""
-        return 0 if self._spool is None else self._spool.bytes
+    def waiting(self) -> int:
+        """How many bytes wait, in memory and on disk."""
+        return self._bytes + (0 if self._spool is None else self._spool.bytes)
 
     def first_time(self, what: object) -> bool:
         """Whether it is asked for the first time."""
@@ -139,15 +142,19 @@ class Store:
     # The thread; only it speaks to the server.
 
     def _work(self) -> None:
-        try:
-            while (write := self._next()) is not None and not self._late():
+        while not self._late():
+            try:
+                write = self._next()
+                if write is None:
+                    break
                 if self._send(write):
                     self._took(write)
-        except Exception:
-            _log.exception("database: the queue broke")
-            raise
-        finally:
-            self._leave()
+            except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue goes on, since doing twice is doing once
+                self._lose("times the database's queue had to begin anew", 1, self._server.redact(error))
+                _log.error("database: the queue begins anew: %s", type(error).__name__)
+                _log.debug("in the queue", exc_info=error)
+                time.sleep(_ANEW)
+        self._leave()
 
     def _late(self) -> bool:
         return self._closing and time.monotonic() >= self._deadline
@@ -156,9 +163,8 @@ class Store:
         """The oldest request, which stays where it is; None at the end."""
         while True:
             with self._disk:
-                record = None if self._spool is None else self._spool.first()
-                if record is not None:
-                    return self._of_record(record)
+                if (record := self._from_disk()) is not None:
+                    return record
                 with self._lock:
                     if self._memory:
                         return self._memory[0]
@@ -168,11 +174,16 @@ class Store:
                         return None
                     self._lock.wait(1)
 
-    def _of_record(self, record: bytes) -> Write:
-        write = unpacked(record)
-        if write.completes and self._inherited and self._spool is not None and self._spool.damaged:
-            return scenarios.give_up(write, self._spool.damaged)
-        return write
+    def _from_disk(self) -> Write | None:
+        """The oldest request in the spool. What cannot be read is left out: its scenarios then lack documents."""
+        while self._spool is not None:
+            try:
+                record = self._spool.first()
+                return None if record is None else unpacked(record)
+            except (OSError, bson.errors.BSONError, KeyError) as error:
+                lost = self._spool.give_up()
+                self._lose("requests in the database's spool", lost, f"unreadable: {type(error).__name__}")
+        return None
 
     def _took(self, write: Write) -> None:
         """The oldest request is done."""
@@ -182,10 +193,6 @@ class Store:
             if self._spool is not None and self._spool.records:
                 self._spool.done()
                 self._stuck = False
-                if self._inherited:
-                    self._inherited -= 1
-                    if not self._inherited:
-                        self._spool.forget_damage()
             elif self._memory:
                 self._memory.popleft()
                 self._bytes -= write.size
@@ -199,7 +206,8 @@ class Store:
         pause, broke = 0.05, 0
         while True:
             try:
-                matched, refused = self._server.write(write)
+                lacking = self._server.lacks(write) if write.expected else ""
+                matched, refused = self._server.write(scenarios.give_up(write, lacking) if lacking else write)
             except RefusedError as error:
                 return self._divide(write, str(error))
             except UnavailableError as error:
@@ -218,7 +226,7 @@ class Store:
             if not all(self._reject(write, each.index, each.why) for each in refused):
                 return False
             if write.completes:
-                self._confirm(write, matched, refused[0].why if refused else "")
+                self._confirm(write, matched, lacking or (refused[0].why if refused else ""))
             return True
 
     def _divide(self, write: Write, why: str) -> bool:
@@ -324,5 +332,5 @@ class Store:
 
     def _note_back(self) -> None:
         if self._away:
-            _log.info("database: can be written to again; %d bytes wait in the spool", self.spooled)
+            _log.info("database: can be written to again; %d bytes wait", self.waiting)
             self._away = ""

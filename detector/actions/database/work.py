@@ -25,6 +25,8 @@ class Write:
     """Each with `find`, `change` (MongoDB's update) and `many`; without `many`, what is not found is made."""
     completes: str = ""
     """The scenario that has all its documents with this; the others before it must have been written."""
+    expected: Mapping[str, int] = field(default_factory=dict)
+    """By collection, how many documents the scenario must have by then."""
     losing: Callable[[int, str], None] | None = field(default=None, compare=False)
     """Told how many of its documents were refused, and why; None where nobody knows of it any more."""
 
@@ -42,6 +44,7 @@ class Write:
                 "documents": list(self.documents),
                 "changes": list(self.changes),
                 "completes": self.completes,
+                "expected": dict(self.expected),
             }
         )
 
@@ -64,4 +67,5 @@ def unpacked(record: bytes) -> Write:
         content["documents"],
         content["changes"],
         content["completes"],
+        content["expected"],
     )
