@@ -90,6 +90,8 @@ class Server:
     def __init__(self, uri: str, *, majority: bool) -> None:
         """Raises ValueError where the connection string is wrong, without showing it."""
         self.redact = Redactor(uri)
+        self.sure = majority
+        """Whether what was written stays written."""
         self._indexed: set[tuple[str, str]] = set()
         self._concern = WriteConcern("majority" if majority else 1, wtimeout=int(_SECONDS * 500))
         self._sure = WriteConcern("majority", wtimeout=int(_SECONDS * 500))

@@ -64,6 +64,10 @@ class Store:
         self._deadline = 0.0
         self._confirms: dict[str, Confirm] = {}
         self._seen: set[Any] = set()
+        self._inherited = 0 if spool is None else spool.records
+        """So many records at the head of the spool are an earlier run's: it is not known what it lost before them."""
+        self._doubts = not server.sure
+        """Documents may be missing of which it is not known: each scenario's are counted before it is completed."""
         if spool is not None and spool.damaged:
             lose("bytes of the database's spool", spool.damaged, "a crash or the disk damaged them")
         if spool is not None and spool.records:
@@ -182,6 +186,8 @@ class Store:
                 return None if record is None else unpacked(record)
             except (OSError, bson.errors.BSONError, KeyError) as error:
                 lost = self._spool.give_up()
+                self._inherited = max(0, self._inherited - lost)
+                self._doubts = True
                 self._lose("requests in the database's spool", lost, f"unreadable: {type(error).__name__}")
         return None
 
@@ -193,6 +199,7 @@ class Store:
             if self._spool is not None and self._spool.records:
                 self._spool.done()
                 self._stuck = False
+                self._inherited = max(0, self._inherited - 1)
             elif self._memory:
                 self._memory.popleft()
                 self._bytes -= write.size
@@ -206,7 +213,7 @@ class Store:
         pause, broke = 0.05, 0
         while True:
             try:
-                lacking = self._server.lacks(write) if write.expected else ""
+                lacking = self._server.lacks(write) if self._doubts or self._inherited else ""
                 matched, refused = self._server.write(scenarios.give_up(write, lacking) if lacking else write)
             except RefusedError as error:
                 return self._divide(write, str(error))
