@@ -1,4 +1,4 @@
-"""The command line: `application-manager run` and `application-manager render`.
+"""The command line: `application-manager run`, `render` and `explain`.
 
 That the API server refuses us at the start is bad input as well: the account and its rights are given to us.
 """
@@ -6,8 +6,10 @@ That the API server refuses us at the start is bad input as well: the account an
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -15,8 +17,10 @@ import typer
 
 from application_manager.connection import ConfigurationError
 from application_manager.core.policy import Policy
+from application_manager.inquiry import InquiryError, inquire
 from application_manager.offline import render_files
 from application_manager.service import Options, serve
+from application_manager.telling import text
 from wayside import commandline
 from wayside.api.base import Duration
 from wayside.api.documents import DocumentError
@@ -28,7 +32,7 @@ app = typer.Typer(
     help="Makes a cluster run what the live ApplicationTasks demand.",
 )
 
-EXPECTED = (DocumentError, ConfigurationError)
+EXPECTED = (DocumentError, ConfigurationError, InquiryError)
 """Errors of the input: said in one line, without a trace."""
 
 RESYNC = Duration("60s")
@@ -116,6 +120,27 @@ def render(
         typer.echo(refusal, err=True)
     if result.refusals:
         raise typer.Exit(1)
+
+
+class Output(StrEnum):
+    """How an explanation is printed."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+@app.command()
+def explain(
+    subject: Annotated[str, typer.Argument(help="A task or an instance: its name, or task/NAME or instance/NAME.")],
+    namespace: Annotated[str | None, typer.Option("--namespace", "-n", help="Default: the kubeconfig's.")] = None,
+    output: Annotated[Output, typer.Option("--output", "-o", help="For people or for programs.")] = Output.TEXT,
+) -> None:
+    """Say why a task is served or not, and why an instance runs as it does: from the event to the pods."""
+    explanation = asyncio.run(inquire(subject, namespace))
+    if output is Output.JSON:
+        sys.stdout.write(f"{json.dumps(explanation.to_json(), indent=2, ensure_ascii=False)}\n")
+    else:
+        sys.stdout.write(text(explanation))
 
 
 def main() -> None:

@@ -63,6 +63,7 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, service),
         instance=instance,
+        message=_task_message(verdict, service),
         observed_generation=task.metadata.generation,
         conditions=list(conditions),
     )
@@ -98,6 +99,17 @@ def _task_phase(verdict: Verdict, service: Service | None) -> TaskPhase:
     return TaskPhase.READY if service.ready else TaskPhase.ACTIVE
 
 
+def _task_message(verdict: Verdict, service: Service | None) -> str | None:
+    if verdict.standing is not Standing.COUNTS:
+        return _short(verdict.message)
+    if service is None:
+        return f"instance {verdict.instance} is not made yet"
+    if service.applied and service.ready:
+        return None
+    lacks = "ready" if service.applied else "applied"
+    return _short(service.problem or f"instance {service.instance} is not {lacks} yet")
+
+
 def instance_status(
     instance: ApplicationInstance,
     decision: Decision,
@@ -119,6 +131,7 @@ def instance_status(
     generation = instance.metadata.generation
     return ApplicationInstanceStatus(
         phase=phase,
+        message=_instance_message(instance, decision, applied, ready),
         observed_generation=generation,
         spec_hash=spec_hash,
         release_time=None if decision.release_time is None else format_seconds(decision.release_time),
@@ -142,6 +155,26 @@ def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:
     if find(known, "Capped") is not None:
         return [Aspect("Capped", False, "WithinBounds", "all merged values are as the tasks say")]
     return []
+
+
+def _instance_message(instance: ApplicationInstance, decision: Decision, applied: Aspect, ready: Aspect) -> str | None:
+    parts = ["paused"] if decision.paused else []
+    if not applied.holds:
+        parts.append(applied.message)
+    elif not ready.holds:
+        parts.append(ready.message)
+    if decision.release_time is not None:
+        parts.append(f"released at {format_seconds(decision.release_time)} unless a demand comes")
+    elif byhand.is_held(instance) and not decision.wanted:
+        parts.append("held though nobody demands it")
+    parts += decision.capped
+    return _short("; ".join(parts))
+
+
+def _short(message: str) -> str | None:
+    """The message as a column shows it; None where it is empty."""
+    longest = 512
+    return (message if len(message) <= longest else f"{message[: longest - 1]}…") or None
 
 
 def demands(decision: Decision) -> Demands:

@@ -61,6 +61,9 @@ class ApplicationInstanceStatus(Model):
     """What the instance consists of and how it is."""
 
     phase: InstancePhase | None = Field(default=None, description="The state in one word.")
+    message: str | None = Field(
+        default=None, max_length=512, description="What it waits for, or what keeps it; absent when all is as usual."
+    )
     observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
     spec_hash: str | None = Field(
         default=None, max_length=64, description="Digest of the manifests that were last applied in full."
@@ -94,13 +97,8 @@ class ApplicationInstance(Kind):
         {"name": "Demands", "type": "integer", "jsonPath": ".status.demands.count"},
         {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},
         {"name": "Phase", "type": "string", "jsonPath": ".status.phase"},
-        {
-            "name": "Message",
-            "type": "string",
-            "jsonPath": '.status.conditions[?(@.type=="Applied")].message',
-            "priority": "1",
-        },
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+        {"name": "Message", "type": "string", "jsonPath": ".status.message"},
     ]
     object_validations: ClassVar[list[dict[str, str]]] = [
         {

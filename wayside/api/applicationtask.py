@@ -95,6 +95,9 @@ class ApplicationTaskStatus(Model):
 
     phase: TaskPhase | None = Field(default=None, description="The state in one word.")
     instance: str | None = Field(default=None, max_length=63, description="The ApplicationInstance that serves it.")
+    message: str | None = Field(
+        default=None, max_length=512, description="What it waits for or why it does not count; absent when all is well."
+    )
     observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
     conditions: list[Condition] = conditions_field(
         "Accepted: the demand counts. Applied, Ready: its instance was, at least once. Finished: it is over."
@@ -112,13 +115,10 @@ class ApplicationTask(Kind):
         {"name": "Subject", "type": "string", "jsonPath": ".spec.event.subject"},
         {"name": "Instance", "type": "string", "jsonPath": ".status.instance"},
         {"name": "Phase", "type": "string", "jsonPath": ".status.phase"},
-        {
-            "name": "Message",
-            "type": "string",
-            "jsonPath": '.status.conditions[?(@.type=="Accepted")].message',
-            "priority": "1",
-        },
+        {"name": "Priority", "type": "integer", "jsonPath": ".spec.priority", "priority": "1"},
+        {"name": "Holder", "type": "string", "jsonPath": ".spec.requester.holder", "priority": "1"},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+        {"name": "Message", "type": "string", "jsonPath": ".status.message"},
     ]
     selectable_fields: ClassVar[list[str]] = [".spec.template", ".spec.requester.detector", ".status.instance"]
     object_validations: ClassVar[list[dict[str, str]]] = [

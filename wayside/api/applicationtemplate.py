@@ -119,13 +119,8 @@ class ApplicationTemplate(Kind):
         {"name": "Key", "type": "string", "jsonPath": ".spec.key"},
         {"name": "Instances", "type": "integer", "jsonPath": ".status.instances"},
         {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
-        {
-            "name": "Message",
-            "type": "string",
-            "jsonPath": '.status.conditions[?(@.type=="Accepted")].message',
-            "priority": "1",
-        },
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].message'},
     ]
     object_validations: ClassVar[list[dict[str, str]]] = [
         {

@@ -210,6 +210,7 @@ class Detector(Kind):
         {"name": "Rules", "type": "integer", "jsonPath": ".status.rules"},
         {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].message'},
     ]
 
     kind: str = "Detector"

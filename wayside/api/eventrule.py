@@ -228,13 +228,8 @@ class EventRule(Kind):
         {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
         {"name": "Detectors", "type": "string", "jsonPath": ".status.detectors"},
         {"name": "When", "type": "string", "jsonPath": ".spec.when"},
-        {
-            "name": "Message",
-            "type": "string",
-            "jsonPath": '.status.conditions[?(@.type=="Accepted")].message',
-            "priority": "1",
-        },
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
+        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].message'},
     ]
 
     kind: str = "EventRule"

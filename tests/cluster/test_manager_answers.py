@@ -1,0 +1,127 @@
+"""Why something runs, or does not, is told by the columns of kubectl and by `application-manager explain` alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from application_manager.core.claims import instance_name
+from tests.cluster.api import Api, Object
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.managed_world import start_manager, task, template, wait_settled
+from tests.cluster.pods import mark_pods_ready
+from tests.cluster.processes import Process, Processes
+from tests.cluster.waiting import wait_until
+
+NORTH = instance_name("app", "north")
+RATED = {
+    "parameters": {"region": {"type": "string"}, "rate": {"type": "number", "merge": "Max", "default": 1}},
+}
+
+
+@pytest.fixture
+def manager(processes: Processes, namespace: str) -> Process:
+    return start_manager(processes, namespace)
+
+
+def emitted(name: str, **parameters: Any) -> Object:
+    made = task(name, holder="town", **parameters)
+    times = dict.fromkeys(("onsetTime", "startTime"), "2026-01-02T03:04:05Z")
+    event = {"id": "e", "rule": "scene", "action": "fuse", "subject": "car1", "values": {"distance": 7}, **times}
+    made["spec"]["event"] = event
+    made["spec"]["requester"]["detector"] = "town"
+    return made
+
+
+def columns(control_plane: ControlPlane, api: Api, what: str, name: str) -> dict[str, str]:
+    """A row of `kubectl get` by its header; a cell goes on to where the next heading stands."""
+    header, row = control_plane.kubectl("get", what, name, "--namespace", api.namespace).splitlines()
+    starts = [
+        (index, header[index:].split()[0])
+        for index in range(len(header))
+        if header[index] != " " and header[index - 1 : index] in ("", " ")
+    ]
+    ends = [start for start, _ in starts[1:]] + [len(row)]
+    return {heading: row[start:end].strip() for (start, heading), end in zip(starts, ends, strict=True)}
+
+
+def explain(control_plane: ControlPlane, api: Api, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "application_manager.cli", "explain", *arguments, "-n", api.namespace]
+    environment = {"KUBECONFIG": str(control_plane.kubeconfig)}
+    return subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+
+
+def wait_column(control_plane: ControlPlane, api: Api, what: str, name: str, **cells: str) -> None:
+    wait_until(
+        lambda: columns(control_plane, api, what, name),
+        lambda row: all(text in row.get(heading, "") for heading, text in cells.items()),
+        what=f"{what} {name} shows {cells}",
+    )
+
+
+def test_columns_tell_what_is_wanted_what_runs_and_what_is_lacking(
+    control_plane: ControlPlane, api: Api, manager: Process
+) -> None:
+    api.create(template(**RATED, linger="300s"))
+    api.create(emitted("one", region="north"))
+    api.create(task("wrong", region="north", rate="fast"))
+    wait_column(control_plane, api, "apptask", "one", RULE="scene", SUBJECT="car1", INSTANCE=NORTH, PHASE="Active")
+    wait_column(control_plane, api, "apptask", "one", MESSAGE=f"instance {NORTH} is not ready yet")
+    wait_column(control_plane, api, "apptask", "wrong", PHASE="Refused", MESSAGE="'fast' is not of type number")
+    wait_column(control_plane, api, "appinst", NORTH, KEY="north", DEMANDS="1", READY="False", PHASE="Applied")
+    wait_column(control_plane, api, "appinst", NORTH, MESSAGE="has 0 of 1 pods available")
+    wait_until(lambda: mark_pods_ready(api), bool, what="the pod exists")
+    wait_column(control_plane, api, "apptask", "one", PHASE="Ready")
+    assert columns(control_plane, api, "apptask", "one")["MESSAGE"] == ""
+    api.delete("ApplicationTask", "one")
+    wait_column(control_plane, api, "appinst", NORTH, PHASE="Lingering", MESSAGE="unless a demand comes")
+    api.create({**template("other"), "spec": {"manifests": [{"apiVersion": "v1", "kind": "Role", "metadata": {}}]}})
+    wait_column(control_plane, api, "apptpl", "other", ACCEPTED="False", MESSAGE="spec.manifests[0].kind")
+
+
+def test_explain_goes_from_the_event_over_merged_values_to_the_pods(
+    control_plane: ControlPlane, api: Api, manager: Process
+) -> None:
+    api.create(template(**RATED))
+    api.create(emitted("one", region="north", rate=5))
+    api.create(task("two", region="north", rate=9))
+    api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: raw["spec"]["parameters"].get("rate") == 9, what="both are merged"
+    )
+    wait_settled(api)
+    pods = api.wait_list("Pod", lambda found: len(found) == 1, what="the pod exists")
+    told = wait_until(
+        lambda: explain(control_plane, api, "one").stdout,
+        lambda text: f"Deployment {NORTH} has 0 of 1 pods available" in text,
+        what="the manager has written what belongs to the instance",
+    )
+    for line in (
+        "event: scene of car1, began 2026-01-02T03:04:05Z",
+        "distance = 7",
+        "asked for by detector town, holder town",
+        "rate = 9 (merge Max)",
+        "5 of one is outbid: a larger value counts",
+        "9 of two is it",
+        f"{pods[0]['metadata']['name']} Pending: not ready yet",
+    ):
+        assert line in told
+    as_json = json.loads(explain(control_plane, api, f"appinst/{NORTH}", "-o", "json").stdout)
+    assert [each["name"] for each in as_json["tasks"]] == ["one", "two"]
+    assert as_json["instance"]["phase"] == "Applied"
+    assert "task" not in as_json
+
+
+def test_what_cannot_be_explained_is_one_line_with_the_remedy(control_plane: ControlPlane, api: Api) -> None:
+    failed = explain(control_plane, api, "nothing")
+    assert (failed.returncode, failed.stdout) == (2, "")
+    assert "there is no ApplicationTask or ApplicationInstance 'nothing'" in failed.stderr
+    assert len(failed.stderr.splitlines()) == 1
+    api.create(task("waits", of="missing"))
+    told = explain(control_plane, api, "waits").stdout
+    assert "template missing: does not exist" in told
+    assert "the manager has not looked at it as it is now" in told

@@ -1,0 +1,166 @@
+"""An explanation follows the chain from the event to the pods, and says of each task and value what came of it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from application_manager.core.explaining import Found, explain, serving
+from application_manager.core.explanation import Explanation
+from application_manager.telling import text
+from tests.unit.manager_objects import NOW, instance, task, template
+from wayside.api import ApplicationInstance, ApplicationTask
+from wayside.times import format_seconds
+
+FUSION = {
+    "parameters": {
+        "region": {"type": "string", "required": True},
+        "sources": {"type": "array", "items": "string", "merge": "Union"},
+        "rateHz": {"type": "number", "default": 10, "merge": "Max"},
+        "quality": {"type": "string", "default": "plain", "merge": "HighestPriority"},
+    },
+    "key": "${parameters.region}",
+}
+NAME = "app-3q3f46oudt"
+WHY = f"Deployment {NAME} has 0 of 1 pods available: image fusion:9 cannot be pulled: not found"
+
+
+def emitted(name: str, parameters: dict[str, Any], subject: str = "car1+car2", **more: Any) -> ApplicationTask:
+    """A task of a detector, as the manager has accepted it."""
+    made = task(name, parameters, holder="town", **more)
+    event = {
+        "id": name,
+        "rule": "scene",
+        "action": "fuse",
+        "subject": subject,
+        "onsetTime": format_seconds(NOW - 2),
+        "startTime": format_seconds(NOW),
+        "values": {"distance": 142.5},
+    }
+    raw = made.to_json()
+    raw["spec"] |= {"event": event, "requester": {"detector": "town", "holder": "town"}}
+    raw["status"] = {"phase": "Active", "instance": NAME, "observedGeneration": 0}
+    return ApplicationTask.model_validate(raw)
+
+
+def running(**parameters: Any) -> ApplicationInstance:
+    made = instance(NAME, key="north", parameters={"region": "north", **parameters}).to_json()
+    ready = {
+        "type": "Ready",
+        "status": "False",
+        "reason": "ImagePullFailed",
+        "message": WHY,
+        "lastTransitionTime": format_seconds(NOW),
+    }
+    return ApplicationInstance.model_validate(made | {"status": {"phase": "Applied", "conditions": [ready]}})
+
+
+DEPLOYMENT = {"kind": "Deployment", "metadata": {}, "spec": {"replicas": 1}}
+POD = {
+    "metadata": {"name": f"{NAME}-abc", "namespace": "site"},
+    "spec": {"nodeName": "edge-1", "containers": [{"name": "main", "image": "fusion:9"}]},
+    "status": {
+        "phase": "Pending",
+        "containerStatuses": [
+            {"name": "main", "state": {"waiting": {"reason": "ErrImagePull", "message": "not found"}}}
+        ],
+    },
+}
+
+TASKS = [
+    emitted("scene-a", {"region": "north", "sources": ["car1"], "rateHz": 20}, priority=3),
+    emitted("scene-b", {"region": "north", "sources": ["car2"], "rateHz": 5}, subject="car2+car3"),
+    task("by-anna", {"region": "north", "quality": "fine"}),
+    task("wrong", {"region": "north", "rateHz": "fast"}),
+]
+
+
+def explained(about: str | None = "scene-a", tasks: Any = TASKS, **more: Any) -> Explanation:
+    found = Found([template(**FUSION)], tasks, more.pop("instances", [running()]), **more)
+    asked = next((each for each in tasks if each.name == about), None)
+    return explain(found, task=about, instance=serving(found, asked) if asked else NAME, now=NOW)
+
+
+def contributions(explanation: Explanation, parameter: str) -> dict[str, str]:
+    (found,) = (each for each in explanation.parameters if each.name == parameter)
+    return {each.task: each.effect for each in found.said}
+
+
+def test_who_gives_a_value_and_who_is_outbid() -> None:
+    found = explained()
+    values = {each.name: (each.value, each.source) for each in found.parameters}
+    assert values == {
+        "region": ("north", "tasks"),
+        "sources": (["car1", "car2"], "tasks"),
+        "rateHz": (20, "tasks"),
+        "quality": ("fine", "tasks"),
+    }
+    assert contributions(found, "rateHz") == {"scene-a": "decides", "scene-b": "outbid"}
+    assert contributions(found, "sources") == {"scene-a": "part", "scene-b": "part"}
+    assert contributions(found, "quality") == {"by-anna": "decides"}
+
+
+def test_a_default_and_a_value_that_is_kept_are_told_apart_from_what_tasks_give() -> None:
+    by_default = explained("scene-b", [TASKS[1]])
+    assert {each.name: each.source for each in by_default.parameters}["quality"] == "default"
+    kept = explained(None, [], instances=[running(rateHz=30)])
+    assert {each.name: (each.value, each.source) for each in kept.parameters}["rateHz"] == (30, "earlier")
+    assert {each.name: each.source for each in kept.parameters}["sources"] == "none"
+
+
+def test_a_refused_task_has_no_instance_and_says_why() -> None:
+    found = explained("wrong")
+    assert found.task is not None
+    assert (found.task.standing, found.task.reason, found.instance) == ("Refused", "InvalidParameters", None)
+    assert "'fast' is not of type number" in found.task.message
+
+
+def test_a_task_that_differs_where_all_must_agree_is_told_among_those_of_the_instance() -> None:
+    spec = {**FUSION, "parameters": {**FUSION["parameters"], "model": {"type": "string"}}}  # type: ignore[dict-item]
+    tasks = [
+        task("first", {"region": "north", "model": "a"}),
+        task("other", {"region": "north", "model": "b"}, created=1),
+    ]
+    found = explain(Found([template(**spec)], tasks, []), task="other", instance=NAME, now=NOW)
+    assert {each.name: each.reason for each in found.tasks} == {"first": "Accepted", "other": "Conflict"}
+    assert contributions(found, "model") == {"first": "decides", "other": "none"}
+    assert found.instance is not None
+    assert not found.instance.exists
+
+
+def test_a_holder_that_the_manager_counts_as_lost_is_lost_in_the_explanation() -> None:
+    lost = task("a", {"region": "north"}, holder="town", accepted_condition=("False", "HolderLost", NOW - 5))
+    found = explained("a", [lost])
+    assert found.task is not None
+    assert (found.task.standing, found.task.holder_is_lost) == ("Lapsed", True)
+
+
+def test_a_missing_template_ends_the_chain() -> None:
+    found = explain(Found([], [TASKS[0]], []), task="scene-a", instance=None, now=NOW)
+    assert found.template.problem == "does not exist"
+    assert found.task is not None
+    assert found.task.reason == "TemplateNotFound"
+
+
+def test_objects_and_pods_say_why_they_are_not_ready() -> None:
+    found = explained(objects={("apps/v1", "Deployment", NAME): DEPLOYMENT, ("v1", "Service", NAME): None}, pods=[POD])
+    assert [(each.kind, each.problem) for each in found.objects] == [
+        ("Deployment", "has 0 of 1 pods available"),
+        ("Service", "does not exist"),
+    ]
+    assert [each.problem for each in found.pods] == ["image fusion:9 cannot be pulled: not found"]
+
+
+def test_the_guide_shows_what_is_printed() -> None:
+    lease = {"spec": {"renewTime": format_seconds(NOW - 2.5)}}
+    found = explained(objects={("apps/v1", "Deployment", NAME): DEPLOYMENT}, pods=[POD], leases={"town": lease})
+    guide = Path("docs/manager.md").read_text()
+    shown = re.search(r"```console\n\$ application-manager explain scene-a\n(.*?)```", guide, re.DOTALL)
+    assert shown is not None
+    assert shown[1] == text(found)
+
+
+def test_an_explanation_as_json_reads_back() -> None:
+    found = explained(pods=[POD])
+    assert Explanation.model_validate(found.to_json()) == found
