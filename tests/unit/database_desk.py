@@ -94,7 +94,7 @@ class Desk:
         with self._changed:
             return self.outcomes[name][-1] if name in self.outcomes else None
 
-    def outcome(self, name: str = "e1", within: float = 20) -> Outcome:
+    def outcome(self, name: str = "e1", within: float = 60) -> Outcome:
         """What became of the episode in the end."""
 
         def final() -> bool:
@@ -119,7 +119,7 @@ def speeds(count: int, client: str = "car1", first: int = 0, pad: int = 0) -> li
     ]
 
 
-def wait_until(condition: Callable[[], bool], within: float = 30, pause: float = 0.02) -> None:
+def wait_until(condition: Callable[[], bool], within: float = 60, pause: float = 0.02) -> None:
     deadline = time.monotonic() + within
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"

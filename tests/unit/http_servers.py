@@ -5,12 +5,13 @@ from __future__ import annotations
 import socket
 import ssl
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-WAIT = 10.0
+WAIT = 60.0
 """Seconds after which a test gives up on the endpoint."""
 
 
@@ -23,6 +24,8 @@ class Received:
     headers: dict[str, str]
     """By lower-case name."""
     body: bytes
+    at: float
+    """When it was there, by the monotonic clock."""
 
 
 Behaviour = Callable[["Endpoint", socket.socket, Received], None]
@@ -120,9 +123,10 @@ class Endpoint:
             with connection:
                 request = _request(connection)
                 with self._arrived:
+                    behaviour = self.behaviour  # whoever sees the request may change what is done about the next
                     self.requests.append(request)
                     self._arrived.notify_all()
-                self.behaviour(self, connection, request)
+                behaviour(self, connection, request)
         except OSError:  # the other side has had enough, or does not like the certificate
             connection.close()
 
@@ -137,7 +141,7 @@ def _request(connection: socket.socket) -> Received:
     while len(body) < int(headers.get("content-length", "0")):
         body += _some(connection)
     method, path, _ = first.split(" ")
-    return Received(method, path, headers, body)
+    return Received(method, path, headers, body, time.monotonic())
 
 
 def _some(connection: socket.socket) -> bytes:

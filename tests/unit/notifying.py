@@ -16,7 +16,7 @@ from tests.unit.driving import SECOND, START, a_detector, a_rule
 from wayside.api.actions.notify import Notify as Parameters
 from wayside.times import format_time
 
-WAIT = 10.0
+WAIT = 60.0
 
 
 class Silent:

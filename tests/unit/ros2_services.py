@@ -75,7 +75,7 @@ class Node:
 
         self._queryables.append(self._session.declare_queryable(key, reply, complete=not self._bridged))
 
-    def wait_for(self, done: Callable[[list[tuple[str, dict[str, Any]]]], bool], seconds: float = 30) -> None:
+    def wait_for(self, done: Callable[[list[tuple[str, dict[str, Any]]]], bool], seconds: float = 60) -> None:
         with self._changed:
             assert self._changed.wait_for(lambda: done(self.calls), seconds), self.calls
 

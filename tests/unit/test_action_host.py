@@ -83,7 +83,7 @@ class Hangs(Recorded):
     """Waits for ever, or until it is let go."""
 
     def started(self, episode: Episode) -> None:
-        SLOW.wait(30)
+        SLOW.wait(120)
         super().started(episode)
 
 
@@ -142,7 +142,7 @@ class Site:
         return self.host.outcomes.tallies()[Which("fast", action)]
 
     def when(self, true: Callable[[], bool]) -> None:
-        end = time.monotonic() + 20
+        end = time.monotonic() + 60
         while not true():
             assert time.monotonic() < end, (Recorded.told, self.host.outcomes.tallies(), self.host.outcomes.lost())
             time.sleep(0.005)

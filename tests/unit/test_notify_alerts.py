@@ -90,7 +90,7 @@ def test_an_alert_is_repeated_with_a_later_end_while_its_episode_lasts(there: En
 
 def test_many_alerts_share_a_request(there: Endpoint) -> None:
     there.behaviour = hangs()
-    desk = a_desk({"alertmanager": {"url": there.url, "repeat": "1h", "timeout": "300ms"}})
+    desk = a_desk({"alertmanager": {"url": there.url, "repeat": "1h", "timeout": "2s"}})
     desk.action.started(open_of(an_episode("e0")))
     there.received(1)
     there.behaviour = answers(200)
@@ -103,7 +103,7 @@ def test_many_alerts_share_a_request(there: Endpoint) -> None:
 
 def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(there: Endpoint) -> None:
     there.behaviour = hangs()
-    desk = a_desk({"alertmanager": {"url": there.url, "timeout": "300ms"}})
+    desk = a_desk({"alertmanager": {"url": there.url, "timeout": "2s"}})
     desk.action.started(open_of(an_episode()))
     there.received(1)
     desk.action.ended(an_episode())

@@ -176,11 +176,10 @@ def test_an_endpoint_that_says_when_is_left_alone_until_then(there: Endpoint, mo
     there.behaviour = answers(429, Retry_After="1")
     desk = a_desk({"http": http(there), "events": ["Started"]})
     desk.run(an_episode("e1"), an_episode("e2"))
-    there.received(1)
-    refused = time.monotonic()
+    (refused,) = there.received(1)
     there.behaviour = answers(200)
     desk.outcome("e1")
-    assert time.monotonic() - refused > 0.8
+    assert there.requests[1].at - refused.at > 0.9
     desk.outcome("e2")
     assert len(there.requests) == 3
     desk.end()
@@ -193,12 +192,12 @@ def test_who_tells_does_not_wait_for_an_endpoint_that_hangs(there: Endpoint) -> 
     there.received(1)
     begun = time.monotonic()
     desk.run(*(an_episode(f"e{number}") for number in range(1, 200)))
-    assert time.monotonic() - begun < 5
+    assert time.monotonic() - begun < 20
     assert desk.lost[LOST] == 197  # three wait, one of them being sent
     assert "more messages wait than the rule allows" in desk.outcome("e199", OutcomeState.FAILED).message
     begun = time.monotonic()
     desk.end()
-    assert time.monotonic() - begun < 5, "the end does not wait for the endpoint either"
+    assert time.monotonic() - begun < 20, "the end does not wait for the endpoint either"
 
 
 def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
@@ -208,7 +207,7 @@ def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
             "events": ["Started"],
             "text": "${client} stands",
             "labels": {"road": "${road}"},
-            "grouping": {"wait": "300ms", "by": ["road"], "maximum": 3},
+            "grouping": {"wait": "3s", "by": ["road"], "maximum": 3},
         }
     )
     for number in range(100):
@@ -382,7 +381,7 @@ def test_a_zenoh_key_gets_the_event() -> None:
         subscriber = session.declare_subscriber("city/alerts", take)
         desk = a_desk({"zenoh": {"key": "city/alerts"}, "title": "t"}, messenger=Session(session))
         desk.run(an_episode(rendered={"title": "braking"}))
-        assert changed.wait(10), arrived
+        assert changed.wait(60), arrived
         desk.outcome("e1")
         desk.end()
         subscriber.undeclare()

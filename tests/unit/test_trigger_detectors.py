@@ -112,7 +112,7 @@ def fast(name: str = "rsu", **trigger: Any) -> EventRule:
 
 def asked(endpoint: str, request: RecordingRequest, name: str = "rsu") -> RecordingReport:
     with open_session(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])) as session:
-        for reply in session.get(status_key(name, "recordings"), payload=write_request(request), timeout=5):
+        for reply in session.get(status_key(name, "recordings"), payload=write_request(request), timeout=PATIENCE):
             if reply.ok is not None:
                 return read_report(reply.ok.payload.to_bytes())
             raise ValueError(reply.err.payload.to_string())
@@ -121,7 +121,7 @@ def asked(endpoint: str, request: RecordingRequest, name: str = "rsu") -> Record
 
 def listed(endpoint: str, name: str = "rsu") -> list[RecordingReport]:
     with open_session(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])) as session:
-        for reply in session.get(status_key(name, "recordings"), timeout=5):
+        for reply in session.get(status_key(name, "recordings"), timeout=PATIENCE):
             if reply.ok is not None:
                 return read_reports(reply.ok.payload.to_bytes())
     raise AssertionError("no answer")
