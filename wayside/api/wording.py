@@ -16,6 +16,10 @@ _PATTERNS = {
     r"^[A-Za-z0-9._:-]+$": "letters, digits and . _ : -",
     r"^[A-Za-z_][A-Za-z0-9_]*$": "letters, digits and _, not beginning with a digit",
     r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$": "package/msg/Type, e.g. geometry_msgs/msg/PoseStamped",
+    r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$": "like https://host:port/path, without # and without a user and password "
+    "before the host (give credentialsSecret)",
+    r"^[^/*$#?]+(/[^/*$#?]+)*$": "a Zenoh key without wildcards, e.g. city/alerts",
+    r"^WAYSIDE_[A-Z0-9_]+$": "a name that begins with WAYSIDE_, in capitals: other variables are not for rules",
     r"^[a-z]+/.+$": "protocol/address:port, e.g. tcp/zenoh:7447",
 }
 """The models' patterns in words."""
