@@ -89,6 +89,9 @@ def run(
     ttl_after_finished: Annotated[
         Duration, typer.Option(parser=_duration, metavar="DURATION", help="How long finished tasks are kept.")
     ] = TTL_AFTER_FINISHED,
+    metrics_port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
+    ] = None,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
 ) -> None:
@@ -98,6 +101,7 @@ def run(
         namespaces=tuple(namespace or ()),
         resync=resync.seconds,
         ttl_after_finished=ttl_after_finished.seconds,
+        metrics_port=metrics_port,
     )
     asyncio.run(serve(options))
 

@@ -5,6 +5,7 @@ The generated model classes are left aside: they cost more time than the request
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -15,6 +16,7 @@ import msgspec
 from kubernetes.aio.client import ApiClient, Configuration
 
 from application_manager.core.policy import KindKey
+from application_manager.measures import NO_ANSWER, Measures
 
 Object = dict[str, Any]
 """A Kubernetes object, as JSON."""
@@ -95,8 +97,9 @@ EVENTS = Resource("events.k8s.io/v1", "Event", "events")
 class Client:
     """The verbs. Each raises ApiError where the API server refuses, and Unreachable where it does not answer."""
 
-    def __init__(self, configuration: Configuration) -> None:
+    def __init__(self, configuration: Configuration, measures: Measures | None = None) -> None:
         self.configuration = configuration
+        self._measures = measures or Measures()
         self._api: Any = ApiClient(configuration)
         self._decode = msgspec.json.Decoder().decode
 
@@ -187,13 +190,17 @@ class Client:
         if token:
             headers["Authorization"] = token
         url = self.configuration.host + path + (f"?{urlencode(query)}" if query else "")
+        began, code = time.monotonic(), NO_ANSWER
         try:
             response = await self._api.rest_client.request(
                 method, url, headers=headers, body=body, _request_timeout=_TIMEOUT
             )
             raw = await response.read()
+            code = str(response.status)
         except (TimeoutError, aiohttp.ClientError, OSError) as error:
             raise Unreachable(f"{method} {path}: {type(error).__name__} {error}".rstrip()) from error
+        finally:
+            self._measures.asked(method, time.monotonic() - began, code)
         if response.status >= 400:
             raise self._error(response.status, raw, response.headers.get("Retry-After"))
         return cast("Object", self._decode(raw))

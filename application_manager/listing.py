@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from application_manager.client import ApiError, Client, Resource, Unreachable
 from application_manager.core.labelling import INSTANCE_LABEL
+from application_manager.measures import Measures
 from application_manager.router import Router
 from application_manager.starting import until_answered
 from application_manager.world import World
@@ -28,6 +29,7 @@ class Listing:
         children: the kinds of instances' objects.
         namespaces: where; empty: everywhere.
         every: seconds between two resyncs.
+        measures: told of each resync.
     """
 
     world: World
@@ -37,6 +39,7 @@ class Listing:
     children: Sequence[Resource]
     namespaces: tuple[str, ...]
     every: float
+    measures: Measures
 
     async def first(self) -> None:
         """List everything, however long the API server takes to answer.
@@ -44,6 +47,7 @@ class Listing:
         Raises ApiError where it refuses for good.
         """
         await until_answered(self._everything)
+        self.measures.resynced(well=True)
 
     async def resync(self, watching: asyncio.Event) -> None:
         """List everything again and again, once the watches have begun, until cancelled."""
@@ -55,6 +59,9 @@ class Listing:
                 await self._everything()
             except (ApiError, Unreachable) as error:
                 log.warning("resync: %s", error)
+                self.measures.resynced(well=False)
+            else:
+                self.measures.resynced(well=True)
             self.world.leases.forget_except(self.world.claims.holders())
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 

@@ -18,7 +18,9 @@ from typing import Any
 
 from application_manager.client import EVENTS, ApiError, Client, Unreachable
 from application_manager.core.conditions import changed
+from application_manager.core.limiting import Allowance
 from application_manager.core.pods import TroubleReason
+from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
 from wayside.times import format_seconds
 
@@ -86,17 +88,23 @@ class _Said:
 class Recorder:
     """Takes Events at once and posts them in the background."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, measures: Measures | None = None) -> None:
         self._client = client
+        self._measures = measures or Measures()
+        self._allowance = Allowance()
         self._waiting: asyncio.Queue[_Said] = asyncio.Queue(_WAITING)
         self._instance = f"{socket.gethostname()}-{os.getpid()}"[:128]
         self.dropped = 0
 
     def say(self, regarding: Kind, reason: Reason, note: str, now: float) -> None:
-        """Post an Event about the object; `now` in seconds since 1970."""
+        """Post an Event about the object, unless there were too many of it; `now` in seconds since 1970."""
+        if not self._allowance.takes(regarding.metadata.uid, now):
+            self._measures.unposted("limited")
+            return
         try:
             self._waiting.put_nowait(_Said(regarding, reason, note, format_seconds(now)))
         except asyncio.QueueFull:
+            self._measures.unposted("full")
             self.dropped += 1
 
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
@@ -117,10 +125,13 @@ class Recorder:
             said = await self._waiting.get()
             try:
                 await self._client.create(EVENTS, self._manifest(said))
+                self._measures.posted(said.reason.value)
             except ApiError as error:
+                self._measures.unposted("failed")
                 if not error.terminating:
                     log.warning("the Event %s about %s is lost: %s", said.reason, said.regarding.name, error)
             except Unreachable:
+                self._measures.unposted("failed")
                 self.dropped += 1
             if self.dropped > told:
                 log.warning("%d Events were dropped so far: more than could be posted", self.dropped)

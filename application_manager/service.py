@@ -24,7 +24,10 @@ from application_manager.instances import InstanceWork
 from application_manager.instancestatus import InstanceStatusWork
 from application_manager.leasewatch import LeaseWatch
 from application_manager.listing import Listing
+from application_manager.measures import Measures
 from application_manager.operator import watch
+from application_manager.overview import Overview
+from application_manager.pages import pages, stalled
 from application_manager.recorder import Recorder
 from application_manager.router import Router
 from application_manager.rulework import RuleKey, RuleWork
@@ -51,23 +54,27 @@ class Options:
         namespaces: those to look at; empty: all.
         resync: seconds between two full resyncs.
         ttl_after_finished: seconds that finished tasks are kept.
+        metrics_port: where metrics and health are served; None: nowhere.
     """
 
     policy: Policy = field(default_factory=Policy)
     namespaces: tuple[str, ...] = ()
     resync: float = 60.0
     ttl_after_finished: float = 3600.0
+    metrics_port: int | None = None
 
 
 async def serve(options: Options) -> None:
     """Run the manager until SIGTERM or SIGINT.
 
     Raises:
-        ConfigurationError: there is no cluster, it lacks our CRDs, or refuses what the manager needs, such as listing.
+        ConfigurationError: there is no cluster, it lacks our CRDs, or refuses what the manager needs, such as listing;
+            or the port for metrics is taken.
     """
-    client = Client(await load_configuration())
+    measures = Measures()
+    client = Client(await load_configuration(), measures)
     try:
-        await Manager(client, options, await _discovered(client, options.policy)).run()
+        await Manager(client, options, await _discovered(client, options.policy), measures).run()
     except ApiError as error:
         raise ConfigurationError(
             f"the API server refuses what the manager needs: {error}; check the account and its rights"
@@ -79,19 +86,28 @@ async def serve(options: Options) -> None:
 class Manager:
     """All parts of one manager."""
 
-    def __init__(self, client: Client, options: Options, resources: dict[KindKey, Resource]) -> None:
+    def __init__(
+        self, client: Client, options: Options, resources: dict[KindKey, Resource], measures: Measures
+    ) -> None:
         self._client = client
+        self._measures = measures
         self._options = options
         self._world = World(options.policy)
-        self._recorder = Recorder(client)
+        self._recorder = Recorder(client, measures)
         applier = Applier(client, self._world.store, resources)
-        self._instances: WorkQueue[Name] = WorkQueue("instance", self._reconcile_instance, _INSTANCE_WORKERS)
-        self._statuses: WorkQueue[Name] = WorkQueue(
-            "instance status", self._say_instance, _STATUS_WORKERS, self._instances
+        self._instances: WorkQueue[Name] = WorkQueue(
+            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures
         )
-        self._tasks: WorkQueue[Name] = WorkQueue("task", self._reconcile_task, _STATUS_WORKERS, self._instances)
-        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances)
-        self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances)
+        self._statuses: WorkQueue[Name] = WorkQueue(
+            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measures
+        )
+        self._tasks: WorkQueue[Name] = WorkQueue(
+            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measures
+        )
+        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances, measures)
+        self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances, measures)
+        queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules)
+        measures.registry.register(Overview(self._world, lambda: [(each.name, *each.depth) for each in queues]))
         self._router = Router(
             self._world, applier, self._instances.add, self._tasks.add, _soon(self._templates), _soon(self._rules)
         )
@@ -125,6 +141,7 @@ class Manager:
             ttl=options.ttl_after_finished,
             again=self._tasks.add_at,
             observe=self._router.observe,
+            measures=measures,
         )
         self._template_work = TemplateWork(
             world=self._world,
@@ -144,6 +161,7 @@ class Manager:
             children=children,
             namespaces=options.namespaces,
             every=options.resync,
+            measures=measures,
         )
         self._leases = LeaseWatch(self._world, client, own[0], options.namespaces, self._instances.add)
         self._rule_work = RuleWork(
@@ -159,8 +177,17 @@ class Manager:
         stop = asyncio.Event()
         watching = asyncio.Event()
         _on_signals(stop)
-        if not await _until(stop, self._listing.first()):
-            return
+        healthy = stalled(self._measures, self._options.resync)
+        async with pages(self._options.metrics_port, self._measures, healthy, lambda: self._lacks(watching)):
+            if await _until(stop, self._listing.first()):
+                await self._work(watching, stop)
+
+    def _lacks(self, watching: asyncio.Event) -> str | None:
+        if not watching.is_set():
+            return "not everything is listed and watched yet"
+        return None if self._world.healthy.reached else "the API server does not answer"
+
+    async def _work(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         tasks = [
             asyncio.create_task(self._watch(watching), name="watches"),
             asyncio.create_task(self._instances.run(), name="instances"),

@@ -9,12 +9,16 @@ from dataclasses import dataclass
 
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core.claims import Refused
+from application_manager.core.conditions import changed, holds
 from application_manager.core.demand import Standing, Verdict
 from application_manager.core.status import Service, difference, finished_since, task_status
+from application_manager.measures import Measures
 from application_manager.recorder import Recorder
 from application_manager.store import Name
 from application_manager.world import World
+from wayside.api import ApplicationTask
 from wayside.api.applicationtask import ApplicationTaskStatus
+from wayside.times import parse_seconds
 
 _OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, whose Events tell of them
 
@@ -31,6 +35,7 @@ class TaskWork:
         ttl: seconds that a finished task is kept.
         again: asks for a task at a time, in seconds since 1970.
         observe: takes an object that was read.
+        measures: told of refusals, and of the times from event to service.
     """
 
     world: World
@@ -41,6 +46,7 @@ class TaskWork:
     ttl: float
     again: Callable[[Name, float], None]
     observe: Callable[[Object], None]
+    measures: Measures
 
     async def reconcile(self, name: Name) -> None:
         """Write the task's status if it is news; delete the task when its time has come.
@@ -64,12 +70,27 @@ class TaskWork:
                 self.observe(await self.client.patch_status(self.tasks, name[0], name[1], uid, patch))
                 own = [each for each in new.conditions if each.type in _OWN_CONDITIONS]
                 self.recorder.transitions(task, old.conditions, own, now)
+                self._measure(task, old, new, now)
             if verdict.standing is Standing.FINISHED:
                 await self._expire(name)
         except ApiError as error:
             if error.terminating or error.code == 404:  # the task or its namespace is gone
                 return
             raise
+
+    def _measure(
+        self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus, now: float
+    ) -> None:
+        """Tell what became of the task, once for each news of it."""
+        for each in changed(old.conditions, new.conditions):
+            if each.type == "Accepted" and each.status == "False":
+                self.measures.refused(each.reason)
+            elif each.status == "True" and task.spec.event is not None and not holds(old.conditions, each.type):
+                since_start = now - parse_seconds(task.spec.event.start_time)
+                if each.type == "Applied":
+                    self.measures.applied(since_start)
+                elif each.type == "Ready":
+                    self.measures.ready(since_start)
 
     async def _has_template(self, namespace: str, template: str) -> bool:
         found = await self.client.get(self.templates, namespace, template)

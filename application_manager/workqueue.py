@@ -16,6 +16,7 @@ from collections.abc import Awaitable, Callable, Hashable
 from typing import Any, Generic, TypeVar
 
 from application_manager.client import ApiError, Unreachable
+from application_manager.measures import Measures
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -39,8 +40,10 @@ class WorkQueue(Generic[Key]):
         work: Callable[[Key], Awaitable[None]],
         concurrency: int,
         after: WorkQueue[Any] | None = None,
+        measures: Measures | None = None,
     ) -> None:
         self.name = name
+        self._measures = measures or Measures()
         self._after = after
         self._work = work
         self._concurrency = concurrency
@@ -51,6 +54,11 @@ class WorkQueue(Generic[Key]):
         self._failures: dict[Key, int] = {}
         self._timers: dict[Key, asyncio.TimerHandle] = {}
         self._wake = asyncio.Event()
+
+    @property
+    def depth(self) -> tuple[int, int]:
+        """How many keys wait for a worker, and how many for their time."""
+        return len(self._waiting), len(self._timers)
 
     @property
     def busy(self) -> bool:
@@ -118,6 +126,7 @@ class WorkQueue(Generic[Key]):
             await asyncio.sleep(_TURN)
 
     async def _once(self, key: Key) -> None:
+        began, failed = time.monotonic(), True
         try:
             await self._work(key)
         except (ApiError, Unreachable) as error:
@@ -129,7 +138,9 @@ class WorkQueue(Generic[Key]):
             log.exception("%s %s failed; again in %.1f s", self.name, _text(key), pause)
             self._add_after(key, pause)
         else:
+            failed = False
             self._failures.pop(key, None)
+        self._measures.reconciled(self.name, time.monotonic() - began, failed=failed)
 
     def _pause(self, key: Key, asked: float | None) -> float:
         failures = self._failures.get(key, 0)

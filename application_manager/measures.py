@@ -1,0 +1,93 @@
+"""What the manager counts and times of itself, as Prometheus metrics. docs/manager.md describes each.
+
+Labels are queues, reasons, phases and codes, never names of objects: there may be too many.
+"""
+
+from __future__ import annotations
+
+import time
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
+
+PREFIX = "wayside_manager_"
+NO_ANSWER = "none"
+"""The code of a request that the API server did not answer."""
+
+_SERVICE = (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60, 120, 300, 600)  # s from an event to what follows
+_WORK = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 15)  # s of a request or a reconciliation
+
+
+class Measures:
+    """The counters and histograms; one of them for a manager, and only its event loop's thread writes them.
+
+    Attributes:
+        registry: where collectors that look at the world are registered as well.
+        looked: when the last resync ended, well or not, on the monotonic clock; the start before that.
+    """
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry(auto_describe=False)
+        self.looked = time.monotonic()
+        self._applied = self._histogram(
+            "event_to_applied_seconds", "From an event's start to its task's Applied", _SERVICE
+        )
+        self._ready = self._histogram("event_to_ready_seconds", "From an event's start to its task's Ready", _SERVICE)
+        self._reconciled = self._histogram("reconcile_seconds", "Time that reconciling one object took", _WORK, "queue")
+        self._failures = self._counter("reconcile_failures", "Reconciliations that failed and are tried again", "queue")
+        self._refusals = self._counter("refusals", "Tasks that were refused, or became so for another reason", "reason")
+        self._requests = self._histogram("api_request_seconds", "Time to the API server's answer", _WORK, "method")
+        self._errors = self._counter("api_errors", "Requests that the API server refused or did not answer", "code")
+        self._events = self._counter("kubernetes_events", "Kubernetes Events that were posted", "reason")
+        self._unposted = self._counter("kubernetes_events_dropped", "Kubernetes Events that were not posted", "cause")
+        self._resynced = Gauge(
+            f"{PREFIX}resync_time_seconds", "When everything was last listed anew, since 1970", registry=self.registry
+        )
+        ProcessCollector(registry=self.registry)
+
+    def text(self) -> bytes:
+        """What a scrape gets, in Prometheus' text format."""
+        return generate_latest(self.registry)
+
+    def applied(self, seconds: float) -> None:
+        """A task was applied so many seconds after its event started, by the detector's clock."""
+        self._applied.observe(max(0.0, seconds))
+
+    def ready(self, seconds: float) -> None:
+        """A task was ready so many seconds after its event started, by the detector's clock."""
+        self._ready.observe(max(0.0, seconds))
+
+    def refused(self, reason: str) -> None:
+        """A task was refused."""
+        self._refusals.labels(reason).inc()
+
+    def reconciled(self, queue: str, seconds: float, *, failed: bool) -> None:
+        """A queue's work on one key ended."""
+        self._reconciled.labels(queue).observe(seconds)
+        if failed:
+            self._failures.labels(queue).inc()
+
+    def asked(self, method: str, seconds: float, code: str) -> None:
+        """The API server answered with an HTTP status, or NO_ANSWER."""
+        self._requests.labels(method).observe(seconds)
+        if not code.startswith(("2", "3")):
+            self._errors.labels(code).inc()
+
+    def posted(self, reason: str) -> None:
+        """A Kubernetes Event was posted."""
+        self._events.labels(reason).inc()
+
+    def unposted(self, cause: str) -> None:
+        """A Kubernetes Event was not posted: `full`, `limited` or `failed`."""
+        self._unposted.labels(cause).inc()
+
+    def resynced(self, *, well: bool) -> None:
+        """A resync ended."""
+        self.looked = time.monotonic()
+        if well:
+            self._resynced.set(time.time())
+
+    def _histogram(self, name: str, text: str, buckets: tuple[float, ...], *labels: str) -> Histogram:
+        return Histogram(f"{PREFIX}{name}", text, labels, buckets=buckets, registry=self.registry)
+
+    def _counter(self, name: str, text: str, *labels: str) -> Counter:
+        return Counter(f"{PREFIX}{name}", text, labels, registry=self.registry)

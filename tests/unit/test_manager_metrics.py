@@ -1,0 +1,156 @@
+"""What the manager counts of itself is scraped as Prometheus metrics, each of which the guide describes."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from application_manager.client import ApiError
+from application_manager.connection import ConfigurationError
+from application_manager.core.limiting import BURST, REFILL, Allowance
+from application_manager.core.policy import Policy
+from application_manager.measures import PREFIX, Measures
+from application_manager.overview import Overview
+from application_manager.pages import STALLED_AFTER, pages, stalled
+from application_manager.recorder import Reason
+from application_manager.workqueue import WorkQueue
+from application_manager.world import World
+from tests.unit.manager_objects import instance, task, template
+
+GUIDE = Path("docs/manager.md").read_text()
+
+
+def raw(model: Any, version: int = 1, **status: Any) -> dict[str, Any]:
+    made: dict[str, Any] = model.to_json()
+    made["metadata"] |= {"uid": f"uid-{made['kind']}-{model.name}", "resourceVersion": str(version)}
+    return made | ({"status": status} if status else {})
+
+
+def samples(measures: Measures) -> dict[tuple[str, ...], float]:
+    """By name without prefix and the values of the labels in order of their names."""
+    return {
+        (sample.name.removeprefix(PREFIX), *(sample.labels[key] for key in sorted(sample.labels))): sample.value
+        for family in text_string_to_metric_families(measures.text().decode())
+        for sample in family.samples
+    }
+
+
+def test_tasks_instances_and_templates_are_counted_by_what_they_are() -> None:
+    world, measures = World(Policy()), Measures()
+    measures.registry.register(Overview(world, lambda: [("task", 3, 1)]))
+    world.store.put(raw(task("a"), phase="Ready"))
+    world.store.put(raw(task("b"), phase="Ready"))
+    world.store.put(raw(task("c")))
+    world.store.put(raw(instance(), phase="Lingering"))
+    accepted = {
+        "type": "Accepted",
+        "status": "True",
+        "reason": "Accepted",
+        "lastTransitionTime": "2026-01-01T00:00:00Z",
+    }
+    world.store.put(raw(template(), conditions=[accepted]))
+    found = samples(measures)
+    assert (found["tasks", "Ready"], found["tasks", "None"], found["tasks", "Refused"]) == (2, 1, 0)
+    assert (found["instances", "Lingering"], found["templates", "True"]) == (1, 1)
+    assert (found["queue_depth", "task"], found["queue_later", "task"]) == (3, 1)
+    assert found["api_reached",] == 0
+
+
+def test_requests_events_and_times_are_counted() -> None:
+    measures = Measures()
+    measures.asked("GET", 0.03, "200")
+    measures.asked("PATCH", 0.03, "409")
+    measures.applied(0.3)
+    measures.ready(-5)  # the detector's clock is ahead of ours
+    measures.refused("Conflict")
+    found = samples(measures)
+    assert found["api_request_seconds_count", "GET"] == 1
+    assert found["api_errors_total", "409"] == 1
+    assert ("api_errors_total", "200") not in found
+    assert (found["event_to_applied_seconds_bucket", "0.2"], found["event_to_applied_seconds_bucket", "0.5"]) == (0, 1)
+    assert found["event_to_ready_seconds_bucket", "0.05"] == 1
+    assert found["refusals_total", "Conflict"] == 1
+
+
+def test_a_queue_tells_how_long_its_work_took_and_what_failed() -> None:
+    measures, failures = Measures(), [ApiError(503, "busy")]
+
+    async def scenario() -> None:
+        finished = asyncio.Event()
+
+        async def work(key: str) -> None:
+            if failures:
+                raise failures.pop()
+            if key == "a":
+                queue.add("b")
+            else:
+                finished.set()
+
+        queue = WorkQueue("task", work, 1, measures=measures)
+        queue.add("a")
+        running = asyncio.create_task(queue.run())
+        async with asyncio.timeout(60):
+            await finished.wait()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(scenario())
+    found = samples(measures)
+    assert found["reconcile_failures_total", "task"] == 1
+    assert found["reconcile_seconds_count", "task"] >= 2
+
+
+def test_pages_are_served_and_what_is_lacking_is_503() -> None:
+    async def scenario() -> None:
+        lacks: list[str] = ["not yet"]
+        measures = Measures()
+        async with pages(0, measures, stalled(measures, 60), lambda: lacks[0] if lacks else None) as port:
+            async with aiohttp.ClientSession() as session:
+
+                async def get(path: str) -> tuple[int, str]:
+                    async with session.get(f"http://127.0.0.1:{port}{path}") as answer:
+                        return answer.status, await answer.text()
+
+                assert f"{PREFIX}api_request_seconds" in (await get("/metrics"))[1]
+                assert await get("/healthz") == (200, "ok\n")
+                assert await get("/readyz") == (503, "not yet\n")
+                lacks.clear()
+                assert await get("/readyz") == (200, "ok\n")
+                measures.looked -= STALLED_AFTER + 1
+                status, text = await get("/healthz")
+                assert (status, text.startswith("no resync has ended for 30")) == (503, True)
+            with pytest.raises(ConfigurationError, match=rf"--metrics-port {port}: .*: give another port"):
+                async with pages(port, measures, lambda: None, lambda: None):
+                    pass
+
+    asyncio.run(scenario())
+
+
+def test_an_object_that_changes_all_the_time_is_told_of_now_and_then() -> None:
+    allowance = Allowance()
+    assert [allowance.takes("a", 0.0) for _ in range(BURST + 2)] == [True] * BURST + [False] * 2
+    assert allowance.takes("b", 0.0)
+    assert not allowance.takes("a", REFILL - 1)
+    assert allowance.takes("a", REFILL + 1)
+    assert not allowance.takes("a", REFILL + 2)
+
+
+def test_the_guide_describes_every_metric() -> None:
+    measures = Measures()
+    measures.registry.register(Overview(World(Policy()), list))
+    names = {each.name + ("_total" if each.type == "counter" else "") for each in measures.registry.collect()}
+    own = {each.removeprefix(PREFIX) for each in names if each.startswith(PREFIX)}
+    assert len(own) > 12
+    assert {each for each in own if f"`{each}`" not in GUIDE} == set()
+    described = set(re.findall(r"^\| `([a-z_]+)` \|", GUIDE[GUIDE.index("## Metrics") :], re.MULTILINE))
+    assert described - own == set()
+
+
+def test_the_guide_lists_every_reason_of_an_event() -> None:
+    assert {each.value for each in Reason if f"`{each.value}`" not in GUIDE} == set()
