@@ -161,7 +161,7 @@ class Trigger(Action[api.Trigger]):
         if self.parameters.detector is not None:
             return OtherDetector(self.parameters, self.setting.messenger)
         if self.parameters.http is not None:
-            return HttpEndpoint(self.parameters)
+            return HttpEndpoint(self.parameters, self.setting.closing)
         return Ros2Services(self.parameters, self.setting.messenger, lambda: self.setting.surroundings().types)
 
     def _make_journal(self) -> Journal | None:
@@ -199,7 +199,7 @@ class Trigger(Action[api.Trigger]):
         place = self._system.place(order)
         try:
             report = self._asked(course, step, begin)
-        except ActionError as error:
+        except (ActionError, ValueError) as error:
             now = time.monotonic()
             times = self._silent.get(place, (0, 0.0))[0] + 1
             self._silent[place] = times, now + _SILENCES[min(times, len(_SILENCES)) - 1]

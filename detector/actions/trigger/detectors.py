@@ -7,10 +7,12 @@ import re
 from detector.actions.base import ActionError, Messenger
 from detector.actions.trigger.orders import Order, Report, member
 from detector.actions.trigger.requests import (
+    MAXIMUM_CLIENTS,
     RECORDINGS,
     RecordingRequest,
     duration,
     read_report,
+    short,
     write_request,
 )
 from detector.streams.answering import status_key
@@ -51,6 +53,8 @@ class OtherDetector:
         clients = None
         if wanted.clients is WindowClients.SUBJECTS and subjects:
             clients = sorted({*subjects, *wanted.with_clients})
+            if len(clients) > MAXIMUM_CLIENTS:
+                clients = None
         request = RecordingRequest(
             do="start",
             id=order.id,
@@ -59,7 +63,7 @@ class OtherDetector:
             before=Duration("0s") if again else wanted.before,
             ago=Duration("0s") if again else duration(ago),
             maximum_duration=self._maximum,
-            event=dict(order.event),
+            event=short(order.event),
         )
         return self._ask(order, request)
 

@@ -7,6 +7,7 @@ good is not sent again, and a stop of what is not there (404, 410) is as good as
 from __future__ import annotations
 
 import json
+import threading
 import time
 
 from yarl import URL
@@ -27,11 +28,13 @@ class HttpEndpoint:
     renew: float | None = None
     ends_by_itself = False
 
-    def __init__(self, parameters: Trigger) -> None:
+    def __init__(self, parameters: Trigger, closing: threading.Event) -> None:
+        """Once `closing` is set, a request that is under way is given up; a further one may take its time."""
         assert parameters.http is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.http
         self._maximum = parameters.maximum_duration
         self.timeout = parameters.http.timeout.seconds
+        self._closing = closing
         self._client = HttpClient(parameters.http, "trigger.http")
         self._unanswered: set[str] = set()
         """The recordings whose start went out and was not answered."""
@@ -76,10 +79,14 @@ class HttpEndpoint:
             body = {"id": order.id, "do": name, "maximumDuration": str(self._maximum), "event": order.event}
         headers = {"Content-Type": "application/json", "Idempotency-Key": f"{order.id}.{name}"}
         url = call.url.replace("{id}", encode(order.id))
-        end = time.monotonic() + self.timeout
+        end, closing = time.monotonic() + self.timeout, self._closing.is_set()
+
+        def give_up() -> bool:
+            return time.monotonic() >= end or self._closing.is_set() is not closing
+
         try:
             text = json.dumps(body, separators=(",", ":"), allow_nan=False).encode()
-            answer = self._client.send(call.method.value, url, headers, text, give_up=lambda: time.monotonic() >= end)
+            answer = self._client.send(call.method.value, url, headers, text, give_up=give_up)
         except (HttpError, ValueError) as error:
             raise ActionError(str(error)) from error
         verdict, told = judge(answer)

@@ -6,6 +6,7 @@ of all recordings.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -21,6 +22,9 @@ RECORDINGS = "recordings"
 MAXIMUM_BYTES = 65_536
 """Of a request."""
 
+MAXIMUM_CLIENTS = 256
+"""Of a request. Who means more means all."""
+
 RecordingId = Annotated[str, Field(min_length=1, max_length=512, pattern=r"^[A-Za-z0-9_.:~+%-]+$")]
 
 
@@ -32,7 +36,7 @@ class RecordingRequest(Model):
     """Whoever asks chooses it. What is asked twice under it is done once."""
     streams: list[ObjectName] | None = Field(default=None, max_length=128)
     """Start: default: all that the detector records on request."""
-    clients: list[ClientName] | None = Field(default=None, max_length=256)
+    clients: list[ClientName] | None = Field(default=None, max_length=MAXIMUM_CLIENTS)
     """Start: default: all."""
     before: Duration = Duration("0s")
     """Start: from so long before `ago`."""
@@ -67,6 +71,17 @@ class RecordingReport(msgspec.Struct, frozen=True, rename="camel"):
 def duration(seconds: float) -> Duration:
     """The duration to the millisecond, as requests write it."""
     return Duration(f"{min(max(0, round(seconds * 1000)), 999_999_999)}ms")
+
+
+def short(event: Mapping[str, Any]) -> dict[str, Any]:
+    """The event as a request carries it: without its values where they make it too long, as a fleet's may."""
+    if len(msgspec.json.encode(event)) <= MAXIMUM_BYTES // 2:
+        return dict(event)
+    told: dict[str, Any] = {key: value for key, value in event.items() if key != "data"}
+    data = event.get("data")
+    if isinstance(data, Mapping):
+        told["data"] = {key: value for key, value in data.items() if key not in ("values", "subjects")}
+    return told
 
 
 def read_request(payload: bytes) -> RecordingRequest:

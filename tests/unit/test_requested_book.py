@@ -1,0 +1,102 @@
+"""What is known of recordings that others asked for: nothing is done twice, and everything has a bound."""
+
+from __future__ import annotations
+
+import msgspec
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detector.actions.episode import Outcome, OutcomeState
+from detector.actions.trigger.orders import Progress
+from detector.actions.trigger.requests import MAXIMUM_BYTES, RecordingRequest, read_request, short, write_request
+from detector.requested.book import Book
+from wayside.api.base import Duration, PositiveDuration
+from wayside.api.recordings import OnRequest
+
+STREAMS = ["camera", "points"]
+SECOND = 10**9
+NOW = 1_700_000_000 * SECOND
+
+
+def start(identity: str, **fields: object) -> RecordingRequest:
+    return RecordingRequest.model_validate({"do": "start", "id": identity, **fields})
+
+
+def stop(identity: str, **fields: object) -> RecordingRequest:
+    return RecordingRequest.model_validate({"do": "stop", "id": identity, **fields})
+
+
+def test_times_are_relative_to_ones_own_clock() -> None:
+    _, entry = Book().start(start("x", before="5s", ago="2s", maximumDuration="1m"), OnRequest(), STREAMS, NOW)
+    assert entry is not None
+    assert (entry.since, entry.until) == (NOW - 7 * SECOND, NOW + 60 * SECOND)
+
+
+def test_a_request_gets_no_more_time_than_is_allowed() -> None:
+    allowed = OnRequest(maximum_duration=PositiveDuration("10s"))
+    _, entry = Book().start(start("x", maximumDuration="1h"), allowed, STREAMS, NOW)
+    assert entry is not None
+    assert entry.until == NOW + 10 * SECOND
+
+
+def test_a_stop_counts_from_the_end_of_its_cause_and_never_prolongs() -> None:
+    for fields, until in (
+        ({"ago": "1s", "after": "3s"}, 2),
+        ({"ago": "9s"}, -9),
+        ({"after": "1h"}, 60),
+        ({"ago": "1h"}, -10),
+    ):
+        book = Book()
+        book.start(start("x", before="10s", maximumDuration="1m"), OnRequest(), STREAMS, NOW)
+        report, entry = book.stop(stop("x", **fields), NOW)
+        assert entry is not None
+        assert entry.until == NOW + until * SECOND
+        assert report.state is Progress.ENDING
+        assert book.stop(stop("x"), NOW) == (report, None)
+
+
+@given(st.lists(st.tuples(st.sampled_from(["start", "stop", "done", "failed", "running"]), st.integers(0, 4))))
+def test_an_id_is_begun_once_and_never_more_at_a_time_than_are_allowed(happenings: list[tuple[str, int]]) -> None:
+    book, allowed, open_ones, begun = Book(), OnRequest(maximum_recordings=2), set[str](), set[str]()
+    for what, number in happenings:
+        identity = f"x{number}"
+        if what == "start":
+            report, entry = book.start(start(identity), allowed, STREAMS, NOW)
+            if entry is not None:
+                assert identity not in begun
+                open_ones.add(identity)
+                begun.add(identity)
+            if identity in open_ones:
+                assert report.state in (Progress.RECORDING, Progress.ENDING)
+        elif what == "stop":
+            report, _ = book.stop(stop(identity), NOW)
+            begun.add(identity)  # it can no longer be
+            assert report.state is not Progress.RECORDING
+        else:
+            book.heard(identity, Outcome(OutcomeState(what.capitalize())))
+            if what != "running":
+                open_ones.discard(identity)
+        assert len(open_ones) <= 2
+        states = {report.id: report.state for report in msgspec.convert(book.status(None), list)}
+        assert all(states[each] in (Progress.RECORDING, Progress.ENDING) for each in open_ones)
+
+
+def test_what_is_over_is_forgotten_at_last() -> None:
+    book = Book()
+    for number in range(3000):
+        book.start(start(f"x{number}"), OnRequest(), STREAMS, NOW)
+        book.heard(f"x{number}", Outcome(OutcomeState.DONE))
+        book.stop(stop(f"y{number}"), NOW)
+    known = book.status(None)
+    assert isinstance(known, list)
+    assert len(known) <= 1000
+    assert book.status("x0") == msgspec.structs.replace(book.status("x1"), id="x0")  # type: ignore[arg-type]
+
+
+def test_the_event_of_a_large_fleet_fits_into_a_request() -> None:
+    event = {"id": "e", "data": {"rule": "r", "values": {"members": [{"client": f"car{n}"} for n in range(10_000)]}}}
+    request = RecordingRequest(do="start", id="x", event=short(event), before=Duration("1s"))
+    payload = write_request(request)
+    assert len(payload) < MAXIMUM_BYTES
+    assert read_request(payload).event == {"id": "e", "data": {"rule": "r"}}
+    assert short({"id": "e", "data": {"values": {"v": 1}}}) == {"id": "e", "data": {"values": {"v": 1}}}
