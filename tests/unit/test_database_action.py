@@ -85,6 +85,45 @@ def test_an_episode_becomes_a_scenario_with_each_sample_once(desk: MakeDesk, dat
     assert client["streams"] == ["speed"]
 
 
+def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(desk: MakeDesk, database: Any) -> None:
+    keep = desk(streams=[a_stream("speed"), a_stream("map", latched=True)], renew_after="3s")
+    episode = keep.begin()
+    said = EpisodeSample("car1", "map", "vehicles/car1/map", START - 10**12, START - 10**12, b'{"v": -1}')
+    later = said._replace(time=START + 7 * 10**9, received=START + 7 * 10**9, payload=b'{"v": -2}')
+    samples = speeds(1000)
+    for first in range(0, 1000, 130):
+        keep.take(episode, [*([] if first else [said]), *samples[first : first + 130]])
+        if first == 650:
+            keep.take(episode, [later])
+    keep.finish(episode)
+    outcome = keep.outcome()
+    assert outcome.state is OutcomeState.DONE, outcome
+    assert outcome.samples == 1000 + 5  # what was said on latched streams is in each
+    parts = {each["_id"]: each for each in database["Scenarios"].find()}
+    assert [each["complete"] for each in parts.values()] == [True] * 4
+    assert sorted(numbers(database, part) for part in parts) == [
+        list(range(300)),
+        list(range(300, 600)),
+        list(range(600, 900)),
+        list(range(900, 1000)),
+    ]
+    assert sorted(numbers(database, part, "json/map") for part in parts) == [[-2], [-1], [-1], [-1, -2]]
+
+
+def test_after_a_restart_a_renewed_episode_leaves_alone_what_was_complete(desk: MakeDesk, database: Any) -> None:
+    keep = desk(renew_after="3s")
+    episode = keep.begin()
+    keep.take(episode, speeds(500))
+    wait_until(lambda: scenario_or_none(database, "e1.keep").get("complete") is True)
+    resumed = keep.begin(resumed=True)
+    keep.take(resumed, speeds(500, first=600))
+    keep.finish(resumed)
+    assert keep.outcome().state is OutcomeState.FAILED
+    assert (scenario(database)["complete"], scenario(database)["state"]) == (True, "Complete")
+    states = sorted(each["state"] for each in database["Scenarios"].find())
+    assert states == ["Complete", "Complete", "Interrupted", "Open"]
+
+
 def test_overlapping_episodes_have_their_samples_each(desk: MakeDesk, database: Any) -> None:
     keep = desk()
     one, two = keep.begin("e1"), keep.begin("e2")

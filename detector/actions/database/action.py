@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import bson
 from detector.actions.base import Action, ActionError, Setting
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.documents import Documents, Made
+from detector.actions.database.episodes import Writing
 from detector.actions.database.folder import Folder, FolderError
 from detector.actions.database.scenario import Scenario
 from detector.actions.database.store import Store
@@ -40,16 +41,6 @@ class _Batch:
     bytes: int = 0
 
 
-@dataclass(slots=True)
-class _Work:
-    """One scenario that is being written."""
-
-    episode: Episode
-    scenario: Scenario
-    documents: Documents
-    undecoded: int = 0
-
-
 class Database(Action[DatabaseAction]):
     """Writes each episode as a scenario."""
 
@@ -60,7 +51,7 @@ class Database(Action[DatabaseAction]):
         self._place: Place | None = None
         self._store: Store | None = None
         self._folder: Folder | None = None
-        self._works: dict[str, _Work] = {}
+        self._writings: dict[str, Writing] = {}
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
         self._awake = False
@@ -69,35 +60,55 @@ class Database(Action[DatabaseAction]):
     def started(self, episode: Episode) -> None:
         """Make the scenario known in the database, as one that is not complete."""
         self._connect()
-        rule = self.setting.rule
-        name = scenarios.scenario_id(episode, self.setting.action)
-        database = self.parameters.database
-        scenario = Scenario(name, self.setting.holder, self.setting.action, database, rule, episode.resumed)
+        renew = self.parameters.renew_after
+        # What an earlier run wrote of the episode may be complete: with renewAfter this one gets a name of its own.
+        part = f"resumed-{time.time_ns()}" if episode.resumed and renew else ""
+        scenario, documents = self._open(episode, part, resumed=episode.resumed)
         if why := episode.unrendered.get("metadata"):
             scenario.lost[f"metadata: {why}"] += 1
+        streams = self.setting.surroundings().detector.spec.streams
+        latched = frozenset(stream.name for stream in streams if stream.latched)
+        self._writings[episode.id] = Writing(episode, scenario, documents, latched, renew.ns if renew else None)
+        self._report(episode, OutcomeState.RUNNING)
+
+    def _open(self, episode: Episode, part: str, *, resumed: bool) -> tuple[Scenario, Documents]:
+        rule, database = self.setting.rule, self.parameters.database
+        name = scenarios.scenario_id(episode, self.setting.action, part)
+        scenario = Scenario(name, self.setting.holder, self.setting.action, database, rule, resumed)
         around = self.setting.surroundings()
         above = None
         if around.detector.spec.database is not None and around.detector.spec.database.files is not None:
             above = (self.parameters.files or Attachments()).above.bytes
         streams = {stream.name: stream for stream in around.detector.spec.streams}
-        place = f"{database}/{rule.name}/{name}"
-        self._works[episode.id] = _Work(episode, scenario, Documents(name, place, streams, around.decoders, above))
         if self._store is not None:
             metadata: Mapping[str, JsonValue] = episode.rendered.get("metadata") or {}
             for write in scenarios.begin(scenario, episode, metadata):
                 self._store.put_change(write)
-        self._report(episode, OutcomeState.RUNNING)
+        return scenario, Documents(name, f"{database}/{rule.name}/{name}", streams, around.decoders, above)
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
         """Turn them into documents; those that are many enough are queued."""
-        work = self._works[episode.id]
+        writing = self._writings[episode.id]
+        while samples:
+            now, samples = writing.parted(samples)
+            self._take(writing, now)
+            if samples:
+                self._renew(writing, min(sample.time for sample in samples))
+
+    def _take(self, writing: Writing, samples: Iterable[EpisodeSample]) -> None:
         for sample in samples:
-            made = work.documents.make(sample)
-            work.scenario.saw(sample.client, sample.stream, sample.time)
-            work.undecoded += made.undecoded
+            made = writing.documents.make(sample)
+            writing.scenario.saw(sample.client, sample.stream, sample.time)
+            writing.undecoded += made.undecoded
             if made.cut:
-                self._lose(work.scenario, 1, f"too large: {made.cut}")
-            self._add(work.scenario, made)
+                self._lose(writing.scenario, 1, f"too large: {made.cut}")
+            self._add(writing.scenario, made)
+
+    def _renew(self, writing: Writing, begin: int) -> None:
+        """Complete the scenario; the episode goes on in another."""
+        self._finish(writing, Completion(), continues=True)
+        writing.go_on(*self._open(writing.episode, str(begin), resumed=False))
+        self._take(writing, list(writing.said.values()))
 
     def _add(self, scenario: Scenario, made: Made) -> None:
         document = made.document if not made.files else self._with_files(scenario, made)
@@ -148,33 +159,39 @@ class Database(Action[DatabaseAction]):
         write = Write(self.parameters.database, collection, batch.documents, losing=losing)
         if self._store.put(write, self.setting.closing):
             return
-        works = {work.scenario.id: work.scenario for work in self._works.values()}
+        open_ones = {each.scenario.id: each.scenario for each in self._writings.values()}
         why = "no room in the queue" if not self._store.away else "no room while the database is away"
         for name, count in batch.owners.items():
-            if name in works:  # else it failed meanwhile
-                self._lose(works[name], count, why)
+            if name in open_ones:  # else it failed meanwhile
+                self._lose(open_ones[name], count, why)
             else:
                 losing(count, why)
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """Queue what makes the scenario complete, or what says why it is not."""
+        writing = self._writings[episode.id]
+        writing.episode = episode
+        self._finish(writing, completion, continues=False)
+        del self._writings[episode.id]
+
+    def _finish(self, writing: Writing, completion: Completion, *, continues: bool) -> None:
         for collection in list(self._batches):
             self._flush(collection)
-        work = self._works.pop(episode.id)
-        scenario = work.scenario
-        incomplete = scenarios.why_incomplete(scenario, episode, completion)
-        if self._store is None:
-            state = OutcomeState.FAILED if incomplete else OutcomeState.DONE
-            self._report(episode, state, incomplete or "dryRun: nothing was written", work, completion)
-            return
+        scenario, episode = writing.scenario, writing.episode
+        incomplete = scenarios.why_incomplete(scenario, None if continues else episode, completion)
 
         def confirm(complete: bool, why: str) -> None:
-            message = incomplete or ("" if complete else why)
-            state = OutcomeState.FAILED if message else OutcomeState.DONE
-            self._report(episode, state, message, work, completion)
+            writing.trouble = writing.trouble or incomplete or ("" if complete else why)
+            if not continues:
+                state = OutcomeState.FAILED if writing.trouble else OutcomeState.DONE
+                said = writing.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
+                self._report(episode, state, said, writing, completion)
 
+        if self._store is None:
+            confirm(not incomplete, incomplete)
+            return
         detector = self.setting.surroundings().detector
-        for write in scenarios.finish(scenario, episode, completion, detector):
+        for write in scenarios.finish(scenario, episode, completion, detector, incomplete):
             self._store.put_change(write, confirm if write.completes else None)
 
     def wake(self) -> float | None:
@@ -200,8 +217,8 @@ class Database(Action[DatabaseAction]):
         away = self._store.away if self._store is not None else ""
         if bool(away) != self._told_away:
             self._told_away = bool(away)
-            for work in self._works.values():
-                self._report(work.episode, OutcomeState.RUNNING, away and f"the database is away: {away}")
+            for writing in self._writings.values():
+                self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is away: {away}")
 
     def close(self) -> None:
         """Let go of the queue; the last action that does waits for it, a few seconds."""
@@ -237,23 +254,26 @@ class Database(Action[DatabaseAction]):
         episode: Episode,
         state: OutcomeState,
         message: str = "",
-        work: _Work | None = None,
+        writing: Writing | None = None,
         completion: Completion | None = None,
     ) -> None:
-        work = work or self._works[episode.id]
-        scenario = work.scenario
+        writing = writing or self._writings[episode.id]
+        scenario = writing.scenario
+        messages = writing.messages + scenario.messages
+        files = writing.files + scenario.files
         details: dict[str, JsonValue] = {
             "database": scenario.database,
             "scenario": scenario.id,
-            "documents": dict(sorted(scenario.messages.items())),
-            "filesWritten": scenario.files,
+            "scenarios": writing.scenarios,
+            "documents": dict(sorted(messages.items())),
+            "filesWritten": files,
             "complete": state is OutcomeState.DONE and not self.parameters.dry_run,
         }
-        if work.undecoded:
-            details["undecoded"] = work.undecoded
+        if writing.undecoded:
+            details["undecoded"] = writing.undecoded
         if self._store is not None:
             details["waitingBytes"] = self._store.waiting
-        lost = sum(scenario.lost.values()) if completion is None else scenarios.missing(scenario, completion)
-        files = (str(self._folder.path / work.documents.place),) if scenario.files and self._folder else ()
-        samples = sum(scenario.messages.values())
-        self.setting.report(episode, Outcome(state, message, samples, scenario.bytes, lost, files, details))
+        lost = writing.lost + sum(scenario.lost.values()) + (0 if completion is None else completion.missing)
+        where = (str(self._folder.path / scenario.database / episode.rule),) if files and self._folder else ()
+        size = writing.bytes + scenario.bytes
+        self.setting.report(episode, Outcome(state, message, sum(messages.values()), size, lost, where, details))

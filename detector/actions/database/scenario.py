@@ -5,6 +5,7 @@ A scenario is complete only where `complete` is true. That is written last, once
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Mapping
@@ -24,9 +25,9 @@ SCENARIOS, TYPES, CLIENTS = "Scenarios", "ScenarioTypes", "ConnectedClients"
 OPEN, COMPLETE, INCOMPLETE, INTERRUPTED = "Open", "Complete", "Incomplete", "Interrupted"
 
 
-def scenario_id(episode: Episode, action: str) -> str:
-    """The same for the same episode and action, whichever process writes it."""
-    return f"{episode.id}.{action}"
+def scenario_id(episode: Episode, action: str, part: str = "") -> str:
+    """The same for the same episode, action and part, whichever process writes it."""
+    return f"{episode.id}.{action}{part and f'.{part}'}"
 
 
 @dataclass(slots=True)
@@ -56,8 +57,15 @@ class Scenario:
 
 
 def type_id(rule: EventRule) -> str:
-    """A version of a rule: its scenarios are of one type."""
-    return f"{rule.metadata.namespace}/{rule.name}@{rule.metadata.generation}"
+    """A version of a rule: its scenarios are of one type. A rule from a file has no generation: its text tells."""
+    version = str(rule.metadata.generation)
+    if not rule.metadata.generation:
+        version = hashlib.sha256(_text(rule).encode()).hexdigest()[:12]
+    return f"{rule.metadata.namespace}/{rule.name}@{version}"
+
+
+def _text(rule: EventRule) -> str:
+    return json.dumps(rule.spec.to_json(), ensure_ascii=False, sort_keys=True)
 
 
 def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue]) -> list[Write]:
@@ -69,7 +77,7 @@ def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue
         "generation": Int64(rule.metadata.generation),
         "description": rule.spec.description,
         "classification": None if rule.spec.classification is None else rule.spec.classification.to_json(),
-        "spec": json.dumps(rule.spec.to_json(), ensure_ascii=False),  # as text: its names may be none of MongoDB's
+        "spec": _text(rule),  # as text: its names may be none of MongoDB's
     }
     known = {
         "rule": rule.name,
@@ -106,8 +114,10 @@ def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
     return Write(database, SCENARIOS, changes=[change])
 
 
-def finish(scenario: Scenario, episode: Episode, completion: Completion, detector: Detector) -> list[Write]:
-    """Say all that is known in the end. The last request makes it complete, where nothing is missing."""
+def finish(
+    scenario: Scenario, episode: Episode, completion: Completion, detector: Detector, incomplete: str
+) -> list[Write]:
+    """Say all that is known in the end. The last request makes it complete, where it is not `incomplete`."""
     labels = {client.name: client.labels for client in detector.spec.clients}
     clients = [
         {
@@ -127,6 +137,8 @@ def finish(scenario: Scenario, episode: Episode, completion: Completion, detecto
         "endTime": None if episode.end_time is None else Int64(episode.end_time),
         "reason": episode.reason,
         "clients": sorted(scenario.clients),
+        "since": Int64(min((first for first, _, _ in scenario.clients.values()), default=0)),
+        "until": Int64(max((last for _, last, _ in scenario.clients.values()), default=0)),
         "messages": {name: Int64(count) for name, count in sorted(scenario.messages.items())},
         "bytes": Int64(scenario.bytes),
         "files": Int64(scenario.files),
@@ -136,7 +148,7 @@ def finish(scenario: Scenario, episode: Episode, completion: Completion, detecto
     }
     find = {"_id": scenario.id}
     writes = [Write(scenario.database, CLIENTS, changes=clients)] if clients else []
-    if why_incomplete(scenario, episode, completion):
+    if incomplete:
         state = INTERRUPTED if scenario.resumed else INCOMPLETE
         return [*writes, _change(scenario, SCENARIOS, find, {"$set": {**known, "state": state}}, scenario.id)]
     intact = {**find, "rejected": False, "state": {"$in": [OPEN, COMPLETE]}}
@@ -148,8 +160,8 @@ def finish(scenario: Scenario, episode: Episode, completion: Completion, detecto
     ]
 
 
-def why_incomplete(scenario: Scenario, episode: Episode, completion: Completion) -> str:
-    """Why not all of it is there; empty where it is."""
+def why_incomplete(scenario: Scenario, episode: Episode | None, completion: Completion) -> str:
+    """Why not all of it is there; empty where it is. Without the episode, another scenario follows."""
     reasons = [f"{count} lost: {reason}" for reason, count in sorted(scenario.lost.items())]
     if completion.missing:
         reasons.append(f"{completion.missing} lost: the samples came faster than they could be taken")
@@ -157,7 +169,7 @@ def why_incomplete(scenario: Scenario, episode: Episode, completion: Completion)
         reasons.append(completion.cut)
     if scenario.resumed:
         reasons.append("the beginning was seen by an earlier run of the detector")
-    if episode.end_time is None and not completion.cut:
+    if episode is not None and episode.end_time is None and not completion.cut:
         reasons.append("its end was not seen")
     return "; ".join(reasons)
 

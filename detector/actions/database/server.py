@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,11 +22,15 @@ from pymongo.errors import (
     DocumentTooLarge,
     NetworkTimeout,
     NotPrimaryError,
+    OperationFailure,
     PyMongoError,
     ServerSelectionTimeoutError,
 )
 
 from detector.actions.database.work import Write
+
+_log = logging.getLogger(__name__)
+logging.getLogger("pymongo").setLevel(logging.INFO)  # it would log every document
 
 _DUPLICATE = 11000
 _SECONDS = 10.0
@@ -153,7 +158,10 @@ class Server:
     def _insert(self, write: Write) -> tuple[int, list[Refused]]:
         collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]
         if (write.database, write.collection) not in self._indexed:
-            collection.create_index("scenario")  # what everybody asks for
+            try:
+                collection.create_index("scenario")  # what everybody asks for
+            except OperationFailure as error:  # it goes without
+                _log.warning("database: no index on %s: %s", write.collection, self._short(error))
             self._indexed.add((write.database, write.collection))
         collection.insert_many([RawBSONDocument(document) for document in write.documents], ordered=False)
         return len(write.documents), []

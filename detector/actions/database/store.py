@@ -106,11 +106,13 @@ class Store:
                     self._add(write, size)
                     return True
                 nowhere = self._away and (self._spool is None or self._stuck)
-                if nowhere or closing.is_set() or self._closing:
+                ending = closing.is_set() or self._closing
+                if nowhere or (ending and waited >= _PATIENCE):
                     return False
-                self._lock.wait(0.1)
-            waited += 1
-            if waited >= _PATIENCE:  # the server hangs on a request: make room without its thread
+                if not ending:
+                    self._lock.wait(0.1)
+            waited = _PATIENCE if ending else waited + 1
+            if waited >= _PATIENCE:  # the server hangs on a request, or there is no time: the disk makes room
                 self._spill()
 
     def put_change(self, write: Write, confirm: Confirm | None = None) -> None:

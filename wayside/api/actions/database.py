@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from wayside.api.actions.window import Window
-from wayside.api.base import Identifier, JsonValue, Model, PositiveQuantity
+from wayside.api.base import Identifier, JsonValue, Model, PositiveDuration, PositiveQuantity
 
 DatabaseName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9_-]+$")]
 """A name that MongoDB takes on every platform."""
@@ -33,6 +33,11 @@ class DatabaseAction(Window):
         max_length=64,
         description="Facts to keep with the scenario, such as who drove, with ${…} over the rule's variables at the "
         "start of the episode.",
+    )
+    renew_after: PositiveDuration | None = Field(
+        default=None,
+        description="After this time the scenario is completed, and the episode goes on in another: no sample is "
+        "missing or in both. For rules whose episodes never end. Default: one scenario for each episode.",
     )
     files: Attachments | None = Field(
         default=None,

@@ -1,0 +1,61 @@
+"""What of an episode is being written: its scenario, or with `renewAfter` one scenario after the other."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from detector.actions.database.documents import Documents
+from detector.actions.database.scenario import Scenario
+from detector.actions.episode import Episode, EpisodeSample
+
+
+@dataclass(slots=True)
+class Writing:
+    """An episode's present scenario, and what became of those before."""
+
+    episode: Episode
+    scenario: Scenario
+    documents: Documents
+    latched: frozenset[str]
+    """The streams of which each scenario gets what was said last."""
+    renew_after: int | None
+    """Nanoseconds."""
+    seam: int | None = None
+    """From here on samples belong to the next scenario; None where nothing tells yet."""
+    said: dict[tuple[str, str, str], EpisodeSample] = field(default_factory=dict)
+    """The newest samples of latched streams."""
+    trouble: str = ""
+    """Why a scenario before is not complete, the first time."""
+    undecoded: int = 0
+    scenarios: int = 1
+    messages: Counter[str] = field(default_factory=Counter)
+    """Of the scenarios before, as are bytes, files and lost."""
+    bytes: int = 0
+    files: int = 0
+    lost: int = 0
+
+    def parted(self, samples: Sequence[EpisodeSample]) -> tuple[Sequence[EpisodeSample], Sequence[EpisodeSample]]:
+        """What belongs to the present scenario, and what to those after it."""
+        if self.renew_after is None:
+            return samples, ()
+        own = [sample.time for sample in samples if sample.stream not in self.latched]
+        if self.seam is None and own:
+            self.seam = min(own) + self.renew_after
+        seam = self.seam
+        now = [sample for sample in samples if seam is None or sample.time < seam]
+        rest = [sample for sample in samples if seam is not None and sample.time >= seam]
+        for sample in now:
+            if sample.stream in self.latched:
+                self.said[sample.client, sample.stream, sample.key] = sample
+        return now, rest
+
+    def go_on(self, scenario: Scenario, documents: Documents) -> None:
+        """The present scenario has all its samples: this is the next."""
+        self.messages += self.scenario.messages
+        self.bytes += self.scenario.bytes
+        self.files += self.scenario.files
+        self.lost += sum(self.scenario.lost.values())
+        self.scenarios += 1
+        self.scenario, self.documents, self.seam = scenario, documents, None
