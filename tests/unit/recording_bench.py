@@ -34,13 +34,14 @@ class Bench:
 
     def __init__(self, path: Path, *streams: dict[str, Any], rule: str = "r", **parameters: Any) -> None:
         self.detector = recording_detector(path, *streams)
+        self._known: Surroundings | None = None
         self.reports: list[tuple[str, Outcome]] = []
         self.lost: list[tuple[str, int, str]] = []
         setting = Setting(
             rule=a_rule(rule, when="true"),
             action="bag",
             holder="h",
-            surroundings=lambda: surroundings(self.detector),
+            surroundings=self._surroundings,
             messenger=_Silent(),
             report=lambda episode, outcome: self.reports.append((episode.id, outcome)),
             lose=lambda what, count, why: self.lost.append((what, count, why)),
@@ -48,10 +49,16 @@ class Bench:
         )
         self.action = Record(Parameters.model_validate(parameters), setting)
         self.path = path
+        self._streams = streams
+
+    def _surroundings(self) -> Surroundings:
+        if self._known is None or self._known.detector is not self.detector:
+            self._known = surroundings(self.detector)
+        return self._known
 
     def limit(self, **recordings: Any) -> None:
         """The Detector's limits change."""
-        self.detector = recording_detector(self.path, **recordings)
+        self.detector = recording_detector(self.path, *self._streams, **recordings)
 
     def record(self, episode: Episode, samples: Sequence[EpisodeSample], completion: Completion | None = None) -> Path:
         """A whole episode; gives the folder."""
