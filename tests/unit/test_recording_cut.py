@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import shutil
@@ -11,7 +12,10 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -19,9 +23,15 @@ from hypothesis import strategies as st
 
 from detector.actions.base import ActionError
 from detector.actions.episode import Completion, OutcomeState
+from detector.actions.outcomes import Outcomes, Which
 from detector.actions.record.destination import Destination
 from detector.actions.record.recovery import recover
 from detector.actions.record.salvage import contents_of, salvage
+from detector.actions.worker import Worker
+from detector.engine.consequences.consequences import Begun, Completed, Run, Sampled
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.rendering import Rendered
+from tests.unit.driving import at
 from tests.unit.recording_bench import (
     Bench,
     a_sample,
@@ -255,3 +265,40 @@ def test_a_sample_waits_no_longer_than_a_second(tmp_path: Path) -> None:
         assert bench.action.wake() is not None
     assert not bench.action._open["episode1"].series.waiting
     bench.action.close()
+
+
+def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, write = threading.Event(), os.pwritev
+
+    def slowly(*arguments: Any) -> int:
+        go_on.wait(60)
+        return write(*arguments)
+
+    monkeypatch.setattr("os.pwritev", slowly)
+    bench = Bench(tmp_path)
+    published: list[dict[str, Any]] = []
+    outcomes = Outcomes("h", lambda key, payload, encoding: published.append(json.loads(payload)), lambda: at(0))
+    which = Which("r", "bag")
+    outcomes.know(which, "record")
+    bench.action.setting = replace(bench.action.setting, report=partial(outcomes.report, which))
+    worker = Worker(which, lambda: bench.action, outcomes, maximum_bytes=5_500_000)
+    run = Run("r", "bag", "episode1")
+    begun = Event("h", "r", "car1", ("car1",), "episode1", at(1), at(1), None, None, {}, None)
+    points = [a_sample(1 + k / 10, "points", MEGABYTE) for k in range(8)]
+    begin = time.monotonic()
+    worker.tell(Begun(run, begun, Rendered(), resumed=False))
+    for sample in points:
+        worker.tell(Sampled(run, [sample]))
+    worker.tell(Completed(run))
+    assert time.monotonic() - begin < 5
+    go_on.set()
+    worker.tell_to_close()
+    assert worker.join(60)
+    tally = outcomes.tallies()[which]
+    assert (tally.failed, tally.samples, tally.missing) == (1, 5, 3)
+    (folder,) = (tmp_path / "r").iterdir()
+    assert folder.name.endswith("_cut")
+    assert read_with_mcap(mcap_files(folder)[0]) == list(map(as_recorded, points[:5]))
+    assert published[-1]["data"]["message"] == "3 samples of the window are missing"

@@ -85,6 +85,13 @@ def test_a_rule_that_records_needs_to_know_where(tmp_path: Path) -> None:
     assert problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", RULE) == []
 
 
+def test_what_is_wrong_with_metadata_is_found_at_its_place(tmp_path: Path) -> None:
+    rule = RULE.replace("{before: 5s}", "{metadata: {fine: '${speed}', wrong: '${sped}'}}")
+    (found,) = problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", rule)
+    assert found.startswith("20:52: spec.actions[0].record.metadata.wrong: ")
+    assert "sped" in found
+
+
 def test_a_window_that_reaches_further_back_than_the_buffer_is_refused(tmp_path: Path) -> None:
     rule = RULE.replace("5s", "50s")
     found = problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", rule)

@@ -77,8 +77,10 @@ class Action(Model):
     def templates(self) -> tuple[tuple[str, ...], Mapping[str, JsonValue]]:
         """What is rendered for each episode, by name, with ${…}; and the field of the action that they stand in.
 
-        A built-in action says by its attribute `templates` which of its fields these are.
+        A built-in action says by its attribute `templates` which of its fields these are, and by `templates_in` where
+        they are not its own but those of a field.
         """
         if self.plugin is not None:
             return ("plugin", "values"), self.plugin.values
-        return (self.field,), getattr(getattr(self, self.field), "templates", {})
+        chosen = getattr(self, self.field)
+        return (self.field, *getattr(chosen, "templates_in", ())), getattr(chosen, "templates", {})

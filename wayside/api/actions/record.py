@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -29,6 +29,8 @@ class Split(Model):
 
 class Record(Window):
     """Record the window as rosbag2 with MCAP files, in the Detector's `recordings` folder."""
+
+    templates_in: ClassVar[tuple[str, ...]] = ("metadata",)
 
     compression: Compression = Field(
         default=Compression.NONE, description="None, Lz4 (fast), or Zstd (smaller). Readers need not be told."
