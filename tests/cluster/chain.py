@@ -7,7 +7,6 @@ is open already keeps its demand. The template makes one Deployment for each pai
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import condition, start_manager, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until
+from tests.ports import free_endpoint
 from tests.unit.ros_messages import cdr, pose_stamped
 from wayside.api.zenoh import Zenoh, ZenohMode
 
@@ -110,7 +110,7 @@ class Chain:
         self.namespace = namespace
         self.processes = processes
         self.folder = folder
-        self.endpoint = _free_endpoint()
+        self.endpoint = free_endpoint()
         self.detector: Process | None = None
         self.manager: Process | None = None
 
@@ -285,9 +285,3 @@ def _live(task: Object) -> bool:
 def kind_of(event: Object) -> str:
     """`started`, or the reason for which the episode ended."""
     return "started" if event["type"].endswith(".started") else str(event["data"]["reason"])
-
-
-def _free_endpoint() -> str:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{found.getsockname()[1]}"

@@ -7,7 +7,6 @@ What exists over time is compared with what the simulated positions alone say sh
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 import threading
@@ -23,6 +22,7 @@ import yaml
 from tests.cluster.api import Api
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import PATIENCE, wait_until
+from tests.ports import free_endpoint
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))
@@ -84,12 +84,6 @@ def _vehicles(deployment: dict[str, Any]) -> tuple[str, ...]:
     """The pair that a recorder records, from its arguments."""
     arguments = deployment["spec"]["template"]["spec"]["containers"][0]["args"]
     return tuple(each.split("/")[1] for each in arguments if each.startswith("--key=vehicles/"))
-
-
-def free_endpoint() -> str:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{found.getsockname()[1]}"
 
 
 def apply_example(api: Api, namespace: str, endpoint: str) -> None:

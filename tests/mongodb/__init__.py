@@ -29,7 +29,7 @@ from rich.console import Console
 
 from tests.cluster.binaries import locked
 from tests.cluster.toolchain import GoUnavailableError, find_go
-from tests.unit.networks import free_port
+from tests.ports import free_port
 
 MODULE = Path(__file__).parent / "server"
 BUILD_FLAGS = ("-trimpath", "-buildvcs=false", "-ldflags", "-s -w")

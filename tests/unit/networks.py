@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 import zenoh
@@ -43,16 +42,6 @@ class Arrivals:
 
 def stream(name: str = "pose", key: str = "vehicles/${client:*}/pose", **fields: Any) -> Stream:
     return Stream(name=name, key=key, encoding=Encoding.JSON, **fields)
-
-
-def free_port() -> int:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def free_endpoint() -> str:
-    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @contextmanager

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import time
 import urllib.request
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +17,13 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from detector.status.model import Status, read_status
 from detector.streams.asking import NoAnswerError, ask
+from tests.ports import free_port
 from tests.unit.driving import a_detector
 from wayside.api import Kind
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 PATIENCE = 60.0
 """Seconds: a loaded machine takes long to start a process."""
-
-
-def free_port() -> int:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Process:

@@ -7,7 +7,6 @@ import itertools
 import queue
 import re
 import signal
-import socket
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -24,6 +23,7 @@ from rosbags.highlevel import AnyReader
 
 from application_manager.core.policy import Policy
 from application_manager.core.rendering import Renderer
+from tests.ports import free_endpoint
 from tests.unit.manager_objects import instance
 from tests.unit.networks import PATIENCE
 from wayside.api import ApplicationTemplate, Detector, EventRule, Kind
@@ -70,12 +70,6 @@ from cooperative_recording.vehicles import (  # noqa: E402
 )
 
 NUMBER = r"-?\d+(?:\.\d+)?"
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def listening(endpoint: str) -> zenoh.Session:

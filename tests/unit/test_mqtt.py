@@ -12,9 +12,10 @@ from paho.mqtt.client import Client
 from detector.sources.mqtt import topic_filter
 from detector.sources.supervision import SourceThread, State
 from detector.streams.tally import Cause, Tally
+from tests.ports import free_port
 from tests.unit.certificates import Authority
 from tests.unit.mqtt_broker import PASSWORD, broker, publisher
-from tests.unit.networks import PATIENCE, Arrivals, free_port, stream, wait_for
+from tests.unit.networks import PATIENCE, Arrivals, stream, wait_for
 from wayside.api.source import DataSource
 
 

@@ -21,9 +21,10 @@ from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
+from tests.ports import free_endpoint
 from tests.unit.certificates import Authority
 from tests.unit.driving import a_detector
-from tests.unit.networks import PATIENCE, Arrivals, free_endpoint, router, router_process, stream, wait_for
+from tests.unit.networks import PATIENCE, Arrivals, router, router_process, stream, wait_for
 from wayside.api.access import Access
 from wayside.api.zenoh import Zenoh, ZenohMode
 

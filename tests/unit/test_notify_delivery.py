@@ -15,8 +15,8 @@ from cloudevents.core.bindings.http import HTTPMessage, from_http_event
 
 from detector.actions import Completion, OutcomeState
 from detector.actions.notify import outbox
+from tests.ports import free_endpoint
 from tests.unit.http_servers import Behaviour, Endpoint, Received, answers, drips, endpoint, hangs, sends
-from tests.unit.networks import free_endpoint
 from tests.unit.notifying import a_desk, an_episode
 
 LOST = "events that nobody was told of"

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.networks import PATIENCE, free_port, wait_for
+from tests.ports import free_port
+from tests.unit.networks import PATIENCE, wait_for
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "source-plugin"

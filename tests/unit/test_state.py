@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -28,6 +27,7 @@ from detector.engine.episodes.subjects import Subject
 from detector.restoring import what_was_open
 from detector.state import StateFile, state_file
 from detector.streams.zenoh import open_session
+from tests.ports import free_endpoint
 from tests.unit.driving import Drive, a_deploy, a_detector, a_rule, arrival, at
 from wayside.api.zenoh import Zenoh, ZenohMode
 
@@ -267,9 +267,7 @@ def events_in(file: Path) -> list[str]:
 
 
 def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_same_to_the_byte(tmp_path: Path) -> None:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{found.getsockname()[1]}"
+    endpoint = free_endpoint()
     detector = a_detector(
         zenoh={"mode": "peer", "listen": [endpoint]}, state={"path": str(tmp_path / "state")}
     ).to_json()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -22,6 +20,7 @@ from detector.status.table import status_view
 from detector.streams.answering import Answering
 from detector.streams.asking import NoAnswerError, ask
 from detector.streams.zenoh import Network
+from tests.ports import free_endpoint
 from tests.unit.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.rules import RuleProblem
@@ -137,9 +136,7 @@ def test_what_is_asked_of_the_evaluation_is_done_on_its_thread_and_errors_are_th
 
 @pytest.fixture
 def endpoint() -> str:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 def an_answer(what: str, given: object, payload: bytes) -> bytes:

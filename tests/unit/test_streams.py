@@ -9,7 +9,8 @@ import pytest
 import zenoh
 
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
-from tests.unit.networks import PATIENCE, Arrivals, free_endpoint, stream, wait_for
+from tests.ports import free_endpoint
+from tests.unit.networks import PATIENCE, Arrivals, stream, wait_for
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 

@@ -23,8 +23,9 @@ from detector.actions.trigger.requests import (
 from detector.cli import app
 from detector.streams.answering import status_key
 from detector.streams.session import open_session
+from tests.ports import free_endpoint
 from tests.unit.driving import a_rule
-from tests.unit.networks import free_endpoint, router_process, wait_for
+from tests.unit.networks import router_process, wait_for
 from tests.unit.running import PATIENCE, Process
 from wayside.api import EventRule
 from wayside.api.base import Duration, PositiveDuration

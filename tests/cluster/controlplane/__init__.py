@@ -26,9 +26,9 @@ from tests.cluster.binaries import Binaries, ensure_binaries
 from tests.cluster.children import Child, remove_afterwards
 from tests.cluster.controlplane import commands
 from tests.cluster.controlplane.kubeconfig import new_token, write_kubeconfig
-from tests.cluster.controlplane.ports import free_ports
 from tests.cluster.crds import apply_crds
 from tests.cluster.waiting import PATIENCE, wait_until
+from tests.ports import free_ports
 
 READY_TIMEOUT = PATIENCE  # for each program; a loaded machine takes ten times the usual 2 s
 

@@ -22,3 +22,13 @@ def free_ports(count: int) -> list[int]:
         if len(found) == count:
             return found
     raise RuntimeError(f"no {count} free loopback ports between {CANDIDATES.start} and {CANDIDATES.stop}")
+
+
+def free_port() -> int:
+    """Return one such port."""
+    return free_ports(1)[0]
+
+
+def free_endpoint() -> str:
+    """Return a Zenoh endpoint on such a port."""
+    return f"tcp/127.0.0.1:{free_port()}"
