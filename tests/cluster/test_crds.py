@@ -221,15 +221,19 @@ class TestKubectl:
     @pytest.mark.parametrize(
         ("short", "manifest", "columns"),
         [
-            ("er", EVENT_RULE, ["NAME", "ENABLED", "ACCEPTED", "DETECTORS", "WHEN", "AGE"]),
-            ("det", DETECTOR, ["NAME", "CLOCK", "RULES", "ACCEPTED", "AGE"]),
-            ("apptpl", APPLICATION_TEMPLATE, ["NAME", "KEY", "INSTANCES", "ACCEPTED", "AGE"]),
+            ("er", EVENT_RULE, ["NAME", "ENABLED", "ACCEPTED", "DETECTORS", "WHEN", "AGE", "MESSAGE"]),
+            ("det", DETECTOR, ["NAME", "CLOCK", "RULES", "ACCEPTED", "AGE", "MESSAGE"]),
+            ("apptpl", APPLICATION_TEMPLATE, ["NAME", "KEY", "INSTANCES", "ACCEPTED", "AGE", "MESSAGE"]),
             (
                 "apptask",
                 APPLICATION_TASK,
-                ["NAME", "TEMPLATE", "RULE", "SUBJECT", "INSTANCE", "PHASE", "AGE"],
+                ["NAME", "TEMPLATE", "RULE", "SUBJECT", "INSTANCE", "PHASE", "AGE", "MESSAGE"],
             ),
-            ("appinst", APPLICATION_INSTANCE, ["NAME", "TEMPLATE", "KEY", "DEMANDS", "READY", "PHASE", "AGE"]),
+            (
+                "appinst",
+                APPLICATION_INSTANCE,
+                ["NAME", "TEMPLATE", "KEY", "DEMANDS", "READY", "PHASE", "AGE", "MESSAGE"],
+            ),
         ],
     )
     def test_get_by_short_name_prints_the_columns(
