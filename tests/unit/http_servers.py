@@ -59,6 +59,16 @@ def hangs(after: bytes = b"") -> Behaviour:
     return hang
 
 
+def holds(until: threading.Event, then: Behaviour) -> Behaviour:
+    """Nothing until the event is set, then that."""
+
+    def hold(endpoint: Endpoint, connection: socket.socket, request: Received) -> None:
+        assert until.wait(WAIT)
+        then(endpoint, connection, request)
+
+    return hold
+
+
 def drips(begin: bytes, drop: bytes = b"x", every: float = 0.02) -> Behaviour:
     """These bytes, then a drop time and again."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from detector.actions import Completion, OutcomeState
 from detector.actions.notify import alerts
-from tests.unit.http_servers import Endpoint, answers, endpoint, hangs
+from tests.unit.http_servers import Endpoint, answers, endpoint, hangs, holds
 from tests.unit.notifying import a_desk, an_episode
 from wayside.times import parse_time
 
@@ -38,10 +39,6 @@ def notify(there: Endpoint, repeat: str = "1h", **fields: Any) -> dict[str, Any]
 def posted(there: Endpoint, count: int = 1) -> list[dict[str, Any]]:
     """The alerts of so many requests."""
     return [alert for request in there.received(count) for alert in json.loads(request.body)]
-
-
-def fires(alert: dict[str, Any], request_time: int) -> bool:
-    return parse_time(alert["endsAt"]) > request_time
 
 
 def open_of(episode: Any) -> Any:
@@ -89,25 +86,28 @@ def test_an_alert_is_repeated_with_a_later_end_while_its_episode_lasts(there: En
 
 
 def test_many_alerts_share_a_request(there: Endpoint) -> None:
-    there.behaviour = hangs()
-    desk = a_desk({"alertmanager": {"url": there.url, "repeat": "1h", "timeout": "2s"}})
+    told = threading.Event()
+    there.behaviour = holds(told, answers(200))
+    desk = a_desk(notify(there))
     desk.action.started(open_of(an_episode("e0")))
     there.received(1)
-    there.behaviour = answers(200)
     for number in range(1, 50):
         desk.action.started(open_of(an_episode(f"e{number}", f"car{number}")))
+    told.set()
     desk.outcome("e49", OutcomeState.RUNNING)
-    assert len(posted(there, 2)) == 1 + 50
+    assert len(posted(there, 2)) == 1 + 49
     desk.end()
 
 
 def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(there: Endpoint) -> None:
-    there.behaviour = hangs()
-    desk = a_desk({"alertmanager": {"url": there.url, "timeout": "2s"}})
+    ended = threading.Event()
+    there.behaviour = holds(ended, answers(503))
+    desk = a_desk(notify(there))
     desk.action.started(open_of(an_episode()))
     there.received(1)
     desk.action.ended(an_episode())
     there.behaviour = answers(200)
+    ended.set()
     first, second = posted(there, 2)
     assert parse_time(first["endsAt"]) > parse_time(second["endsAt"])
     failed = desk.outcome("e1", OutcomeState.FAILED)
