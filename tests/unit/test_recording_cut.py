@@ -302,3 +302,28 @@ def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
     assert folder.name.endswith("_cut")
     assert read_with_mcap(mcap_files(folder)[0]) == list(map(as_recorded, points[:5]))
     assert published[-1]["data"]["message"] == "3 samples of the window are missing"
+
+
+def test_what_the_disk_did_not_confirm_waits_for_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path)
+    bench.action.started(an_episode())
+    bench.action.samples(an_episode(), SAMPLES)
+
+    def broken(fd: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", broken)
+        bench.action.completed(an_episode(), Completion())
+    outcome = bench.outcome(an_episode())
+    assert outcome.state is OutcomeState.FAILED
+    assert "cannot be completed, the next start tries again: [Errno 5] Input/output error" in outcome.message
+    assert [each.name[0] for each in (tmp_path / "r").iterdir()] == ["."]
+    place = Destination(Recordings.model_validate({"path": str(tmp_path)}))
+    (kept,) = recover(place, place.take_left())
+    assert kept.path.name.endswith("_cut")
+    (file,) = mcap_files(kept.path)
+    assert sorted(each.payload for each in read_with_mcap(file)) == sorted(each.payload for each in SAMPLES)
+    assert "cut" in metadata_of(file)

@@ -6,18 +6,25 @@ encoding says how they read.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import yaml
 
+from detector.actions.record.mcap_file import McapFile
 from detector.streams.codecs.ros import RosTypes
 from wayside.api.stream import Encoding, Stream
 from wayside.keys import KeyPattern
 
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 """How rosbag2 writes a time that is not limited."""
+_MAXIMUM_CHANNELS = 60_000
+"""MCAP numbers channels with 16 bits: samples on more keys than this are left out, and missing."""
+
+Place = tuple[str, str, str]
+"""A stream, a key and a client: what has a channel of its own."""
+
 _HISTORY = 100
 """A latched topic may have so many publishers: what each said last is played again."""
 
@@ -67,6 +74,36 @@ def qos(latched: bool) -> list[dict[str, Any]]:
             "avoid_ros_namespace_conventions": False,
         }
     ]
+
+
+class FileChannels:
+    """The channels of one file, made as they are needed."""
+
+    def __init__(self, file: McapFile) -> None:
+        self._file = file
+        self._numbers: dict[Place, int] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
+
+    def keep(self, streams: Collection[str]) -> None:
+        """Samples of other streams than these go into new channels from now on."""
+        self._numbers = {place: number for place, number in self._numbers.items() if place[0] in streams}
+
+    def number(self, place: Place, known: Reading | None) -> int | None:
+        """The number of a channel in the file; None where there are too many."""
+        number = self._numbers.get(place)
+        if number is None and len(self._file.contents.channels) < _MAXIMUM_CHANNELS:
+            number = self._numbers[place] = self._new(place, known or Reading("raw", None, None, "", False))
+        return number
+
+    def _new(self, place: Place, known: Reading) -> int:
+        stream, key, client = place
+        schema = 0
+        if known.type is not None and known.definition is not None:
+            about = known.type, known.definition
+            schema = self._schemas.get(about) or self._file.schema(known.type, "ros2msg", known.definition.encode())
+            self._schemas[about] = schema
+        metadata = {"client": client, "stream": stream, **({"latched": "true"} if known.latched else {})}
+        return self._file.channel(f"/{key}", known.encoding, schema, {**metadata, **known.metadata})
 
 
 class Owners:

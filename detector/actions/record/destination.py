@@ -12,7 +12,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,7 +54,6 @@ class Destination:
         self._limits = limits
         self._bytes = self._files = 0
         self._ahead = 0
-        self._kept: list[Kept] = []
         self._left = [*hidden(self.path, PARTIAL)]
         self._scan()
 
@@ -106,8 +105,7 @@ class Destination:
             self._ahead -= later
             self._files -= files
             if kept is not None and all(each.path != kept.path for each in self._kept):
-                self._kept.append(kept)
-                self._kept.sort()
+                self._keep([*self._kept, kept])
 
     def expire(self) -> list[Kept]:
         """Drops what is older than it may be. Returns it. Raises OSError."""
@@ -121,14 +119,14 @@ class Destination:
 
     @property
     def _total(self) -> int:
-        return self._bytes + sum(each.bytes for each in self._kept)
+        return self._bytes + self._kept_bytes
 
     def _short(self, size: int, files: int) -> str:
         """Which limit there is no room under, for so much more; empty where there is room."""
         limits = self._limits
         if size > 0 and self._total + size > limits.bytes.bytes:
             return f"the recordings would take more than spec.recordings.bytes ({limits.bytes})"
-        total = self._files + sum(each.files for each in self._kept) + files
+        total = self._files + self._kept_files + files
         if files > 0 and limits.files is not None and total > limits.files:
             return f"there would be more than {limits.files} files (spec.recordings.files)"
         if size > 0 and self._free() - self._ahead - size < limits.reserve.bytes:
@@ -141,7 +139,7 @@ class Destination:
 
     def _drop(self, kept: Kept) -> Kept:
         """Delete a recording; in between it has no name under which it looks whole."""
-        self._kept.remove(kept)
+        self._keep(each for each in self._kept if each is not kept)
         hidden = hidden_path(kept.path, DROPPED)
         try:
             kept.path.rename(hidden)
@@ -150,8 +148,13 @@ class Destination:
         shutil.rmtree(hidden)
         return kept
 
+    def _keep(self, recordings: Iterable[Kept]) -> None:
+        self._kept = sorted(recordings)
+        self._kept_bytes = sum(each.bytes for each in self._kept)
+        self._kept_files = sum(each.files for each in self._kept)
+
     def _scan(self) -> None:
-        self._kept = sorted(finished(self.path))
+        self._keep(finished(self.path))
         self._scanned = time.monotonic()
 
 

@@ -187,7 +187,7 @@ class McapFile:
         return True
 
     def finish(self) -> None:
-        """Completes and closes the file, once the disk has it. After an OSError but SyncError it can be tried again."""
+        """Completes and closes the file, once the disk has it. It can be tried again, but after a SyncError."""
         self.flush()
         end, later = self.end, self._later
         tail = [self._new, packed(DataEnd(0))]
@@ -196,7 +196,8 @@ class McapFile:
             os.fsync(self._fd)
         except OSError as error:
             raise SyncError(*error.args) from error
-        self.give_up()
+        finally:
+            self.give_up()
 
     def give_up(self) -> None:
         """Closes the file as it is."""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from detector.actions.base import Surroundings
 from detector.actions.episode import EpisodeSample
 from detector.actions.record.bag import Part
-from detector.actions.record.channels import Owners, Reading, reading
+from detector.actions.record.channels import FileChannels, Owners, Place, Reading, reading
 from detector.actions.record.compressing import compressor
 from detector.actions.record.description import (
     METADATA,
@@ -31,12 +31,6 @@ from detector.actions.record.mcap_file import McapFile, SyncError
 from detector.actions.record.stamps import Stamps
 from detector.engine.buffering.lanes import latched_topics
 from wayside.api.actions.record import Record
-
-_MAXIMUM_CHANNELS = 60_000
-"""MCAP numbers channels with 16 bits: samples on more keys than this are left out."""
-
-Place = tuple[str, str, str]
-"""A stream, a key and a client: what has a channel of its own."""
 
 
 class _Latched(NamedTuple):
@@ -71,8 +65,6 @@ class Recording:
         self._numbers: Counter[Place] = Counter()
         self._held: list[EpisodeSample] = []
         self._readings: dict[str, Reading] = {}
-        self._channels: dict[Place, int] = {}
-        self._schemas: dict[tuple[str, str], int] = {}
         self._first: int | None = None  # the earliest time in the file, but for latched streams
         self._file: McapFile | None = None
         self._began: int | None = None
@@ -84,6 +76,7 @@ class Recording:
             folder.describe(told)
             self._open()
         except BaseException:
+            self._give_up()
             folder.remove()
             raise
 
@@ -98,8 +91,8 @@ class Recording:
         old, self._readings = self._readings, {}
         for name, stream in streams.items():
             self._readings[name] = reading(stream, surroundings.types)
-        same = {name for name, each in self._readings.items() if old.get(name) == each}
-        self._channels = {place: number for place, number in self._channels.items() if place[0] in same}
+        if self._file is not None:
+            self._channels.keep({name for name, each in self._readings.items() if old.get(name) == each})
 
     def take(self, samples: Sequence[EpisodeSample], surroundings: Surroundings) -> None:
         """The next samples. Raises NoRoomError, OSError: then it takes no more, and `finish` keeps what there is."""
@@ -174,6 +167,7 @@ class Recording:
                 return None, told
             return self._folder.publish(self._parts, told), told
         except OSError:
+            self._give_up()
             self._folder.leave()
             raise
 
@@ -186,7 +180,6 @@ class Recording:
             file.add_metadata(METADATA_END, ending(told))
             file.finish()
         except SyncError:
-            file.give_up()
             raise
         except (NoRoomError, OSError) as error:
             if not file.drop_last_chunk():  # nothing is left of it
@@ -203,6 +196,10 @@ class Recording:
         self._parts.append(Part(file.path.name, file.contents))
         self._closed_bytes += file.end
         self._lost += file.lost
+
+    def _give_up(self) -> None:
+        if self._file is not None:
+            self._file.give_up()
 
     def _ending(self, told: Mapping[str, Any], cut: str, missing: int) -> dict[str, Any]:
         missing += self.given - self.written
@@ -278,27 +275,13 @@ class Recording:
             compressor(self._parameters.compression),
             self._folder.claim,
         )
-        self._channels, self._schemas, self._first = {}, {}, None
+        self._channels, self._first = FileChannels(self._file), None
         self._file.add_metadata(METADATA, {**beginning(self._told), "file": str(len(self._parts))})
         if self._told.get("metadata"):
             self._file.add_metadata(METADATA_USER, as_text(self._told["metadata"]))
 
     def _channel(self, place: Place) -> int | None:
-        """The channel's number in this file; None where there are too many."""
-        number = self._channels.get(place)
-        if number is None and len(self._writer.contents.channels) < _MAXIMUM_CHANNELS:
-            number = self._channels[place] = self._new_channel(*place)
-        return number
-
-    def _new_channel(self, stream: str, key: str, client: str) -> int:
-        known = self._readings.get(stream) or Reading("raw", None, None, "", False)
-        schema = 0
-        if known.type is not None and known.definition is not None:
-            about = known.type, known.definition
-            schema = self._schemas.get(about) or self._writer.schema(known.type, "ros2msg", known.definition.encode())
-            self._schemas[about] = schema
-        metadata = {"client": client, "stream": stream, **({"latched": "true"} if known.latched else {})}
-        return self._writer.channel(f"/{key}", known.encoding, schema, {**metadata, **known.metadata})
+        return self._channels.number(place, self._readings.get(place[0]))
 
 
 def reason(error: Exception) -> str:

@@ -50,7 +50,9 @@ def _recovered(destination: Destination, path: Path) -> Kept | None:
     folder.use_room()
     told = folder.described()
     try:
-        parts = [] if told is None else [part for file in files if (part := _part(file, folder, told)) is not None]
+        last = files[-1:]
+        found = () if told is None else ((_part(file, folder, told, file in last)) for file in files)
+        parts = [part for part in found if part is not None]
         samples = sum(part.contents.messages for part in parts)
         if told is None or not samples:
             folder.remove()
@@ -63,9 +65,12 @@ def _recovered(destination: Destination, path: Path) -> Kept | None:
         raise
 
 
-def _part(path: Path, folder: Folder, told: dict[str, Any]) -> Part | None:
-    """The file, completed; None where nothing of it can be read: it is deleted."""
-    contents = contents_of(path)
+def _part(path: Path, folder: Folder, told: dict[str, Any], last: bool) -> Part | None:
+    """The file, completed; None where nothing of it can be read: it is deleted.
+
+    The last one is looked through even if it seems complete: the disk may not have had all of it.
+    """
+    contents = None if last else contents_of(path)
     if contents is None:
         file = salvage(path, folder.claim)
         if file is None or not file.contents.messages:
