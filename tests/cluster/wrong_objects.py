@@ -113,7 +113,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "EventRule",
         "an action that does nothing",
         {"spec.actions.0.deploy": ABSENT},
-        r"spec\.actions\[0\]\.deploy: Required value",
+        r"spec\.actions\[0\]: Invalid value: give exactly one of deploy, record",
     ),
     ("EventRule", "a name that is too long", {"metadata.name": "x" * 64}, r"metadata\.name: .*63"),
     ("Detector", "no streams", {"spec.streams": []}, r"spec\.streams: .*at least 1 items"),
