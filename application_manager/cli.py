@@ -19,6 +19,7 @@ from application_manager.connection import ConfigurationError
 from application_manager.core.policy import Policy
 from application_manager.inquiry import InquiryError, inquire
 from application_manager.offline import render_files
+from application_manager.publishing import settings
 from application_manager.service import Options, serve
 from application_manager.telling import text
 from wayside import commandline
@@ -92,6 +93,13 @@ def run(
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
     ] = None,
+    zenoh: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Publish the instances' configurations on Zenoh, as a client of this endpoint, e.g. tcp/zenoh:7447 "
+            "(repeatable), or as a Zenoh configuration file says (its name ends with .json5)."
+        ),
+    ] = None,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
 ) -> None:
@@ -102,6 +110,7 @@ def run(
         resync=resync.seconds,
         ttl_after_finished=ttl_after_finished.seconds,
         metrics_port=metrics_port,
+        zenoh=settings(zenoh) if zenoh else None,
     )
     asyncio.run(serve(options))
 

@@ -142,6 +142,14 @@ class Client:
         query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
         return await self._request("PATCH", resource.path(namespace, name, "status"), query, body, _MERGE)
 
+    async def annotate(
+        self, resource: Resource, namespace: str, name: str, uid: str, annotations: Mapping[str, str]
+    ) -> Object:
+        """Set annotations of the object with this uid, and touch nothing else."""
+        body = {"metadata": {"uid": uid, "annotations": dict(annotations)}}
+        query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
+        return await self._request("PATCH", resource.path(namespace, name), query, body, _MERGE)
+
     async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> bool:
         """Delete the object with this uid, and in the background what it owns. Returns whether it was there."""
         options = {

@@ -17,8 +17,9 @@ from application_manager.apply import Applied, Applier, Known, ObjectKey, refere
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core import drafting
 from application_manager.core.conditions import Aspect, find
+from application_manager.core.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.demand import Decision
-from application_manager.core.rendering import Rendering
+from application_manager.core.rendering import Rendering, object_key
 from application_manager.recorder import Reason, Recorder
 from application_manager.store import Name
 from application_manager.world import Record, World
@@ -40,6 +41,7 @@ class InstanceWork:
         done: told when an instance's record is new.
         absent: told what was decided of an instance that neither exists nor should.
         observe: takes an object that was read.
+        configured: told when an instance's configuration was applied.
     """
 
     world: World
@@ -52,6 +54,7 @@ class InstanceWork:
     done: Callable[[Name], None]
     absent: Callable[[Name, Decision | None], None]
     observe: Callable[[Object], None]
+    configured: Callable[[Name], None]
 
     async def reconcile(self, name: Name) -> None:
         """Make the cluster match what is demanded of this instance.
@@ -127,6 +130,8 @@ class InstanceWork:
                 self._note(name, instance, decision, failed, known.digest)
             raise
         self._note(name, instance, decision, applied, rendering.digest if applied.complete else known.digest)
+        if any(object_key(each) == (*CONFIG_MAP, config_map_name(name[1])) for each in pending):
+            self.configured(name)
         if applied.aspect.reason == "Waiting":
             self.again(name, time.time() + _LOOK_AGAIN)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from application_manager.apply import Applier
 from application_manager.client import Object
+from application_manager.core.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.labelling import INSTANCE_LABEL
 from application_manager.core.readiness import not_ready
 from application_manager.rulework import RuleKey
@@ -32,6 +33,7 @@ class Router:
 
     Attributes:
         instance, task, template, rule: ask for one of these to be reconciled; `rule` is for Detectors as well.
+        configuration: asks for an instance's configuration to be brought to those that follow it.
     """
 
     world: World
@@ -40,6 +42,7 @@ class Router:
     task: Ask
     template: Ask
     rule: Callable[[RuleKey], None]
+    configuration: Ask
 
     def observe(self, raw: Object) -> None:
         """Take an object as it was read."""
@@ -81,6 +84,7 @@ class Router:
             self._claim_again(name)
         elif kind == INSTANCE:
             self.instance(name)
+            self.configuration(name)
             if isinstance(entry.model, ApplicationInstance):
                 self.template((name[0], entry.model.spec.template))
         elif kind in _RULES:
@@ -92,6 +96,7 @@ class Router:
             self.world.pods.forget(raw)
             self.applier.forget(raw)
             self._ask_for_owner(raw)
+            self._ask_for_configuration(raw)
 
     def everything(self) -> None:
         """Ask for all that there is."""
@@ -145,15 +150,22 @@ class Router:
         self.applier.note(entry.raw)
         if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
             self._ask_for_owner(entry.raw)
+        if old is None or old.raw.get("data") != entry.raw.get("data"):
+            self._ask_for_configuration(entry.raw)
 
     def _significance(self, entry: Entry) -> tuple[str, bool, str | None]:
         """What of an object matters to its instance; workloads change their status far more often."""
         return entry.uid, "deletionTimestamp" in entry.raw["metadata"], not_ready(entry.raw)
 
     def _ask_for_owner(self, raw: Object) -> None:
-        owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
-        if owner:
-            self.instance((raw["metadata"]["namespace"], owner))
+        owner = _instance_of(raw)
+        if owner is not None:
+            self.instance(owner)
+
+    def _ask_for_configuration(self, raw: Object) -> None:
+        owner = _instance_of(raw)
+        if kind_of(raw) == CONFIG_MAP and owner is not None and name_of(raw)[1] == config_map_name(owner[1]):
+            self.configuration(owner)
 
     def _lease(self, name: Name, raw: Object | None) -> None:
         holder = holder_of(name[1])
@@ -177,6 +189,12 @@ class Router:
     def _ask_all(self, instances: Iterable[Name]) -> None:
         for name in instances:
             self.instance(name)
+
+
+def _instance_of(raw: Object) -> Name | None:
+    """The instance whose label the object bears."""
+    owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
+    return (raw["metadata"]["namespace"], owner) if owner else None
 
 
 def _written(entry: Entry) -> tuple[object, object]:

@@ -15,9 +15,11 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import kopf
+import zenoh
 
 from application_manager.apply import Applier
 from application_manager.client import ApiError, Client, Resource
+from application_manager.configurations import ConfigurationWork
 from application_manager.connection import ConfigurationError, load_configuration
 from application_manager.core.policy import KindKey, Policy, kind_text
 from application_manager.instances import InstanceWork
@@ -28,6 +30,7 @@ from application_manager.measures import Measures
 from application_manager.operator import watch
 from application_manager.overview import Overview
 from application_manager.pages import pages, stalled
+from application_manager.publishing import Publisher
 from application_manager.recorder import Recorder
 from application_manager.router import Router
 from application_manager.rulework import RuleKey, RuleWork
@@ -40,6 +43,7 @@ from application_manager.world import INSTANCE, OWN_KINDS, POD, TASK, TEMPLATE, 
 
 JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
 _INSTANCE_WORKERS = 16
+_CONFIGURATION_WORKERS = 4
 _STATUS_WORKERS = 2  # few: what runs goes before what is said of it
 
 log = logging.getLogger(__name__)
@@ -55,6 +59,7 @@ class Options:
         resync: seconds between two full resyncs.
         ttl_after_finished: seconds that finished tasks are kept.
         metrics_port: where metrics and health are served; None: nowhere.
+        zenoh: where configurations are published; None: nowhere.
     """
 
     policy: Policy = field(default_factory=Policy)
@@ -62,6 +67,7 @@ class Options:
     resync: float = 60.0
     ttl_after_finished: float = 3600.0
     metrics_port: int | None = None
+    zenoh: zenoh.Config | None = None
 
 
 async def serve(options: Options) -> None:
@@ -108,8 +114,23 @@ class Manager:
         self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances, measures)
         queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules)
         measures.registry.register(Overview(self._world, lambda: [(each.name, *each.depth) for each in queues]))
+        self._tasks: WorkQueue[Name] = WorkQueue("task", self._reconcile_task, _STATUS_WORKERS, self._instances)
+        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances)
+        self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances)
+        self._publisher = Publisher(options.zenoh)
+        self._configurations: WorkQueue[Name] = WorkQueue(
+            "configuration",
+            ConfigurationWork(self._world, client, applier, self._publisher).reconcile,
+            _CONFIGURATION_WORKERS,
+        )
         self._router = Router(
-            self._world, applier, self._instances.add, self._tasks.add, _soon(self._templates), _soon(self._rules)
+            self._world,
+            applier,
+            self._instances.add,
+            self._tasks.add,
+            _soon(self._templates),
+            _soon(self._rules),
+            self._configurations.add,
         )
         self._status_work = InstanceStatusWork(
             world=self._world,
@@ -131,6 +152,7 @@ class Manager:
             done=self._statuses.add,
             absent=lambda name, decision: self._status_work.tell(name, decision, None),
             observe=self._router.observe,
+            configured=self._configurations.add,
         )
         self._task_work = TaskWork(
             world=self._world,
@@ -195,6 +217,8 @@ class Manager:
             asyncio.create_task(self._tasks.run(), name="tasks"),
             asyncio.create_task(self._templates.run(), name="templates"),
             asyncio.create_task(self._rules.run(), name="rules"),
+            asyncio.create_task(self._configurations.run(), name="configurations"),
+            asyncio.create_task(self._publisher.run(), name="zenoh"),
             asyncio.create_task(self._recorder.run(), name="events"),
             asyncio.create_task(self._leases.run(), name="leases"),
             asyncio.create_task(self._listing.resync(watching), name="resync"),

@@ -38,7 +38,7 @@ def ignore(*_: object) -> None:
 def work_on(world: World, client: Client) -> tuple[Router, InstanceWork]:
     resources = {("apps/v1", "Deployment"): Resource("apps/v1", "Deployment", "deployments")}
     applier = Applier(client, world.store, resources)
-    router = Router(world, applier, ignore, ignore, ignore, ignore)
+    router = Router(world, applier, ignore, ignore, ignore, ignore, ignore)
     absent: Callable[[Name, Decision | None], None] = ignore
     work = InstanceWork(
         world=world,
@@ -51,6 +51,7 @@ def work_on(world: World, client: Client) -> tuple[Router, InstanceWork]:
         done=ignore,
         absent=absent,
         observe=router.observe,
+        configured=ignore,
     )
     return router, work
 

@@ -62,6 +62,7 @@ def test_an_instance_that_goes_while_its_release_is_checked_stays_gone_while_its
         done=lambda name: None,
         absent=lambda name, decision: absent.append(name),
         observe=lambda raw: None,
+        configured=lambda name: None,
     )
     asyncio.run(work.reconcile(NAME))
     assert server.written == []

@@ -1,0 +1,282 @@
+"""A configuration that changes reaches pods and Zenoh at once, and restarts nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zenoh
+
+from application_manager.core.following import ANNOTATION, fingerprint
+from tests.cluster.api import Api, Object
+from tests.cluster.managed_world import end, start_manager, task, wait_settled
+from tests.cluster.processes import Process, Processes
+from tests.cluster.waiting import wait_until
+from tests.unit.networks import free_endpoint, router
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "live-configuration"
+CONFIG_MAP = "fusion-configuration"
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def network(endpoint: str) -> Iterator[zenoh.Session]:
+    with router(listen__endpoints=[endpoint]) as session:
+        yield session
+
+
+@pytest.fixture
+def manager(processes: Processes, namespace: str, endpoint: str) -> Process:
+    return start_manager(processes, namespace, "--zenoh", endpoint)
+
+
+def template() -> Any:
+    raw = yaml.safe_load((EXAMPLE / "templates.yaml").read_text())
+    raw["spec"]["lifecycle"] = {"linger": "0s"}
+    return raw
+
+
+def vehicle(name: str) -> Object:
+    return {**task(name, of="fusion"), "spec": {"template": "fusion", "parameters": {"sources": [name]}}}
+
+
+def sources_in(content: str) -> list[str]:
+    sources: list[str] = yaml.safe_load(content)["sources"]
+    return sources
+
+
+def wait_for_sources(api: Api, *expected: str) -> None:
+    api.wait_for(
+        "ConfigMap",
+        CONFIG_MAP,
+        lambda raw: sources_in(raw["data"]["sources.yaml"]) == [*expected],
+        what=f"the sources are {expected}",
+    )
+
+
+def wait_for_pod(api: Api) -> Object:
+    (pod,) = api.wait_list("Pod", lambda pods: len(pods) == 1, what="there is one pod")
+    return pod
+
+
+def wait_until_told(api: Api, *sources: str) -> Object:
+    """Wait until the pod's annotation stands for the configuration with these sources; return the pod."""
+    wait_for_sources(api, *sources)
+    content = fingerprint(api.get("ConfigMap", CONFIG_MAP)["data"])
+    (pod,) = api.wait_list(
+        "Pod",
+        lambda pods: [each["metadata"].get("annotations", {}).get(ANNOTATION) for each in pods] == [content],
+        what=f"the only pod is told of {sources}",
+    )
+    return pod
+
+
+class Told:
+    """What comes on a key, as sources; None for a deletion."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self.contents: list[list[str] | None] = []
+        self._changed = threading.Condition()
+        self._subscriber = session.declare_subscriber(key, self._take)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        deleted = sample.kind == zenoh.SampleKind.DELETE
+        with self._changed:
+            self.contents.append(None if deleted else _sources_of(sample))
+            self._changed.notify_all()
+
+    def wait_for(self, expected: list[str] | None) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: self.contents[-1:] == [expected], 120), self.contents
+
+
+def _sources_of(sample: zenoh.Sample) -> list[str]:
+    return sources_in(json.loads(sample.payload.to_bytes())["sources.yaml"])
+
+
+def asked(session: zenoh.Session, key: str) -> list[list[str]]:
+    """What a late joiner gets who asks on the key."""
+    return [_sources_of(reply.ok) for reply in session.get(key) if reply.ok is not None]
+
+
+def test_a_change_touches_the_pods_and_not_their_template(api: Api, manager: Process) -> None:
+    api.create(template())
+    api.create(vehicle("car1"))
+    pod = wait_for_pod(api)
+    deployment = api.get("Deployment", "fusion")
+    api.create(vehicle("car2"))
+    told = wait_until_told(api, "car1", "car2")
+    assert told["metadata"]["uid"] == pod["metadata"]["uid"]
+    now = api.get("Deployment", "fusion")
+    assert now["spec"] == deployment["spec"]
+    assert now["metadata"]["generation"] == deployment["metadata"]["generation"]
+    wait_settled(api)
+    end(api, "car2")
+    wait_until_told(api, "car1")
+    wait_settled(api)
+
+
+def test_pods_of_others_are_left_alone(api: Api, manager: Process) -> None:
+    """A pod with the very labels of the instance's, which does not mount its configuration."""
+    api.create(template())
+    api.create(
+        {
+            "apiVersion": "v1",
+            "kind": "Pod",
+            "metadata": {"name": "stranger", "labels": {"app": "fusion"}},
+            "spec": {"containers": [{"name": "main", "image": "other:1"}]},
+        }
+    )
+    api.create(vehicle("car1"))
+    api.wait_list("Pod", lambda pods: len(pods) == 2, what="the application has its pod")
+    api.create(vehicle("car2"))
+    api.wait_list(
+        "Pod",
+        lambda pods: [_was_told(each) for each in pods if each["metadata"]["name"] != "stranger"] == [True],
+        what="the application's pod is told",
+    )
+    assert not _was_told(api.get("Pod", "stranger"))
+
+
+def _was_told(pod: Object) -> bool:
+    return ANNOTATION in pod["metadata"].get("annotations", {})
+
+
+def test_zenoh_has_each_change_and_answers_who_comes_late(
+    api: Api, namespace: str, network: zenoh.Session, manager: Process
+) -> None:
+    key = f"wayside/instances/{namespace}/fusion/configuration"
+    told = Told(network, key)
+    api.create(template())
+    api.create(vehicle("car1"))
+    told.wait_for(["car1"])
+    api.create(vehicle("car2"))
+    told.wait_for(["car1", "car2"])
+    assert asked(network, key) == [["car1", "car2"]]
+    assert asked(network, "wayside/instances/*/fusion/**") == [["car1", "car2"]]
+    assert asked(network, f"wayside/instances/{namespace}/other/configuration") == []
+    for each in ("car1", "car2"):
+        end(api, each)
+    told.wait_for(None)
+    assert asked(network, key) == []
+
+
+def test_a_killed_manager_comes_back_and_answers_again(
+    api: Api, namespace: str, network: zenoh.Session, manager: Process
+) -> None:
+    key = f"wayside/instances/{namespace}/fusion/configuration"
+    api.create(template())
+    api.create(vehicle("car1"))
+    wait_until(lambda: asked(network, key), lambda found: found == [["car1"]], what="there is an answer")
+    manager.kill9()
+    api.create(vehicle("car2"))
+    manager.restart()
+    wait_until(lambda: asked(network, key), lambda found: found == [["car1", "car2"]], what="there is an answer again")
+    wait_until_told(api, "car1", "car2")
+
+
+def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, manager: Process) -> None:
+    key = f"wayside/instances/{namespace}/fusion/configuration"
+    api.create(template())
+    api.create(vehicle("car1"))
+    wait_for_sources(api, "car1")
+    wait_settled(api)  # without a network everything else goes on
+    for number in (2, 3):
+        with router(listen__endpoints=[endpoint]) as session:
+            cars = [f"car{each}" for each in range(1, number)]
+            wait_until(lambda: asked(session, key), lambda found, cars=cars: found == [cars], what="there is an answer")
+            told = Told(session, key)
+            api.create(vehicle(f"car{number}"))
+            told.wait_for([*cars, f"car{number}"])
+    assert manager.terminate(patience=15) == 0
+
+
+class Repeated:
+    """Puts a value again and again, for the duration of a `with` block."""
+
+    def __init__(self, session: zenoh.Session, key: str, value: str) -> None:
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(session, key, value), daemon=True)
+
+    def _run(self, session: zenoh.Session, key: str, value: str) -> None:
+        while not self._ended.wait(0.1):
+            session.put(key, value)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+class Mount:
+    """A mounted ConfigMap, brought up to date as a kubelet does it that was told: when the pod's annotation changes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._seen: str | None = None
+        self._versions = 0
+
+    def sync(self, api: Api) -> None:
+        """What the kubelet does when the pod has changed since."""
+        pod = wait_for_pod(api)
+        annotation = pod["metadata"].get("annotations", {}).get(ANNOTATION, "")
+        if annotation == self._seen:
+            return
+        self._seen = annotation
+        self._versions += 1
+        version = self.folder / f"..{self._versions}"
+        version.mkdir()
+        for name, text in api.get("ConfigMap", CONFIG_MAP)["data"].items():
+            (version / name).write_text(text)
+            if not (self.folder / name).is_symlink():
+                (self.folder / name).symlink_to(f"..data/{name}")
+        (self.folder / "..new").symlink_to(version.name)
+        os.replace(self.folder / "..new", self.folder / "..data")
+
+    def wait_for(self, api: Api, *sources: str) -> None:
+        def look() -> list[str]:
+            self.sync(api)
+            return sources_in((self.folder / "sources.yaml").read_text())
+
+        wait_until(look, lambda found: found == [*sources], what=f"the kubelet is told, and brings {sources}")
+
+
+@pytest.mark.parametrize("way", ["zenoh", "file"])
+def test_the_example_follows_its_sources(
+    api: Api, namespace: str, endpoint: str, network: zenoh.Session, processes: Processes, tmp_path: Path, way: str
+) -> None:
+    start_manager(processes, namespace, *(["--zenoh", endpoint] if way == "zenoh" else []))
+    api.create(template())
+    api.create(vehicle("car1"))
+    wait_for_sources(api, "car1")
+    (folder := tmp_path / "mount").mkdir()
+    mount = Mount(folder)
+    mount.sync(api)
+    where = ["--file", str(folder / "sources.yaml"), "--zenoh", endpoint, "--instance", f"{namespace}/fusion"]
+    application = processes.start(sys.executable, str(EXAMPLE / "follow.py"), *where, name="application")
+    application.wait_for_output("following car1 ")
+    api.create(vehicle("car2"))
+    if way == "file":
+        mount.wait_for(api, "car1", "car2")
+    application.wait_for_output(f"following car1, car2 .by {way}.")
+    with Repeated(network, "vehicles/car2/pose", "here"):  # its subscription takes a moment to reach us
+        application.wait_for_output("vehicles/car2/pose: here")
+    end(api, "car1")
+    if way == "file":
+        mount.wait_for(api, "car2")
+    application.wait_for_output(f"following car2 .by {way}.")
+    assert application.starts == 1
+    assert application.terminate() == 0
