@@ -43,6 +43,7 @@ unit: $(BIN)/.installed-dev ## the tests that need no cluster
 
 cluster: $(BIN)/.installed-dev ## the tests against a real control plane; builds it first where it is missing
 	@$(BIN)/python -m tests.cluster.binaries
+	@$(BIN)/python -m tests.helm
 	@$(BIN)/python -m pytest tests/cluster
 
 bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its baseline

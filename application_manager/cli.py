@@ -15,8 +15,10 @@ from typing import Annotated
 
 import typer
 
+from application_manager.chartcache import default_folder
 from application_manager.connection import ConfigurationError
 from application_manager.core.policy import Policy
+from application_manager.helm import Helm
 from application_manager.inquiry import InquiryError, inquire
 from application_manager.offline import render_files
 from application_manager.publishing import settings
@@ -43,6 +45,14 @@ AllowedKinds = Annotated[
     list[str] | None,
     typer.Option(help="A kind that templates may create, e.g. apps/v1/Deployment; repeatable. Replaces the default."),
 ]
+HelmProgram = Annotated[
+    str, typer.Option(help="The helm program, a path or a name on PATH, for templates with charts.")
+]
+ChartCacheFolder = Annotated[
+    Path | None, typer.Option(help="The folder to keep fetched charts in. Default: ~/.cache/wayside/charts.")
+]
+CHART_FOLDER = Path("/charts")
+ChartFolder = Annotated[Path, typer.Option(help="The folder with charts that templates may name by their path.")]
 ServiceAccounts = Annotated[
     list[str] | None,
     typer.Option(help="A service account that templates may use; repeatable. Default: only `default`, without token."),
@@ -100,6 +110,9 @@ def run(
             "(repeatable), or as a Zenoh configuration file says (its name ends with .json5)."
         ),
     ] = None,
+    helm: HelmProgram = "helm",
+    chart_cache: ChartCacheFolder = None,
+    chart_folder: ChartFolder = CHART_FOLDER,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
 ) -> None:
@@ -111,6 +124,9 @@ def run(
         ttl_after_finished=ttl_after_finished.seconds,
         metrics_port=metrics_port,
         zenoh=settings(zenoh) if zenoh else None,
+        helm=Helm(helm),
+        chart_cache=chart_cache or default_folder(),
+        chart_folder=chart_folder,
     )
     asyncio.run(serve(options))
 

@@ -170,6 +170,10 @@ class Client:
         """Create the object."""
         return await self._request("POST", resource.path(manifest["metadata"]["namespace"]), body=manifest)
 
+    async def server_version(self) -> str:
+        """The version of the API server, e.g. v1.36.3."""
+        return str((await self._request("GET", "/version"))["gitVersion"])
+
     async def discover(self, api_version: str) -> dict[KindKey, Resource]:
         """The kinds of a group and version; none where the cluster does not have it."""
         root = f"/apis/{api_version}" if "/" in api_version else f"/api/{api_version}"

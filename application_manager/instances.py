@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from application_manager.apply import Applied, Applier, Known, ObjectKey, references
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core import drafting
+from application_manager.core.charts import Charts, no_charts
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.demand import Decision
@@ -42,6 +43,7 @@ class InstanceWork:
         absent: told what was decided of an instance that neither exists nor should.
         observe: takes an object that was read.
         configured: told when an instance's configuration was applied.
+        charts: renders charts, and asks for an instance again once its chart is rendered.
     """
 
     world: World
@@ -55,6 +57,7 @@ class InstanceWork:
     absent: Callable[[Name, Decision | None], None]
     observe: Callable[[Object], None]
     configured: Callable[[Name], None]
+    charts: Charts = no_charts
 
     async def reconcile(self, name: Name) -> None:
         """Make the cluster match what is demanded of this instance.
@@ -91,7 +94,7 @@ class InstanceWork:
             return
         wanted = drafting.draft(name, decision, existing)
         template = self.world.template((name[0], wanted.spec.template))
-        rendering = drafting.objects(wanted, template, self.world.renderer)
+        rendering = drafting.objects(wanted, template, self.world.renderer, self.charts)
         manifest = drafting.manifest(wanted, existing, template)
         looked: dict[ObjectKey, Object | None] = {}
         if manifest is not None:
@@ -106,6 +109,8 @@ class InstanceWork:
             return  # deleted by somebody meanwhile: its event brings us back
         known = self._known(name, instance)
         if not isinstance(rendering, Rendering):
+            if rendering.reason == drafting.CHART_PENDING and self._was_applied(name, instance) is not None:
+                return  # what runs stays as it is, and nothing is news until the chart is rendered, or has failed
             self._note(
                 name, instance, decision, Applied(rendering, references(known.objects), complete=False), known.digest
             )

@@ -74,7 +74,7 @@ _OWN_REASONS = frozenset({Reason.HOLDER_LOST, Reason.TEMPLATE_INVALID}) | _TROUB
 """Reasons of conditions that are those of their Events too."""
 
 _WARNINGS = frozenset({Reason.REFUSED, Reason.HOLDER_LOST, Reason.NOT_APPLIED, Reason.TEMPLATE_INVALID}) | _TROUBLES
-_EXPECTED = frozenset({"Waiting", "NotApplied", "NotReady"})  # reasons that come with every start
+_EXPECTED = frozenset({"Waiting", "ChartPending", "NotApplied", "NotReady"})  # reasons that come with every start
 
 
 @dataclass(frozen=True, slots=True)

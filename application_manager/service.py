@@ -11,17 +11,21 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 
 import kopf
 import zenoh
 
 from application_manager.apply import Applier
+from application_manager.chartcache import ChartCache, default_folder
+from application_manager.chartdesk import ChartDesk
 from application_manager.client import ApiError, Client, Resource
 from application_manager.configurations import ConfigurationWork
 from application_manager.connection import ConfigurationError, load_configuration
 from application_manager.core.policy import KindKey, Policy, kind_text
+from application_manager.helm import Helm
 from application_manager.instances import InstanceWork
 from application_manager.instancestatus import InstanceStatusWork
 from application_manager.leasewatch import LeaseWatch
@@ -60,6 +64,9 @@ class Options:
         ttl_after_finished: seconds that finished tasks are kept.
         metrics_port: where metrics and health are served; None: nowhere.
         zenoh: where configurations are published; None: nowhere.
+        helm: renders charts.
+        chart_cache: the folder in which fetched charts are kept.
+        chart_folder: the folder with the charts of the image.
     """
 
     policy: Policy = field(default_factory=Policy)
@@ -68,6 +75,9 @@ class Options:
     ttl_after_finished: float = 3600.0
     metrics_port: int | None = None
     zenoh: zenoh.Config | None = None
+    helm: Helm = field(default_factory=Helm)
+    chart_cache: Path = field(default_factory=default_folder)
+    chart_folder: Path = Path("/charts")
 
 
 async def serve(options: Options) -> None:
@@ -80,7 +90,9 @@ async def serve(options: Options) -> None:
     measures = Measures()
     client = Client(await load_configuration(), measures)
     try:
-        await Manager(client, options, await _discovered(client, options.policy), measures).run()
+        resources = await _discovered(client, options.policy)
+        helm = replace(options.helm, kube_version=await until_answered(client.server_version))
+        await Manager(client, replace(options, helm=helm), resources, measures).run()
     except ApiError as error:
         raise ConfigurationError(
             f"the API server refuses what the manager needs: {error}; check the account and its rights"
@@ -141,6 +153,8 @@ class Manager:
             task_changed=self._tasks.add,
             observe=self._router.observe,
         )
+        cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
+        self._charts = ChartDesk(options.helm, cache, self._instances.add_at)
         self._instance_work = InstanceWork(
             world=self._world,
             client=client,
@@ -153,6 +167,7 @@ class Manager:
             absent=lambda name, decision: self._status_work.tell(name, decision, None),
             observe=self._router.observe,
             configured=self._configurations.add,
+            charts=self._charts.outcome,
         )
         self._task_work = TaskWork(
             world=self._world,
@@ -230,6 +245,7 @@ class Manager:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            await self._charts.close()
         for task in done:
             task.result()
         log.info("stopped")

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from application_manager.core.charts import Charts, no_charts
 from application_manager.core.claims import InvalidTemplate
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import LINGER_ANNOTATION, Decision, is_managed, linger_of
-from application_manager.core.rendering import Renderer, RenderError, Rendering
+from application_manager.core.rendering import ChartPending, Renderer, RenderError, Rendering
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationinstance import ApplicationInstanceSpec
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
@@ -61,11 +62,18 @@ def created(wanted: ApplicationInstance, template: ApplicationTemplate | None) -
             "labels": {MANAGED_BY_LABEL: MANAGED_BY},
             "annotations": {LINGER_ANNOTATION: str(linger_of(wanted, template))},
         },
-        "spec": wanted.spec.to_json(),
+        # Said also where there are none: fields that are taken away by an apply would leave a null.
+        "spec": {"parameters": {}, **wanted.spec.to_json()},
     }
 
 
-def objects(wanted: ApplicationInstance, template: TemplateState, renderer: RendererOf) -> Rendering | Aspect:
+CHART_PENDING = "ChartPending"
+"""The reason of the condition Applied while a chart is being rendered."""
+
+
+def objects(
+    wanted: ApplicationInstance, template: TemplateState, renderer: RendererOf, charts: Charts = no_charts
+) -> Rendering | Aspect:
     """The instance's objects, or why it has none, as the condition Applied says it."""
     of = wanted.spec.template
     if template is None:
@@ -77,6 +85,8 @@ def objects(wanted: ApplicationInstance, template: TemplateState, renderer: Rend
     if isinstance(template, InvalidTemplate):
         return Aspect("Applied", False, "TemplateInvalid", f"ApplicationTemplate {of}: {template.problem}")
     try:
-        return renderer(template).render(wanted)
+        return renderer(template).render(wanted, charts)
+    except ChartPending as pending:
+        return Aspect("Applied", False, CHART_PENDING, f"ApplicationTemplate {of}: {pending}")
     except RenderError as error:
-        return Aspect("Applied", False, "RenderFailed", f"ApplicationTemplate {of}: {error}")
+        return Aspect("Applied", False, error.reason, f"ApplicationTemplate {of}: {error}")

@@ -14,12 +14,14 @@ from functools import partial
 from typing import Any, cast
 
 from application_manager.core import parameters, values
+from application_manager.core.charts import ChartFailure, ChartRequest, Charts, ChartSource, no_charts
 from application_manager.core.claims import unknown_members
 from application_manager.core.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
 from application_manager.core.labelling import labelled
 from application_manager.core.policy import Policy
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import API_VERSION
+from wayside.api.chart import Helm
 from wayside.expressions import CompiledTemplate, Environment, InterpolationError, Kind, compile_template
 
 _INSTANCE_VARIABLES = ("name", "key", "namespace")
@@ -33,9 +35,14 @@ Manifest = dict[str, Any]
 class RenderError(Exception):
     """A template that cannot be rendered; `problems` holds all that is wrong, each with field, value and remedy."""
 
-    def __init__(self, problems: list[str]) -> None:
+    def __init__(self, problems: list[str], reason: str = "RenderFailed") -> None:
         super().__init__("; ".join(problems))
         self.problems = tuple(problems)
+        self.reason = reason
+
+
+class ChartPending(Exception):  # noqa: N818  no error: the answer is still to come
+    """The instance's chart is being rendered; render again once it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +92,21 @@ class Renderer:
                 problems += [str(each) for each in (error, *error.others)]
             else:
                 self._manifests.append(compiled)
+        self._values: CompiledTemplate | None = None
+        if template.spec.helm is not None:
+            try:
+                where = "spec.helm.values"
+                self._values = compile_template(template.spec.helm.values, _ENVIRONMENT, path=where, check=check)
+            except InterpolationError as error:
+                problems += [str(each) for each in (error, *error.others)]
         if problems:
             raise RenderError(problems)
 
-    def render(self, instance: ApplicationInstance) -> Rendering:
-        """The instance's objects.
+    def render(self, instance: ApplicationInstance, charts: Charts = no_charts) -> Rendering:
+        """The instance's objects; `charts` knows what became of a chart.
 
-        Raises RenderError where an expression fails on the instance's values, or a manifest may not be as it is.
+        Raises RenderError where an expression fails on the instance's values, or a manifest may not be as it is, and
+        ChartPending where the chart's rendering is still to come.
         """
         spec = self.template.spec
         problems = parameters.problems(spec.parameters, instance.spec.parameters, self.template.name, "spec.parameters")
@@ -118,10 +133,41 @@ class Renderer:
             problems += found
             if not found:
                 manifests.append(labelled(self._policy.completed(manifest), instance))
+        if spec.helm is not None and self._values is not None and not problems:
+            for where, manifest in self._chart_manifests(spec.helm, self._values, instance, variables, charts):
+                found = [f"{where}: {field}: {problem}" for field, problem in self._problems(manifest, instance)]
+                if kind_problem := self._policy.kind_problem(manifest["apiVersion"], manifest["kind"]):
+                    found.append(f"{where}: {kind_problem}; or turn it off by the chart's values")
+                problems += found
+                if not found:
+                    manifests.append(labelled(self._policy.completed(manifest), instance))
         problems += _duplicates(manifests)
         if problems:
             raise RenderError(problems)
         return Rendering(tuple(manifests), digest(manifests))
+
+    def _chart_manifests(
+        self,
+        helm: Helm,
+        compiled: CompiledTemplate,
+        instance: ApplicationInstance,
+        variables: Mapping[str, Any],
+        charts: Charts,
+    ) -> Iterator[tuple[str, Manifest]]:
+        """The chart's objects, each with where it stands."""
+        try:
+            given = compiled.render(variables, integers=True)
+        except InterpolationError as error:
+            raise RenderError([str(error)]) from None
+        request = ChartRequest(ChartSource.of(helm), instance.namespace, instance.name, values.canonical(given or {}))
+        outcome = charts(request)
+        if outcome is None:
+            raise ChartPending(f"chart {request.source} is being rendered")
+        if isinstance(outcome, ChartFailure):
+            raise RenderError([outcome.message], outcome.reason)
+        for each in outcome.objects:
+            # Copied and in one form, since what comes from the chart is kept for the next time.
+            yield f"spec.helm: {each.file} of chart {helm.chart}", cast("Manifest", values.normal(each.manifest))
 
     def _problems(self, manifest: Manifest, instance: ApplicationInstance) -> Iterator[tuple[str, str]]:
         metadata = manifest.get("metadata")

@@ -125,7 +125,7 @@ def instance_status(
     if lingering:
         phase = InstancePhase.LINGERING
     elif not applied.holds:
-        phase = InstancePhase.FAILED if applied.reason != "Waiting" else InstancePhase.PENDING
+        phase = InstancePhase.FAILED if applied.reason not in ("Waiting", "ChartPending") else InstancePhase.PENDING
     else:
         phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
     generation = instance.metadata.generation

@@ -29,7 +29,7 @@ def template(name: str = "app", **spec: Any) -> ApplicationTemplate:
         {
             "kind": "ApplicationTemplate",
             "metadata": {"name": name, "namespace": "site"},
-            "spec": {"manifests": [DEPLOYMENT], **spec},
+            "spec": spec if "helm" in spec else {"manifests": [DEPLOYMENT], **spec},
         }
     )
 

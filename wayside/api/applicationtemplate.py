@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from wayside.api.base import (
     Condition,
@@ -16,7 +16,9 @@ from wayside.api.base import (
     Kind,
     Model,
     conditions_field,
+    validations,
 )
+from wayside.api.chart import Helm
 from wayside.api.parameter import Parameter
 
 
@@ -55,9 +57,13 @@ Manifest = Annotated[dict[str, Any], Field(json_schema_extra={"x-kubernetes-pres
 FileName = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._a-zA-Z0-9]+$")]
 """A file's name, as ConfigMaps allow it."""
 
+_ONE_OF = "give exactly one of manifests and helm"
+
 
 class ApplicationTemplateSpec(Model):
     """Parameters, identity and manifests of an application."""
+
+    model_config = validations(("has(self.manifests) != has(self.helm)", _ONE_OF))
 
     description: str = Field(default="", max_length=1024, description="What the application does, for people.")
     parameters: dict[Identifier, Parameter] = Field(
@@ -77,6 +83,7 @@ class ApplicationTemplateSpec(Model):
         "list as the extension says, .yaml or .json.",
     )
     manifests: list[Manifest] = Field(
+        default_factory=list,
         min_length=1,
         max_length=64,
         description="The objects of an instance, with ${…} over parameters and instance (name, key, namespace, and "
@@ -85,6 +92,17 @@ class ApplicationTemplateSpec(Model):
         "${instance.name}.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
+    helm: Helm | None = Field(
+        default=None,
+        description="A Helm chart in place of manifests. Its objects are applied as manifests are, of the same kinds; "
+        "the release's name is the instance's.",
+    )
+
+    @model_validator(mode="after")
+    def _one_kind_of_objects(self) -> ApplicationTemplateSpec:
+        if bool(self.manifests) == (self.helm is not None):
+            raise ValueError(_ONE_OF)
+        return self
 
     @field_validator("manifests")
     @classmethod

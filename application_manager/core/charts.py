@@ -1,0 +1,163 @@
+"""Helm charts as applications: what is asked of Helm, and the objects in what it answers. Pure.
+
+The program itself runs elsewhere. Here a template and an instance become a request, the text that `helm template` gave
+for it becomes objects, and everything that is not applied like a manifest is refused: hooks, which would run at moments
+that there are not here, and CRDs, which are the cluster's and not a namespace's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from wayside.api.chart import Helm
+
+UNAVAILABLE = "ChartUnavailable"
+"""The reason where the chart cannot be had."""
+FAILED = "RenderFailed"
+"""The reason where it cannot be rendered, as for manifests."""
+
+MAXIMUM_OBJECTS = 256
+"""In one chart: an instance's status names them all."""
+
+_DOCUMENT = re.compile(r"^---[ \t]*$", re.MULTILINE)
+_SOURCE = re.compile(r"^# Source: (?:[^/\n]*/)?(.+)$", re.MULTILINE)
+_HOOK = "helm.sh/hook"
+
+
+@dataclass(frozen=True, slots=True)
+class ChartSource:
+    """Where a chart is, as the template says."""
+
+    chart: str
+    version: str | None = None
+    repository: str | None = None
+
+    @classmethod
+    def of(cls, helm: Helm) -> ChartSource:
+        """The source that a template names."""
+        return cls(helm.chart, helm.version, helm.repository)
+
+    def __str__(self) -> str:
+        version = f" {self.version}" if self.version else ""
+        return f"{self.chart}{version}" + (f" of {self.repository}" if self.repository else "")
+
+
+@dataclass(frozen=True, slots=True)
+class ChartRequest:
+    """One rendering of a chart: for one instance, with one set of values.
+
+    Attributes:
+        release: the instance's name.
+        values: canonical JSON.
+    """
+
+    source: ChartSource
+    namespace: str
+    release: str
+    values: str
+
+
+@dataclass(frozen=True, slots=True)
+class ChartObject:
+    """One object of a chart, and the file in the chart that it comes from."""
+
+    file: str
+    manifest: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ChartObjects:
+    """What a chart was rendered to, in Helm's order."""
+
+    objects: tuple[ChartObject, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ChartFailure:
+    """Why there is none: the reason of the condition Applied, and the problem with its remedy."""
+
+    reason: str
+    message: str
+
+
+ChartOutcome = ChartObjects | ChartFailure
+
+Charts = Callable[[ChartRequest], ChartOutcome | None]
+"""What came of a request; None where it is still to come."""
+
+
+def no_charts(request: ChartRequest) -> ChartOutcome:
+    """For where there is no Helm."""
+    return ChartFailure(UNAVAILABLE, f"spec.helm: chart {request.source} cannot be rendered here: there is no helm")
+
+
+def parse(source: ChartSource, text: str) -> ChartOutcome:
+    """The objects in what `helm template --include-crds` wrote, or why they cannot be used."""
+    objects: list[ChartObject] = []
+    problems: list[str] = []
+    for part in _DOCUMENT.split(text):
+        found = _SOURCE.search(part)
+        file = found[1] if found else "?"
+        try:
+            manifest = yaml.load(part, Loader=_Loader)  # noqa: S506  a safe loader, with fewer types
+        except yaml.YAMLError as error:
+            problems.append(f"{file} is no YAML: {error}")
+            continue
+        if manifest is None:
+            continue
+        found_problems = list(_problems(file, manifest))
+        problems += found_problems
+        if not found_problems:
+            objects.append(ChartObject(file, manifest))
+    if len(objects) > MAXIMUM_OBJECTS:
+        problems.append(f"it has {len(objects)} objects, more than {MAXIMUM_OBJECTS}: use a smaller chart")
+    if not objects and not problems:
+        problems.append("it has no objects with these values: give others")
+    if problems:
+        return ChartFailure(FAILED, f"spec.helm: chart {source}: {'; '.join(problems)}")
+    return ChartObjects(tuple(objects))
+
+
+def _problems(file: str, manifest: Any) -> Iterator[str]:
+    if not isinstance(manifest, dict) or not all(isinstance(manifest.get(each), str) for each in _LITERAL):
+        yield f"{file} has something that is no object: apiVersion and kind are missing"
+        return
+    metadata = manifest.get("metadata")
+    name = metadata.get("name") if isinstance(metadata, dict) else None
+    what = f"{manifest['kind']} {name} in {file}"
+    annotations = metadata.get("annotations") if isinstance(metadata, dict) else None
+    if isinstance(annotations, dict) and _HOOK in annotations:
+        yield (
+            f"{what} is a hook ({annotations[_HOOK]}), and nothing here runs hooks: turn it off by the chart's values, "
+            "or make its work part of the application"
+        )
+    elif manifest["kind"] == "CustomResourceDefinition":
+        yield (
+            f"{what} is a CRD, which is the whole cluster's: let the administrator install it, and turn it off by the "
+            "chart's values, or use the chart without its folder crds/"
+        )
+
+
+_LITERAL = ("apiVersion", "kind")
+
+
+class _Loader(yaml.CSafeLoader):
+    """Reads plain scalars as Kubernetes' tools do: a date or a time of day is text, and 1e3 a number."""
+
+
+_NUMBERS = {
+    "tag:yaml.org,2002:int": re.compile(r"[-+]?(0|[1-9][0-9_]*|0[0-7_]+|0x[0-9a-fA-F_]+|0b[01_]+)$"),
+    "tag:yaml.org,2002:float": re.compile(
+        r"([-+]?([0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*|[0-9][0-9_]*(?=[eE]))([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)"
+        r"|\.(nan|NaN|NAN))$"
+    ),
+}
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, _NUMBERS.get(tag, pattern)) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}

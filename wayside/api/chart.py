@@ -1,0 +1,68 @@
+"""A Helm chart as an application: which one, and the values that it is rendered with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from wayside.api.base import Model, validations
+
+OCI = "oci://"
+
+_FORMS = (
+    "write oci://… of a registry with a version, the name of a chart with its repository and version, or the absolute "
+    "path of a folder or archive in the manager's image"
+)
+_VERSION = r"^v?[0-9]+(\.[0-9]+){0,2}(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?$"
+
+
+class Helm(Model):
+    """A chart and its values."""
+
+    model_config = validations(
+        (
+            "self.chart.startsWith('/') ? !has(self.version) && !has(self.repository) : has(self.version)",
+            "a chart of a registry or repository needs a version, and a path has neither version nor repository",
+        ),
+        (
+            "self.chart.startsWith('/') || self.chart.startsWith('oci://') != has(self.repository)",
+            "a chart's name needs its repository, and oci://… has none",
+        ),
+    )
+
+    chart: str = Field(
+        min_length=1,
+        max_length=512,
+        # No `-` at the beginning: it is an argument of a program.
+        pattern=r"^(oci://[a-zA-Z0-9][^ ?#@]*|/[^ ]+|[a-zA-Z0-9][a-zA-Z0-9._-]*)$",
+        description="oci://… of a registry, a name in `repository`, or a path in the manager's image.",
+    )
+    version: str | None = Field(
+        default=None,
+        max_length=128,
+        pattern=_VERSION,
+        description="The exact version, not a range: the same template must always give the same objects.",
+    )
+    repository: str | None = Field(
+        default=None,
+        max_length=512,
+        pattern=r"^https?://[^ ]+$",
+        description="The URL of the chart repository, for a chart given by its name.",
+    )
+    values: dict[str, Any] = Field(
+        default_factory=dict,
+        description="The chart's values, with ${…} over parameters and instance (name, key, namespace, configMap).",
+        json_schema_extra={"x-kubernetes-preserve-unknown-fields": True},
+    )
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Helm:
+        if self.chart.startswith("/"):
+            if self.version is not None or self.repository is not None:
+                raise ValueError(f"chart {self.chart} is a path, which has neither version nor repository: remove them")
+        elif self.version is None:
+            raise ValueError(f"chart {self.chart} needs an exact version: {_FORMS}")
+        elif self.chart.startswith(OCI) == (self.repository is not None):
+            raise ValueError(f"chart {self.chart} does not say where it is: {_FORMS}")
+        return self
