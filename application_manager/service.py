@@ -126,14 +126,12 @@ class Manager:
         self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances, measures)
         queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules)
         measures.registry.register(Overview(self._world, lambda: [(each.name, *each.depth) for each in queues]))
-        self._tasks: WorkQueue[Name] = WorkQueue("task", self._reconcile_task, _STATUS_WORKERS, self._instances)
-        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances)
-        self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances)
         self._publisher = Publisher(options.zenoh)
         self._configurations: WorkQueue[Name] = WorkQueue(
             "configuration",
             ConfigurationWork(self._world, client, applier, self._publisher).reconcile,
             _CONFIGURATION_WORKERS,
+            measures=measures,
         )
         self._router = Router(
             self._world,
