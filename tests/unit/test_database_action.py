@@ -251,7 +251,7 @@ def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_eac
 def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_whole(
     desk: MakeDesk, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("detector.actions.database.store.MEMORY", 100_000)
+    monkeypatch.setattr("detector.actions.database.queue.MEMORY", 100_000)
     keep = desk(spool=400_000)
     way.cut()
     early, late = keep.begin("e1"), keep.begin("e2")

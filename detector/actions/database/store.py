@@ -1,8 +1,7 @@
-"""The queue before the server: what is put into it is written in its order, each once, or counted as lost.
+"""What is put into it is written in its order, each once, or counted as lost.
 
-It begins in memory. While the server is away, what is there moves to the spool on disk, whose records are always older
-than what is in memory. Where neither has room, what is *new* is dropped: so scenarios that are in the queue stay whole,
-and whoever puts learns it at once. One queue and one thread serve all database actions of the process.
+A thread of its own sends what is in the queue, again and again until the server has it. What the server refuses is
+found among what it takes. One queue and one thread serve all database actions of the process.
 """
 
 from __future__ import annotations
@@ -11,21 +10,19 @@ import logging
 import random
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import bson
 
 from detector.actions.database import scenario as scenarios
+from detector.actions.database.queue import Queue
 from detector.actions.database.server import RefusedError, Server, UnavailableError
 from detector.actions.database.spool import Spool
-from detector.actions.database.work import Write, unpacked
+from detector.actions.database.work import Write
 
 _log = logging.getLogger(__name__)
 
-MEMORY = 64 * 2**20
-"""So many bytes wait in memory at most."""
 _LONGEST = 5.0
 """Between two attempts lie at most so many seconds."""
 _SUSPECT = 3
@@ -50,28 +47,18 @@ class Store:
     def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
         """`lose` is told what is lost of an earlier run's records."""
         self._server = server
-        self._spool = spool
         self._lose = lose
-        self._capacity = MEMORY
-        self._lock = threading.Condition()
-        self._disk = threading.Lock()
-        """Held while records are moved, taken or removed; never together with a request to the server."""
+        self._queue = Queue(spool, lose)
+        self._lock = self._queue.changed
         self._left = False
-        self._memory: deque[Write] = deque()
-        self._bytes = 0
+        self._spooling = spool is not None
         self._away = ""
         self._closing = False
         self._deadline = 0.0
         self._confirms: dict[str, Confirm] = {}
         self._seen: set[Any] = set()
-        self._inherited = 0 if spool is None else spool.records
-        """So many records at the head of the spool are an earlier run's: it is not known what it lost before them."""
-        self._doubts = not server.sure
+        self._doubts = not server.sure or (spool is not None and spool.damaged > 0)
         """Documents may be missing of which it is not known: each scenario's are counted before it is completed."""
-        if spool is not None and spool.damaged:
-            lose("bytes of the database's spool", spool.damaged, "a crash or the disk damaged them")
-        if spool is not None and spool.records:
-            _log.info("database: %d requests of an earlier run wait in the spool", spool.records)
         self.written = 0
         """Documents that are in the database."""
         self._thread = threading.Thread(target=self._work, name="database", daemon=True)
@@ -85,7 +72,7 @@ class Store:
     @property
     def waiting(self) -> int:
         """How many bytes wait, in memory and on disk."""
-        return self._bytes + (0 if self._spool is None else self._spool.bytes)
+        return self._queue.bytes
 
     def first_time(self, what: object) -> bool:
         """Whether it is asked for the first time."""
@@ -96,16 +83,15 @@ class Store:
 
     def put(self, write: Write, closing: threading.Event) -> bool:
         """Queue documents. Waits while the server is only slow; False where there is no room: they are dropped."""
-        size = write.size
         waited = 0
         while True:
             with self._lock:
                 if self._left:
                     return False
-                if not self._bytes or self._bytes + size <= self._capacity:
-                    self._add(write, size)
+                if self._queue.has_room(write.size):
+                    self._queue.add(write)
                     return True
-                nowhere = self._away and (self._spool is None or self._stuck)
+                nowhere = self._away and self._queue.full
                 ending = closing.is_set() or self._closing
                 if nowhere or (ending and waited >= _PATIENCE):
                     return False
@@ -113,7 +99,7 @@ class Store:
                     self._lock.wait(0.1)
             waited = _PATIENCE if ending else waited + 1
             if waited >= _PATIENCE:  # the server hangs on a request, or there is no time: the disk makes room
-                self._spill()
+                self._queue.spill()
 
     def put_change(self, write: Write, confirm: Confirm | None = None) -> None:
         """Queue what is said about scenarios: small, and never dropped."""
@@ -121,18 +107,10 @@ class Store:
             if not self._left:
                 if confirm is not None:
                     self._confirms[write.completes] = confirm
-                self._add(write, write.size)
+                self._queue.add(write)
                 return
         if confirm is not None:
             confirm(False, self._end_text())
-
-    _stuck = False
-    """The spool takes nothing more for now."""
-
-    def _add(self, write: Write, size: int) -> None:
-        self._memory.append(write)
-        self._bytes += size
-        self._lock.notify_all()
 
     def close(self, seconds: float) -> None:
         """Write what there is, at most for so long; the rest goes to the spool, or is lost where there is none."""
@@ -153,8 +131,8 @@ class Store:
                 write = self._next()
                 if write is None:
                     break
-                if self._send(write):
-                    self._took(write)
+                if self._send(write) and not self._left:
+                    self._queue.done()
             except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue goes on, since doing twice is doing once
                 self._lose("times the database's queue had to begin anew", 1, self._server.redact(error))
                 _log.error("database: the queue begins anew: %s", type(error).__name__)
@@ -167,45 +145,13 @@ class Store:
 
     def _next(self) -> Write | None:
         """The oldest request, which stays where it is; None at the end."""
-        while True:
-            with self._disk:
-                if (record := self._from_disk()) is not None:
-                    return record
-                with self._lock:
-                    if self._memory:
-                        return self._memory[0]
+        while (write := self._queue.first()) is None:
             with self._lock:
-                if not self._memory:
-                    if self._closing:
-                        return None
+                if self._closing:
+                    return None
+                if self._queue.bytes == 0:
                     self._lock.wait(1)
-
-    def _from_disk(self) -> Write | None:
-        """The oldest request in the spool. What cannot be read is left out: its scenarios then lack documents."""
-        while self._spool is not None:
-            try:
-                record = self._spool.first()
-                return None if record is None else unpacked(record)
-            except (OSError, bson.errors.BSONError, KeyError) as error:
-                lost = self._spool.give_up()
-                self._inherited = max(0, self._inherited - lost)
-                self._doubts = True
-                self._lose("requests in the database's spool", lost, f"unreadable: {type(error).__name__}")
-        return None
-
-    def _took(self, write: Write) -> None:
-        """The oldest request is done."""
-        with self._disk, self._lock:
-            if self._left:
-                return
-            if self._spool is not None and self._spool.records:
-                self._spool.done()
-                self._stuck = False
-                self._inherited = max(0, self._inherited - 1)
-            elif self._memory:
-                self._memory.popleft()
-                self._bytes -= write.size
-            self._lock.notify_all()
+        return write
 
     def _send(self, write: Write, patience: int = _SUSPECT) -> bool:
         """Write it, however often that takes; False where there is no more time.
@@ -215,7 +161,8 @@ class Store:
         pause, broke = 0.05, 0
         while True:
             try:
-                lacking = self._server.lacks(write) if self._doubts or self._inherited else ""
+                doubts = self._doubts or self._queue.damaged or self._queue.inherited
+                lacking = self._server.lacks(write) if doubts else ""
                 matched, refused = self._server.write(scenarios.give_up(write, lacking) if lacking else write)
             except RefusedError as error:
                 return self._divide(write, str(error))
@@ -275,67 +222,34 @@ class Store:
         """Wait before the next attempt; what comes meanwhile goes to the disk. False where there is no more time."""
         until = time.monotonic() + seconds
         while True:
-            self._spill()
+            self._queue.spill()
             with self._lock:
                 left = until - time.monotonic()
                 if left <= 0 or self._late():
                     return not self._late()
                 self._lock.wait(min(left, 0.2))
 
-    def _spill(self) -> None:
-        """Move what is in memory to the disk, oldest first, as far as there is room."""
-        spool = self._spool
-        if spool is None:
-            return
-        with self._disk:
-            try:
-                self._stuck = not self._move(spool)
-            except OSError as error:
-                if not self._stuck:
-                    _log.warning("database: the spool takes nothing more: %s", error.strerror or type(error).__name__)
-                self._stuck = True
-
-    def _move(self, spool: Spool) -> bool:
-        """False where there is no room for more."""
-        moved = 0
-        while self._memory:
-            write = self._memory[0]
-            if not spool.append(write.packed()):
-                break
-            with self._lock:
-                self._memory.popleft()
-                self._bytes -= write.size
-                self._lock.notify_all()
-            moved += 1
-        if moved:
-            spool.sync()
-        return not self._memory
-
     def _leave(self) -> None:
         """What is not written waits on disk for the next run, or is lost."""
-        self._spill()
         with self._lock:
             if self._left:
                 return
             self._left = True
-            for write in self._memory:
-                if write.documents:
-                    lose = write.losing or self._lost_earlier
-                    lose(len(write.documents), "the detector ended before it was written")
-            self._memory.clear()
-            confirms, self._confirms = self._confirms, {}
+        for write in self._queue.close():
+            if write.documents:
+                lose = write.losing or self._lost_earlier
+                lose(len(write.documents), "the detector ended before it was written")
+        confirms, self._confirms = self._confirms, {}
         for confirm in confirms.values():
             confirm(False, self._end_text())
-        if self._spool is not None:
-            self._spool.close()
 
     def _end_text(self) -> str:
-        where = "what is not written waits in the spool" if self._spool is not None else "there is no spool"
+        where = "what is not written waits in the spool" if self._spooling else "there is no spool"
         return f"the detector ended before the database had it ({self._away or 'it was busy'}); {where}"
 
     def _note_away(self, why: str) -> None:
         if not self._away:
-            where = "waits in the spool on disk" if self._spool is not None else "waits in memory: there is no spool"
+            where = "waits in the spool on disk" if self._spooling else "waits in memory: there is no spool"
             _log.warning("database: cannot be written to: %s; what comes %s", why, where)
         self._away = why
 

@@ -1,0 +1,139 @@
+"""Requests in their order: in memory, and on disk while the server is away.
+
+The spool's records are always older than what is in memory. Where neither has room, what is *new* finds none, and
+whoever puts it learns that at once; what is in the queue stays whole.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+
+import bson
+
+from detector.actions.database.spool import Spool
+from detector.actions.database.work import Write, unpacked
+
+_log = logging.getLogger(__name__)
+
+MEMORY = 64 * 2**20
+"""So many bytes wait in memory at most."""
+
+
+class Queue:
+    """Several threads put and move to the disk, one takes."""
+
+    def __init__(self, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
+        """`lose` is told what cannot be read of the spool."""
+        self.changed = threading.Condition()
+        """Held for a moment where the memory changes, and told of it."""
+        self._disk = threading.Lock()
+        """Held while records are moved, taken or removed; taken before the other."""
+        self._spool = spool
+        self._lose = lose
+        self._capacity = MEMORY
+        self._memory: deque[Write] = deque()
+        self._bytes = 0
+        self._inherited = 0 if spool is None else spool.records
+        self.full = spool is None
+        """The disk takes nothing more for now."""
+        self.damaged = False
+        """Something in the spool could not be read in this run."""
+        if spool is not None and spool.damaged:
+            lose("bytes of the database's spool", spool.damaged, "a crash or the disk damaged them")
+        if spool is not None and spool.records:
+            _log.info("database: %d requests of an earlier run wait in the spool", spool.records)
+
+    @property
+    def inherited(self) -> bool:
+        """Whether the oldest request is an earlier run's: it is not known what that run lost before it."""
+        return self._inherited > 0
+
+    @property
+    def bytes(self) -> int:
+        """That wait, in memory and on disk."""
+        return self._bytes + (0 if self._spool is None else self._spool.bytes)
+
+    def has_room(self, size: int) -> bool:
+        """Whether so many bytes fit into the memory."""
+        return not self._bytes or self._bytes + size <= self._capacity
+
+    def add(self, write: Write) -> None:
+        """Put it at the end, into the memory; `changed` is held."""
+        self._memory.append(write)
+        self._bytes += write.size
+        self.changed.notify_all()
+
+    def first(self) -> Write | None:
+        """The oldest request, which stays where it is; None where there is none."""
+        with self._disk:
+            if (write := self._from_disk()) is not None:
+                return write
+            with self.changed:
+                return self._memory[0] if self._memory else None
+
+    def _from_disk(self) -> Write | None:
+        """The oldest in the spool. What cannot be read is left out: its scenarios then lack documents."""
+        while self._spool is not None:
+            try:
+                record = self._spool.first()
+                return None if record is None else unpacked(record)
+            except (OSError, bson.errors.BSONError, KeyError) as error:
+                lost = self._spool.give_up()
+                self._inherited = max(0, self._inherited - lost)
+                self.damaged = True
+                self._lose("requests in the database's spool", lost, f"unreadable: {type(error).__name__}")
+        return None
+
+    def done(self) -> None:
+        """The oldest request is not needed any more."""
+        with self._disk, self.changed:
+            if self._spool is not None and self._spool.records:
+                self._spool.done()
+                self.full = False
+                self._inherited = max(0, self._inherited - 1)
+            elif self._memory:
+                self._bytes -= self._memory.popleft().size
+            self.changed.notify_all()
+
+    def spill(self) -> None:
+        """Move what is in memory to the disk, oldest first, as far as there is room."""
+        if self._spool is None:
+            return
+        with self._disk:
+            try:
+                self.full = not self._move(self._spool)
+            except OSError as error:
+                if not self.full:
+                    _log.warning("database: the spool takes nothing more: %s", error.strerror or type(error).__name__)
+                self.full = True
+
+    def _move(self, spool: Spool) -> bool:
+        """False where there is no room for more."""
+        moved = 0
+        while self._memory:
+            write = self._memory[0]
+            if not spool.append(write.packed()):
+                break
+            with self.changed:
+                self._memory.popleft()
+                self._bytes -= write.size
+                self.changed.notify_all()
+            moved += 1
+        if moved:
+            spool.sync()
+        return not self._memory
+
+    def close(self) -> list[Write]:
+        """What found no place on the disk, and is lost with the process."""
+        self.spill()
+        with self._disk, self.changed:
+            left = list(self._memory)
+            self._memory.clear()
+            self._bytes = 0
+            if self._spool is not None:
+                self._spool.close()
+                self._spool = None
+            return left
