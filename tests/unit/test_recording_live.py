@@ -102,6 +102,16 @@ def finished(process: Process, count: int) -> list[Path]:
     raise AssertionError(f"{[*process.folder.rglob('*')]}\n{(process.folder / 'log').read_text()}")
 
 
+def until_written(process: Process, size: int) -> None:
+    """The kernel has so much of a recording in progress."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        if sum(each.stat().st_size for each in process.folder.glob("recordings/*/.*/*.mcap")) >= size:
+            return
+        time.sleep(0.05)
+    raise AssertionError((process.folder / "log").read_text())
+
+
 @pytest.mark.parametrize("clock", ["Wall", "Data"])
 def test_overlapping_episodes_have_exactly_their_samples(process: Process, clock: str) -> None:
     data = {"clock": "Data", "lateness": "300ms", "maxAhead": "10s"} if clock == "Data" else {}
@@ -143,7 +153,8 @@ def test_a_killed_detector_leaves_what_it_wrote_and_goes_on_in_another_recording
     vehicle.start()
     vehicle.join()
     process.status_when(lambda status: status.streams[1].samples >= 25 and bool(status.rules[0].open))
-    time.sleep(1.2)  # longer than what a kill may cost, with all that waits between
+    everything = sum(31 + len(payload) for _, _, payload in vehicle.sent)  # as the file has them
+    until_written(process, everything)
     process.process.send_signal(signal.SIGKILL)
     process.process.wait()
     process.vehicle.close()  # type: ignore[no-untyped-call]
