@@ -132,6 +132,8 @@ class Book:
         return ""
 
     def _forget(self) -> None:
+        if len(self._entries) <= _REMEMBERED:
+            return
         over = [entry.id for entry in self._entries.values() if entry.state.over]
         for identity in over[: max(0, len(over) - _REMEMBERED)]:
             del self._entries[identity]

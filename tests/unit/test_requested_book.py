@@ -83,7 +83,7 @@ def test_an_id_is_begun_once_and_never_more_at_a_time_than_are_allowed(happening
 
 def test_what_is_over_is_forgotten_at_last() -> None:
     book = Book()
-    for number in range(3000):
+    for number in range(600):
         book.start(start(f"x{number}"), OnRequest(), STREAMS, NOW)
         book.heard(f"x{number}", Outcome(OutcomeState.DONE))
         book.stop(stop(f"y{number}"), NOW)
