@@ -146,7 +146,8 @@ class ControlPlane:
         child = self._controller_manager = Child("kube-controller-manager", command, log)
         probe = f"probe-{secrets.token_hex(3)}"
         api = self.api(probe)
-        api.create({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": probe}})
+        namespace = {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": probe}}
+        self._wait(child, lambda: bool(api.apply(namespace)), f"kube-apiserver takes the namespace {probe}")
         what = f"kube-controller-manager made the service account of the new namespace {probe}"
         self._wait(child, lambda: api.find("ServiceAccount", "default") is not None, what)
         api.delete("Namespace", probe)
