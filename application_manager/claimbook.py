@@ -9,8 +9,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from application_manager.core.claims import Claim, InvalidTemplate, Refused
-from application_manager.core.demand import Standing, Verdict, claim_or_verdict
+from application_manager.core.demand import claim_or_verdict
 from application_manager.core.leases import HolderKey
+from application_manager.core.operations import Standing, Verdict
 from application_manager.store import Entry, Name
 from wayside.api import ApplicationTask, ApplicationTemplate
 

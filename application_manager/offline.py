@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from application_manager.core import drafting
-from application_manager.core.demand import Decision, Standing, demand
+from application_manager.core.demand import Decision, demand
+from application_manager.core.operations import Standing
 from application_manager.core.policy import Policy
 from application_manager.core.rendering import Renderer, RenderError
 from wayside.api import ApplicationTask, ApplicationTemplate, Kind

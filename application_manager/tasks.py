@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core.claims import Refused
 from application_manager.core.conditions import changed, holds
-from application_manager.core.demand import Standing, Verdict
+from application_manager.core.operations import Standing, Verdict
 from application_manager.core.status import Service, difference, finished_since, task_status
 from application_manager.measures import Measures
 from application_manager.recorder import Recorder

@@ -9,8 +9,9 @@ from typing import Final, TypeVar
 from application_manager.apply import Applied
 from application_manager.claimbook import ClaimBook
 from application_manager.core.claims import InvalidTemplate
-from application_manager.core.demand import Decision, Verdict, decide, written_deadline
+from application_manager.core.demand import Decision, decide, written_deadline
 from application_manager.core.leases import HealthyTime, LeaseBook, LeaseView
+from application_manager.core.operations import Verdict
 from application_manager.core.policy import KindKey, Policy
 from application_manager.core.rendering import Renderer, RenderError
 from application_manager.core.status import Service

@@ -15,6 +15,7 @@ from typing import Any
 
 from application_manager.core import parameters, values
 from wayside.api import ApplicationTask, ApplicationTemplate
+from wayside.api.operation import Operation
 from wayside.expressions import (
     CompiledTemplate,
     Embedded,
@@ -36,6 +37,7 @@ class Refused(StrEnum):
     INVALID_PARAMETERS = "InvalidParameters"
     INVALID_KEY = "InvalidKey"
     CONFLICT = "Conflict"
+    OUTBID = "Outbid"
     INSTANCE_NOT_MANAGED = "InstanceNotManaged"
     INVALID_TASK = "InvalidTask"
 
@@ -50,12 +52,22 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A task's demand on one instance; `parameters` are those that the task itself gives."""
+    """A task's demand on one instance, or on all of a template.
+
+    Attributes:
+        instance: its name, or what `all_instances` gives for the template.
+        parameters: those that the task itself gives; without the key's where it acts on what runs.
+    """
 
     task: ApplicationTask
     instance: str
     key: str | None
     parameters: Mapping[str, Any]
+
+    @property
+    def operation(self) -> Operation:
+        """What the task does to it."""
+        return self.task.spec.operation
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +90,62 @@ def claim(template: ApplicationTemplate | InvalidTemplate | None, task: Applicat
             "create it, or correct the rule that emitted this task",
         )
     declared = template.spec.parameters
-    problems = parameters.problems(declared, task.spec.parameters, template.name, "spec.parameters")
+    deploys = task.spec.operation is Operation.DEPLOY
+    problems = parameters.problems(declared, task.spec.parameters, template.name, "spec.parameters", whole=deploys)
     if problems:
         return Refusal(Refused.INVALID_PARAMETERS, "; ".join(problems))
     given = parameters.given(task.spec.parameters)
+    if not deploys:
+        return _on_what_runs(template, task, given)
     if template.spec.key is None:
         return Claim(task, template.name, None, given)
+    key = _key_or_refusal(template, given)
+    return key if isinstance(key, Refusal) else Claim(task, instance_name(template.name, key), key, given)
+
+
+def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: Mapping[str, Any]) -> Claim | Refusal:
+    """The claim of a task that reconfigures or suspends: on the instance of its key, or on all."""
+    declared, operation = template.spec.parameters, task.spec.operation
     try:
-        key = instance_key(template, parameters.with_defaults(declared, given))
+        of_key = key_parameters(template)
+    except InterpolationError as error:
+        return Refusal(Refused.INVALID_KEY, f"the key of template {template.name}, {error}")
+    rest = {name: value for name, value in given.items() if name not in of_key}
+    if operation is Operation.SUSPEND and rest:
+        name, value = next(iter(rest.items()))
+        return Refusal(
+            Refused.INVALID_PARAMETERS,
+            f"spec.parameters.{name}: {values.shown(value)} is given, but a Suspend task changes no parameter: remove "
+            f"it{_which(of_key)}",
+        )
+    if operation is Operation.RECONFIGURE and not rest:
+        return Refusal(
+            Refused.INVALID_PARAMETERS,
+            f"spec.parameters: {values.shown(dict(given))} has nothing to change: give at least one parameter of "
+            f"template {template.name}{_which(of_key)}",
+        )
+    if template.spec.key is None:
+        return Claim(task, template.name, None, rest)
+    if not of_key & given.keys():
+        return Claim(task, all_instances(template.name), None, rest)
+    missing = sorted(name for name in of_key - given.keys() if declared[name].default is None)
+    if missing:
+        return Refusal(
+            Refused.INVALID_KEY,
+            f"spec.parameters.{missing[0]}: is missing, and the key of template {template.name}, {template.spec.key}, "
+            "needs it to tell the instance: give it, or give none of the key's parameters to mean all instances",
+        )
+    key = _key_or_refusal(template, given)
+    return key if isinstance(key, Refusal) else Claim(task, instance_name(template.name, key), key, rest)
+
+
+def _which(of_key: frozenset[str]) -> str:
+    return f" (the key's, {', '.join(sorted(of_key))}, only say which instance is meant)" if of_key else ""
+
+
+def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> str | Refusal:
+    try:
+        key = instance_key(template, parameters.with_defaults(template.spec.parameters, given))
     except InterpolationError as error:
         return Refusal(Refused.INVALID_KEY, f"the key of template {template.name}, {error}")
     if len(key) > MAXIMUM_KEY_LENGTH:
@@ -94,7 +154,17 @@ def claim(template: ApplicationTemplate | InvalidTemplate | None, task: Applicat
             f"the key of template {template.name}, {template.spec.key}, has {len(key)} characters for this task, "
             f"more than {MAXIMUM_KEY_LENGTH}: make it from shorter parameters",
         )
-    return Claim(task, instance_name(template.name, key), key, given)
+    return key
+
+
+def all_instances(template: str) -> str:
+    """What stands for all instances of the template where an instance's name stands else; no instance has this name."""
+    return f"{template}/*"
+
+
+def template_of_all(instance: str) -> str | None:
+    """The template, where the name stands for all its instances; else None."""
+    return instance.removesuffix("/*") if instance.endswith("/*") else None
 
 
 def instance_name(template: str, key: str | None) -> str:
@@ -118,6 +188,20 @@ def instance_key(template: ApplicationTemplate, complete: Mapping[str, Any]) -> 
             "is null for this task", path="spec.key", hint="give the parameters that it is made from"
         )
     return values.text(value)
+
+
+def key_parameters(template: ApplicationTemplate) -> frozenset[str]:
+    """The parameters that the key is made from; none where there is no key.
+
+    Raises InterpolationError where the key does not compile, or reads what is no parameter.
+    """
+    if template.spec.key is None:
+        return frozenset()
+    declared = tuple(sorted(template.spec.parameters))
+    paths = _compiled_key(template.spec.key, declared).paths
+    if any(len(path) == 1 for path in paths):  # it looks at the whole map
+        return frozenset(declared)
+    return frozenset(str(path[1]) for path in paths)
 
 
 @lru_cache(maxsize=1024)

@@ -10,13 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 
 from application_manager.core import byhand
-from application_manager.core.claims import Claim, InvalidTemplate, Refusal, Refused, claim
+from application_manager.core.claims import (
+    Claim,
+    InvalidTemplate,
+    Refusal,
+    Refused,
+    all_instances,
+    claim,
+    template_of_all,
+)
 from application_manager.core.leases import LeaseView
-from application_manager.core.merging import Contribution, merge
-from application_manager.core.parameters import with_defaults
+from application_manager.core.operations import Standing, Verdict, gathered, settle, waiting_for_any
+from application_manager.core.parameters import baseline
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle, LossPolicy
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Duration
@@ -28,25 +35,6 @@ LINGER_ANNOTATION = "wayside.dev/linger"
 
 HOLDER_LOST = "HolderLost"
 FINISH_LOST_AFTER = 3600.0  # s that a holder may be lost before its tasks are finished
-
-
-class Standing(StrEnum):
-    """What a task is to the demand."""
-
-    COUNTS = "Counts"
-    REFUSED = "Refused"
-    LAPSED = "Lapsed"
-    FINISHED = "Finished"
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What became of one task; reason and message are those of its condition Accepted, or Finished."""
-
-    standing: Standing
-    reason: str
-    message: str
-    instance: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +50,9 @@ class Decision:
         paused: whether a person wants the instance and its objects left as they are.
         withheld: whether the pause keeps merged values from the instance.
         capped: a word about each merged sum that is held at its parameter's bound.
+        baseline: whether the template demands it by itself.
+        suspended: whether it is to be at zero; None where that stays as it is.
+        suspender: the task that suspends it.
     """
 
     name: str
@@ -75,11 +66,14 @@ class Decision:
     paused: bool = False
     withheld: bool = False
     capped: tuple[str, ...] = ()
+    baseline: bool = False
+    suspended: bool | None = None
+    suspender: str | None = None
 
     @property
     def wanted(self) -> bool:
-        """Whether any task demands it."""
-        return bool(self.tasks)
+        """Whether any task demands it, or its template by itself."""
+        return bool(self.tasks) or self.baseline
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +111,13 @@ def demand(
             claimed.setdefault(verdict.instance, []).append(verdict)
         else:
             verdicts[task.name] = verdict
+    to_all = {name: claimed.pop(name) for name in list(claimed) if template_of_all(name)}
+    always = {name for name, each in by_name.items() if has_baseline(each)}
     decisions: dict[str, Decision] = {}
-    for name in sorted(claimed.keys() | existing.keys()):
+    for name in sorted(claimed.keys() | existing.keys() | always):
         instance, claims = existing.get(name), claimed.get(name, [])
-        template = instance.spec.template if instance else claims[0].task.spec.template
+        template = instance.spec.template if instance else claims[0].task.spec.template if claims else name
+        claims = [*claims, *to_all.get(all_instances(template), [])]
         decision = decide(
             name,
             template,
@@ -135,7 +132,24 @@ def demand(
         if decision.wanted or instance:
             decisions[name] = decision
     changes = [each.next_change for each in decisions.values() if each.next_change is not None]
+    for name, claims in to_all.items():
+        of = template_of_all(name) or ""
+        alone = decide_for_all(name, template=by_name.get(of), claims=claims, leases=leases, now=now)
+        for each in claims:
+            parts = {
+                decision.name: decision.verdicts[each.task.name]
+                for decision in decisions.values()
+                if decision.template == of and each.task.name in decision.verdicts
+            }
+            verdicts[each.task.name] = gathered(each, parts, alone.verdicts[each.task.name])
+        if alone.next_change is not None:
+            changes.append(alone.next_change)
     return Outcome(decisions, verdicts, min(changes, default=None))
+
+
+def has_baseline(template: ApplicationTemplate | InvalidTemplate | None) -> bool:
+    """Whether the template demands its instance, which has its name, by itself."""
+    return isinstance(template, ApplicationTemplate) and baseline(template) is not None
 
 
 def claim_or_verdict(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Verdict:
@@ -173,10 +187,81 @@ def decide(
     if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
         key = instance.spec.key if instance else None
         return Decision(name, template_name, key, None, (), {}, None, None, paused)
+    live, verdicts, changes = _live(ordered, template, leases, now)
+    settled = settle(name, template, live, instance is not None)
+    keyed = [each for each in live if each.task.name in settled.tasks]
+    key = keyed[0].key if keyed else instance.spec.key if instance else None
+    wanted = settled.parameters is not None
+    suspended: bool | None = settled.suspender is not None
+    release_time = None
+    if not wanted and instance is not None and not paused and not byhand.is_held(instance):
+        linger = linger_of(instance, template).seconds  # from when we see that no demand is left
+        release_time = now + linger if deadline is None else deadline
+        changes.append(release_time)
+    if paused or template is None or (release_time is not None and instance is not None and instance.spec.suspended):
+        suspended = None  # what lingers is not started again
+    withheld = (
+        paused
+        and wanted
+        and instance is not None
+        and (
+            instance.spec.parameters != settled.parameters or instance.spec.suspended != (settled.suspender is not None)
+        )
+    )
+    return Decision(
+        name=name,
+        template=template_name,
+        key=key,
+        parameters=None if paused else settled.parameters,
+        tasks=settled.tasks,
+        verdicts=verdicts | settled.verdicts,
+        release_time=release_time,
+        next_change=min((change for change in changes if change > now), default=None),
+        paused=paused,
+        withheld=withheld,
+        capped=settled.capped,
+        baseline=settled.baseline,
+        suspended=suspended,
+        suspender=settled.suspender,
+    )
+
+
+def decide_for_all(
+    name: str,
+    *,
+    template: ApplicationTemplate | InvalidTemplate | None,
+    claims: Iterable[Claim],
+    leases: Mapping[str, LeaseView],
+    now: float,
+) -> Decision:
+    """The verdicts of tasks that mean all instances of a template, as far as these do not matter (see `gathered`).
+
+    It makes nothing run; `name` is what `all_instances` gives.
+    """
+    ordered = sorted(claims, key=lambda each: precedence(each.task))
+    usable = template if isinstance(template, ApplicationTemplate) else None
+    live, verdicts, changes = _live(ordered, usable, leases, now)
+    verdicts |= {each.task.name: waiting_for_any(each) for each in live}
+    return Decision(
+        name=name,
+        template=template_of_all(name) or "",
+        key=None,
+        parameters=None,
+        tasks=(),
+        verdicts=verdicts,
+        release_time=None,
+        next_change=min((change for change in changes if change > now), default=None),
+    )
+
+
+def _live(
+    ordered: Iterable[Claim], template: ApplicationTemplate | None, leases: Mapping[str, LeaseView], now: float
+) -> tuple[list[Claim], dict[str, Verdict], list[float]]:
+    """The claims whose holders are not lost, the verdicts of the others, and when any of this changes by itself."""
+    lifecycle = template.spec.lifecycle if template else Lifecycle()
+    live: list[Claim] = []
     verdicts: dict[str, Verdict] = {}
     changes: list[float] = []
-    live: list[Claim] = []
-    lifecycle = template.spec.lifecycle if template else Lifecycle()
     for each in ordered:
         lapse, change = _lapse(each.task, lifecycle, leases, now)
         if change is not None:
@@ -185,36 +270,7 @@ def decide(
             live.append(each)
         else:
             verdicts[each.task.name] = lapse
-    declared = template.spec.parameters if template else {}
-    merged = merge(declared, [Contribution(each.task.name, each.parameters) for each in live])
-    values = with_defaults(declared, merged.parameters)
-    contributing = [each for each in live if each.task.name not in merged.conflicts]
-    for each in live:
-        conflict = merged.conflicts.get(each.task.name)
-        verdicts[each.task.name] = (
-            Verdict(Standing.REFUSED, Refused.CONFLICT, conflict.message())
-            if conflict
-            else Verdict(Standing.COUNTS, "Accepted", f"counts for instance {name}", name)
-        )
-    key = contributing[0].key if contributing else instance.spec.key if instance else None
-    release_time = None
-    if not contributing and instance is not None and not paused and not byhand.is_held(instance):
-        linger = linger_of(instance, template).seconds  # from when we see that no demand is left
-        release_time = now + linger if deadline is None else deadline
-        changes.append(release_time)
-    return Decision(
-        name=name,
-        template=template_name,
-        key=key,
-        parameters=values if contributing and not paused else None,
-        tasks=tuple(each.task.name for each in contributing),
-        verdicts=verdicts,
-        release_time=release_time,
-        next_change=min((change for change in changes if change > now), default=None),
-        paused=paused,
-        withheld=paused and bool(contributing) and instance is not None and instance.spec.parameters != values,
-        capped=merged.capped if contributing else (),
-    )
+    return live, verdicts, changes
 
 
 def precedence(task: ApplicationTask) -> tuple[int, str, str]:

@@ -25,10 +25,16 @@ RendererOf = Callable[[ApplicationTemplate], Renderer]
 
 def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) -> ApplicationInstance:
     """The instance as it should be; without a uid where it does not exist yet."""
+    suspended = bool(existing and existing.spec.suspended) if decision.suspended is None else decision.suspended
     if existing is not None and decision.parameters is None:
-        return existing
+        if suspended == existing.spec.suspended:
+            return existing
+        return existing.model_copy(update={"spec": existing.spec.model_copy(update={"suspended": suspended})})
     spec = ApplicationInstanceSpec(
-        template=decision.template, key=decision.key, parameters=dict(decision.parameters or {})
+        template=decision.template,
+        key=decision.key,
+        parameters=dict(decision.parameters or {}),
+        suspended=suspended,
     )
     if existing is not None:
         return existing.model_copy(update={"spec": spec})

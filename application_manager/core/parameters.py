@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from application_manager.core import patterns, values
+from wayside.api import ApplicationTemplate
 from wayside.api.applicationtask import MAXIMUM_PARAMETER_BYTES
 from wayside.api.parameter import Parameter
 
@@ -29,8 +30,13 @@ def with_defaults(declared: Mapping[str, Parameter], parameters: Parameters) -> 
     return dict(sorted((defaults | given(parameters)).items()))
 
 
-def problems(declared: Mapping[str, Parameter], parameters: Parameters, template: str, where: str) -> list[str]:
-    """Why the parameters do not fit the template; each text names the field under `where`, the value and the remedy."""
+def problems(
+    declared: Mapping[str, Parameter], parameters: Parameters, template: str, where: str, *, whole: bool = True
+) -> list[str]:
+    """Why the parameters do not fit the template; each text names the field under `where`, the value and the remedy.
+
+    Required ones may be missing where the parameters are not meant to be the `whole`.
+    """
     size = len(json.dumps(dict(parameters), ensure_ascii=False, separators=(",", ":")).encode())
     if size > MAXIMUM_PARAMETER_BYTES:
         return [
@@ -46,7 +52,7 @@ def problems(declared: Mapping[str, Parameter], parameters: Parameters, template
         elif problem := _problem(parameter, value):
             found.append(f"{where}.{name}: {problem}")
     for name, parameter in declared.items():
-        if parameter.required and name not in present:
+        if whole and parameter.required and name not in present:
             found.append(f"{where}.{name}: is missing, and template {template} requires it: give a {parameter.type}")
     return found
 
@@ -78,9 +84,24 @@ def _remedy(parameter: Parameter) -> str:
     return "give " + " ".join(part for part in (f"a value of type {kind}", " and ".join(bounds), choice, match) if part)
 
 
-def template_problems(declared: Mapping[str, Parameter]) -> list[str]:
-    """What is wrong with the patterns of the parameters that a template declares; its model has checked all else."""
-    found = []
+def baseline(template: ApplicationTemplate) -> dict[str, Any] | None:
+    """The values of the template's baseline; None where it has none, or one that does not fit, which it is told."""
+    spec = template.spec
+    if spec.baseline is None or _baseline_problems(template):
+        return None
+    return given(spec.baseline.parameters)
+
+
+def _baseline_problems(template: ApplicationTemplate) -> list[str]:
+    said = template.spec.baseline
+    if said is None:
+        return []
+    return problems(template.spec.parameters, said.parameters, template.name, "spec.baseline.parameters")
+
+
+def template_problems(template: ApplicationTemplate) -> list[str]:
+    """What is wrong with the template's parameters and its baseline, beside what its model has checked."""
+    declared, found = template.spec.parameters, _baseline_problems(template)
     for name, parameter in declared.items():
         if parameter.pattern is None:
             continue

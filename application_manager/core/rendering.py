@@ -68,7 +68,7 @@ class Renderer:
         self._policy = policy
         self._keyed = template.spec.key is not None
         self._manifests: list[CompiledTemplate] = []
-        problems = parameters.template_problems(template.spec.parameters)
+        problems = parameters.template_problems(template)
         configured = bool(template.spec.configuration)
         members = _WITH_CONFIGURATION if configured else _INSTANCE_VARIABLES
         known = {"parameters": tuple(sorted(template.spec.parameters)), "instance": members}

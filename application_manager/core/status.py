@@ -12,7 +12,8 @@ from typing import Any
 
 from application_manager.core import byhand
 from application_manager.core.conditions import Aspect, find, holds, updated
-from application_manager.core.demand import Decision, Standing, Verdict
+from application_manager.core.demand import Decision
+from application_manager.core.operations import Standing, Verdict
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
 from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase

@@ -153,7 +153,7 @@ class RuleRun:
         Returns the event that told of its start then. Where an action is not what it was, its demand holds until it is
         rendered anew, at the next evaluation.
         """
-        deploys = {deploy.action: (deploy.template, deploy.priority) for deploy in self.rule.deploys}
+        deploys = {deploy.action: deploy.fixed for deploy in self.rule.deploys}
         self._states[episode.subject] = SubjectState(is_open=True)
         self._open[episode.subject] = Episode(
             episode.episode,
@@ -163,7 +163,7 @@ class RuleRun:
             episode.values,
             None,
             {d.action: d for d in demands if d.action in deploys},
-            {d.action for d in demands if d.action in deploys and deploys[d.action] != (d.template, d.priority)},
+            {d.action for d in demands if d.action in deploys and deploys[d.action] != d.fixed},
         )
         return self._open[episode.subject].started(self.rule, self._identity)
 

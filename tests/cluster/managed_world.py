@@ -14,8 +14,9 @@ from pydantic import ValidationError
 
 from application_manager.core.byhand import is_held
 from application_manager.core.claims import InvalidTemplate
-from application_manager.core.demand import Outcome, Standing, demand, is_managed
+from application_manager.core.demand import Outcome, demand, is_managed
 from application_manager.core.leases import LeaseView
+from application_manager.core.operations import Standing
 from application_manager.core.policy import Policy
 from application_manager.core.rendering import Renderer, RenderError
 from application_manager.core.status import task_status

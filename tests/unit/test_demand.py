@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from application_manager.core.demand import Outcome, Standing, demand
+from application_manager.core.demand import Outcome, demand
 from application_manager.core.leases import LeaseView
+from application_manager.core.operations import Standing
 from tests.unit.manager_objects import NOW, instance, task, template
 
 FUSION = {

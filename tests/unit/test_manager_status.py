@@ -8,7 +8,7 @@ import pytest
 
 from application_manager.claimbook import ClaimBook
 from application_manager.core.conditions import Aspect, changed, updated
-from application_manager.core.demand import Standing, Verdict
+from application_manager.core.operations import Standing, Verdict
 from application_manager.core.status import Service, difference, finished_since, task_status
 from application_manager.store import Entry
 from tests.unit.manager_objects import NOW, task, template

@@ -22,6 +22,9 @@ class ApplicationInstanceSpec(Model):
     parameters: dict[Identifier, JsonValue] = Field(
         default_factory=dict, max_length=64, description="The merged values of the template's parameters."
     )
+    suspended: bool = Field(
+        default=False, description="true: its workloads are at zero, whoever demands it; status says what they were."
+    )
 
 
 class ObjectReference(Model):
@@ -33,6 +36,15 @@ class ObjectReference(Model):
     uid: str | None = Field(
         default=None, max_length=63, description="The object's uid; absent until it was applied for the first time."
     )
+
+
+class SuspendedReplicas(Model):
+    """A workload that is at zero, and how many replicas it goes back to."""
+
+    api_version: str = Field(max_length=255, description="The workload's apiVersion.")
+    kind: str = Field(max_length=63, description="The workload's kind.")
+    name: str = Field(max_length=253, description="The workload's name.")
+    replicas: int = Field(ge=0, description="How many it had, or was to have.")
 
 
 class Demands(Model):
@@ -53,6 +65,7 @@ class InstancePhase(StrEnum):
     PENDING = "Pending"
     APPLIED = "Applied"
     READY = "Ready"
+    SUSPENDED = "Suspended"
     LINGERING = "Lingering"
     FAILED = "Failed"
 
@@ -78,11 +91,18 @@ class ApplicationInstanceStatus(Model):
         "a new instance are told by their label and their controller reference until this is written.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
+    suspended_replicas: list[SuspendedReplicas] = Field(
+        default_factory=list,
+        max_length=64,
+        description="What the workloads go back to; written before any is stopped, and removed once they are back.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
     demands: Demands = Field(default=Demands(), description="The live tasks that it serves.")
     conditions: list[Condition] = conditions_field(
         "Applied: all objects are as the template says. Ready: its workloads are ready. Capped: a merged Sum is held "
-        "at its parameter's bound. Paused, Held: a person wants it left as it is (annotation wayside.dev/pause), or "
-        "kept without demand (wayside.dev/hold)."
+        "Applied: all objects are as the template says. Ready: its workloads are ready. Capped: a merged Sum is held "
+        "at its parameter's bound. Suspended: its workloads are at zero. Paused, Held: a person wants it left as it is "
+        "(annotation wayside.dev/pause), or kept without demand (wayside.dev/hold)."
     )
 
 

@@ -19,6 +19,7 @@ from wayside.api.base import (
     conditions_field,
 )
 from wayside.api.classification import Classification
+from wayside.api.operation import MEANING, Operation
 
 MAXIMUM_PARAMETER_BYTES = 64 * 1024
 """The most that a task's parameters may take as JSON; the manager refuses more."""
@@ -66,6 +67,7 @@ class ApplicationTaskSpec(Model):
     """What is wanted and why."""
 
     template: TemplateName = Field(description="The ApplicationTemplate, in the task's namespace.")
+    operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
     priority: int = Field(default=0, ge=-1_000_000, le=1_000_000, description="Tasks of higher priority come first.")
     parameters: dict[Identifier, JsonValue] = Field(
         default_factory=dict,
@@ -83,9 +85,11 @@ class TaskPhase(StrEnum):
     """A task's state in one word."""
 
     PENDING = "Pending"
+    WAITING = "Waiting"
     REFUSED = "Refused"
     ACTIVE = "Active"
     READY = "Ready"
+    SUSPENDED = "Suspended"
     LAPSED = "Lapsed"
     FINISHED = "Finished"
 
@@ -111,6 +115,7 @@ class ApplicationTask(Kind):
     short_name: ClassVar[str] = "apptask"
     printer_columns: ClassVar[list[dict[str, str]]] = [
         {"name": "Template", "type": "string", "jsonPath": ".spec.template"},
+        {"name": "Operation", "type": "string", "jsonPath": ".spec.operation"},
         {"name": "Rule", "type": "string", "jsonPath": ".spec.event.rule"},
         {"name": "Subject", "type": "string", "jsonPath": ".spec.event.subject"},
         {"name": "Instance", "type": "string", "jsonPath": ".status.instance"},
@@ -124,6 +129,7 @@ class ApplicationTask(Kind):
     object_validations: ClassVar[list[dict[str, str]]] = [
         {
             "rule": "self.spec.template == oldSelf.spec.template && self.spec.priority == oldSelf.spec.priority"
+            " && self.spec.operation == oldSelf.spec.operation"
             " && self.spec.requester == oldSelf.spec.requester"
             " && has(self.spec.event) == has(oldSelf.spec.event)"
             " && (!has(self.spec.event) || (self.spec.event.id == oldSelf.spec.event.id"

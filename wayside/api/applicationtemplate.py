@@ -51,6 +51,23 @@ class Lifecycle(Model):
     )
 
 
+BASELINE_WITH_KEY = (
+    "baseline is for a template without a key, which has one instance: remove one of the two; with a key, a rule whose "
+    "`when` is true says which instances run always"
+)
+
+
+class Baseline(Model):
+    """An instance that runs always, whether tasks demand it or not."""
+
+    parameters: dict[Identifier, JsonValue] = Field(
+        default_factory=dict,
+        max_length=64,
+        description="Its values. With merge Same, tasks must agree with them; else they count as those of a task of "
+        "the lowest priority.",
+    )
+
+
 Manifest = Annotated[dict[str, Any], Field(json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})]
 
 
@@ -63,7 +80,10 @@ _ONE_OF = "give exactly one of manifests and helm"
 class ApplicationTemplateSpec(Model):
     """Parameters, identity and manifests of an application."""
 
-    model_config = validations(("has(self.manifests) != has(self.helm)", _ONE_OF))
+    model_config = validations(
+        ("has(self.manifests) != has(self.helm)", _ONE_OF),
+        ("!has(self.baseline) || !has(self.key)", BASELINE_WITH_KEY),
+    )
 
     description: str = Field(default="", max_length=1024, description="What the application does, for people.")
     parameters: dict[Identifier, Parameter] = Field(
@@ -73,6 +93,11 @@ class ApplicationTemplateSpec(Model):
         default=None,
         description="Tasks with the same key share one instance, e.g. ${parameters.region}. "
         "Without a key the template has one instance. Immutable.",
+    )
+    baseline: Baseline | None = Field(
+        default=None,
+        description="One instance that runs always, also without tasks. Not with a key: a rule with when: true then "
+        "says which instances run.",
     )
     lifecycle: Lifecycle = Field(default=Lifecycle(), description="How long instances live.")
     configuration: dict[FileName, JsonValue] = Field(
@@ -102,6 +127,12 @@ class ApplicationTemplateSpec(Model):
     def _one_kind_of_objects(self) -> ApplicationTemplateSpec:
         if bool(self.manifests) == (self.helm is not None):
             raise ValueError(_ONE_OF)
+        return self
+
+    @model_validator(mode="after")
+    def _one_baseline(self) -> ApplicationTemplateSpec:
+        if self.baseline is not None and self.key is not None:
+            raise ValueError(BASELINE_WITH_KEY)
         return self
 
     @field_validator("manifests")

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from wayside.api.eventrule import Aggregate
 from wayside.api.model import ModelImage, ModelPoints, ModelSource
+from wayside.api.operation import Operation
 from wayside.expressions import CompiledTemplate, Expression
 from wayside.rules.parameters import NO_PARAMETERS, Parameters
 
@@ -128,6 +129,12 @@ class CompiledDeploy:
     """Whether the parameters are evaluated again at each evaluation."""
     each_parameter: Mapping[str, CompiledTemplate] = field(default_factory=dict, compare=False)
     """The parameters one by one, where they follow."""
+    operation: Operation = Operation.DEPLOY
+
+    @property
+    def fixed(self) -> tuple[str, Operation, int]:
+        """What of its tasks never changes while they live."""
+        return self.template, self.operation, self.priority
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,7 +202,9 @@ class _RuleCompiler:
             if deploy.follow
         }
         source = canonical(deploy.parameters)
-        return CompiledDeploy(action, deploy.template, deploy.priority, source, parameters, deploy.follow, one_by_one)
+        return CompiledDeploy(
+            action, deploy.template, deploy.priority, source, parameters, deploy.follow, one_by_one, deploy.operation
+        )
 
     def template(
         self, path: FieldPath, value: Mapping[str, JsonValue], environment: Environment

@@ -51,6 +51,7 @@ def differences(demand: Demand, stored: StoredTask) -> list[str]:
     event = spec.event
     pairs: dict[str, tuple[Any, Any]] = {
         "template": (demand.template, spec.template),
+        "operation": (demand.operation, spec.operation),
         "priority": (demand.priority, spec.priority),
         "requester.detector": (demand.detector, spec.requester.detector),
         "requester.subjects": (list(demand.subjects), spec.requester.subjects),

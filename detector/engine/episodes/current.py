@@ -106,6 +106,7 @@ class Episode:
             rule=rule.name,
             action=deploy.action,
             template=deploy.template,
+            operation=deploy.operation,
             priority=deploy.priority,
             parameters=parameters or {},
             detector=identity.detector,

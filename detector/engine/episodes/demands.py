@@ -24,6 +24,7 @@ from wayside.api.applicationtask import (
 )
 from wayside.api.base import JsonValue, Metadata
 from wayside.api.classification import Classification
+from wayside.api.operation import Operation
 from wayside.times import format_time, parse_time
 
 _LABEL_LIMIT = 63
@@ -58,6 +59,12 @@ class Demand:
     """The rule's variables at the start."""
     rule_digest: str
     """Of the rule's semantics under which the episode started."""
+    operation: Operation = Operation.DEPLOY
+
+    @property
+    def fixed(self) -> tuple[str, Operation, int]:
+        """What the action says of it that cannot change while it lives: template, operation and priority."""
+        return self.template, self.operation, self.priority
 
     @cached_property
     def name(self) -> str:
@@ -95,6 +102,7 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
         ),
         spec=ApplicationTaskSpec(
             template=demand.template,
+            operation=demand.operation,
             priority=demand.priority,
             parameters=plain(demand.parameters),
             requester=Requester(detector=demand.detector, holder=demand.holder, subjects=list(demand.subjects)),
@@ -138,6 +146,7 @@ def from_task(task: ApplicationTask) -> Demand | None:
         classification=None if event.classification is None else event.classification.to_json(),
         values=event.values,
         rule_digest=task.metadata.annotations.get(RULE_DIGEST_ANNOTATION, ""),
+        operation=spec.operation,
     )
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from pydantic import Field
 
 from wayside.api.base import Identifier, JsonValue, Model, TemplateName
+from wayside.api.operation import MEANING, Operation
 
 
 class Deploy(Model):
-    """Demand an application for as long as the episode lasts."""
+    """Demand, reconfigure or suspend an application for as long as the episode lasts."""
 
     template: TemplateName = Field(description="The ApplicationTemplate, in the rule's namespace.")
+    operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
     priority: int = Field(
         default=0, ge=-1_000_000, le=1_000_000, description="Tasks of higher priority are looked at first."
     )
