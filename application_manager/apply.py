@@ -189,7 +189,7 @@ class Applier:
                 return problem
             body["metadata"]["uid"] = live["metadata"]["uid"]
         try:
-            raw = await self._client.apply(await self._resource(key), body)
+            raw = await self._client.apply(await self.resource(key), body)
         except ApiError as error:
             if error.code == 409:  # vanished or replaced since we looked
                 return _Problem("Waiting", f"{what} changed hands while it was applied; looking again")
@@ -208,13 +208,14 @@ class Applier:
         live = await self._get(instance.namespace, key)
         if live is None or controller_uid(live) != instance.metadata.uid:
             return
-        await self._client.delete(await self._resource(key), instance.namespace, key[2], live["metadata"]["uid"])
+        await self._client.delete(await self.resource(key), instance.namespace, key[2], live["metadata"]["uid"])
         log.info("instance %s/%s: pruned %s %s", instance.namespace, instance.name, key[1], key[2])
 
     async def _get(self, namespace: str, key: ObjectKey) -> Object | None:
-        return await self._client.get(await self._resource(key), namespace, key[2])
+        return await self._client.get(await self.resource(key), namespace, key[2])
 
-    async def _resource(self, key: ObjectKey) -> Resource:
+    async def resource(self, key: ObjectKey) -> Resource:
+        """Where the object's kind lives. Raises ApiError where the cluster does not have it."""
         kind = key[:2]
         if kind not in self._resources:  # a kind that was allowed once, or was added to the cluster since we started
             self._resources |= await self._client.discover(key[0])

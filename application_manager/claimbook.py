@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from application_manager.core.claims import Claim, InvalidTemplate, Refused
+from application_manager.core.claims import Claim, InvalidTemplate, Refused, all_instances, template_of_all
 from application_manager.core.demand import claim_or_verdict
 from application_manager.core.leases import HolderKey
 from application_manager.core.operations import Standing, Verdict
@@ -70,9 +70,17 @@ class ClaimBook:
         """The claim of a task."""
         return self._claims.get(name)
 
-    def claims(self, instance: Name) -> list[Claim]:
-        """All claims on an instance."""
-        return list(self._by_instance.get(instance, {}).values())
+    def claims(self, instance: Name, template: str | None = None) -> list[Claim]:
+        """All claims on an instance; with its template, also those on all instances of that."""
+        claimed = list(self._by_instance.get(instance, {}).values())
+        if template is not None:
+            claimed += self._by_instance.get((instance[0], all_instances(template)), {}).values()
+        return claimed
+
+    def claimed_of(self, template: Name) -> set[Name]:
+        """The instances of a template that tasks claim; what stands for all of them is none."""
+        found = {claimed.instance for name in self.tasks_of(template) if (claimed := self._claims.get(name))}
+        return {(template[0], each) for each in found if template_of_all(each) is None}
 
     def tasks_of(self, template: Name) -> list[Name]:
         """All tasks that name the template."""

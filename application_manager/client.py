@@ -150,6 +150,12 @@ class Client:
         query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
         return await self._request("PATCH", resource.path(namespace, name), query, body, _MERGE)
 
+    async def scale(self, resource: Resource, namespace: str, name: str, version: str, replicas: int) -> Object:
+        """Set the replicas of the object by its subresource `scale`, if it is still of this resourceVersion."""
+        body = {"metadata": {"resourceVersion": version}, "spec": {"replicas": replicas}}
+        query = {"fieldManager": FIELD_MANAGER}
+        return await self._request("PATCH", resource.path(namespace, name, "scale"), query, body, _MERGE)
+
     async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> bool:
         """Delete the object with this uid, and in the background what it owns. Returns whether it was there."""
         options = {

@@ -23,6 +23,7 @@ from application_manager.core.demand import Decision
 from application_manager.core.rendering import Rendering, object_key
 from application_manager.recorder import Reason, Recorder
 from application_manager.store import Name
+from application_manager.suspending import Suspending
 from application_manager.world import Record, World
 from wayside.api import ApplicationInstance
 
@@ -50,6 +51,7 @@ class InstanceWork:
     client: Client
     applier: Applier
     recorder: Recorder
+    suspending: Suspending
     instances: Resource
     tasks: Resource
     again: Callable[[Name, float], None]
@@ -78,14 +80,14 @@ class InstanceWork:
         # Decided only now: while the tasks were listed, the instance itself may have gone. From here to the first
         # request nothing is waited for, so what was decided and what there is belong together.
         instance, decision = self.world.instance(name), self.world.decide(name, time.time())
+        if decision is not None and decision.next_change is not None:
+            self.again(name, decision.next_change)
         if decision is None or (instance is None and not decision.wanted):
             self.world.records.pop(name, None)
             self.absent(name, decision)
             return
         if instance is not None and instance.metadata.deletion_timestamp is not None:
             return  # it is waited for: its deletion brings us back
-        if decision.next_change is not None:
-            self.again(name, decision.next_change)
         await self._make(name, decision, instance)
 
     async def _make(self, name: Name, decision: Decision, existing: ApplicationInstance | None) -> None:
@@ -115,6 +117,8 @@ class InstanceWork:
                 name, instance, decision, Applied(rendering, references(known.objects), complete=False), known.digest
             )
             return
+        await self.suspending.settle(instance, rendering)
+        instance = self.world.instance(name) or instance
         pending = self.applier.pending(instance, rendering, known)
         was_applied = self._was_applied(name, instance)
         if not pending and was_applied is not None:

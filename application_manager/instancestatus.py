@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from application_manager.apply import Applied, Applier
+from application_manager.apply import Applied, Applier, ObjectKey
 from application_manager.client import ApiError, Client, Object, Resource
 from application_manager.core.byhand import PAUSE_ANNOTATION
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import Decision
 from application_manager.core.pods import Trouble
 from application_manager.core.readiness import not_ready
-from application_manager.core.status import Service, difference, instance_status
+from application_manager.core.status import Service, difference, instance_status, suspension_aspect
 from application_manager.recorder import Reason, Recorder
 from application_manager.store import Name
 from application_manager.world import Served, World
@@ -58,9 +58,13 @@ class InstanceStatusWork:
             return
         now = time.time()
         old = instance.status or ApplicationInstanceStatus()
-        ready = self._ready(instance, record.applied)
         applied = record.applied
-        new = instance_status(instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now)
+        live = self._live(instance, applied)
+        suspended = suspension_aspect(instance, record.decision, live.values())
+        ready = self._ready(instance, live)
+        new = instance_status(
+            instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now, suspended
+        )
         patch = difference(old.to_json() if instance.status else {}, new.to_json())
         if patch:
             uid = instance.metadata.uid
@@ -82,11 +86,23 @@ class InstanceStatusWork:
         if record.decision.withheld and applied.aspect.holds:
             why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): it does not get the task's values"
         serves = applied.aspect.holds and not record.decision.withheld
-        self.tell(name, record.decision, Service(name[1], serves, serves and ready.holds, why_not, reason))
+        service = Service(
+            name[1],
+            serves,
+            serves and ready.holds,
+            why_not,
+            reason,
+            suspended=instance.spec.suspended,
+            stopped=serves and suspended is not None and suspended.holds,
+        )
+        self.tell(name, record.decision, service)
 
     def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:
         """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
         old = self.world.served.pop(name, None)
+        verdicts = decision.verdicts if decision is not None else {}
+        for task in old.verdicts.keys() - verdicts.keys() if old is not None else ():
+            self.task_changed((name[0], task))  # one that means all instances may have others yet
         if decision is None:
             return
         served = Served(decision.verdicts, service or Service(name[1], applied=False, ready=False))
@@ -96,15 +112,21 @@ class InstanceStatusWork:
             if all_changed or old is None or old.verdicts.get(task) != verdict:
                 self.task_changed((name[0], task))
 
-    def _ready(self, instance: ApplicationInstance, applied: Applied) -> Aspect:
+    def _live(self, instance: ApplicationInstance, applied: Applied) -> dict[ObjectKey, Object | None]:
+        """The instance's objects, as watched."""
+        keys = [(each.api_version, each.kind, each.name) for each in applied.objects]
+        return {key: self.applier.live(instance.namespace, key) for key in keys}
+
+    def _ready(self, instance: ApplicationInstance, objects: Mapping[ObjectKey, Object | None]) -> Aspect:
         missing = []
-        for each in applied.objects:
-            live = self.applier.live(instance.namespace, (each.api_version, each.kind, each.name))
+        for (_, kind, name), live in objects.items():
             problem = "does not exist" if live is None else not_ready(live)
             if problem is not None:
-                missing.append(f"{each.kind} {each.name} {problem}")
-        if not applied.objects:
+                missing.append(f"{kind} {name} {problem}")
+        if not objects:
             return Aspect("Ready", False, "NotApplied", "nothing is applied yet")
+        if instance.spec.suspended:
+            return Aspect("Ready", False, "Suspended", "the instance is suspended")
         if missing:
             troubles = self.world.pods.troubles((instance.namespace, instance.name))
             reason = troubles[0].reason.value if troubles else "NotReady"

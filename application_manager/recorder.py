@@ -48,6 +48,8 @@ class Reason(StrEnum):
     PAUSED = "Paused"
     RESUMED = "Resumed"
     HELD = "Held"
+    SUSPENDED = "Suspended"
+    NOT_SUSPENDED = "NotSuspended"
     NOT_HELD = "NotHeld"
     IMAGE_PULL_FAILED = "ImagePullFailed"
     CONTAINER_FAILED = "ContainerFailed"
@@ -67,6 +69,7 @@ _OF_CONDITION = {
     ("Paused", "True"): Reason.PAUSED,
     ("Paused", "False"): Reason.RESUMED,
     ("Held", "True"): Reason.HELD,
+    ("Suspended", "True"): Reason.SUSPENDED,
     ("Held", "False"): Reason.NOT_HELD,
 }
 _TROUBLES = frozenset(Reason(each.value) for each in TroubleReason)
@@ -114,6 +117,8 @@ class Recorder:
             reason = _OF_CONDITION.get((each.type, each.status))
             if each.reason in _OWN_REASONS:
                 reason = Reason(each.reason)
+            if each.reason == Reason.NOT_SUSPENDED:
+                reason = Reason.NOT_SUSPENDED
             expected = each.status == "False" and each.type not in was_true and each.reason in _EXPECTED
             if reason is not None and not expected:
                 self.say(regarding, reason, each.message, now)

@@ -14,6 +14,7 @@ from application_manager.client import Object
 from application_manager.core.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.labelling import INSTANCE_LABEL
 from application_manager.core.readiness import not_ready
+from application_manager.core.suspension import pods_left
 from application_manager.rulework import RuleKey
 from application_manager.store import Entry, Name, kind_of, name_of
 from application_manager.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, POD, TASK, TEMPLATE, World
@@ -103,6 +104,7 @@ class Router:
         for name, _ in self.world.store.all(TEMPLATE):
             self.template(name)
         instances = {name for name, _ in self.world.store.all(INSTANCE)}
+        instances |= {name for name, _ in self.world.store.all(TEMPLATE)}  # for their baselines
         self._ask_all(instances | set(self.world.claims.instances()))
         for name, _ in self.world.store.all(TASK):
             self.task(name)
@@ -128,7 +130,7 @@ class Router:
 
     def _claim_again(self, template: Name) -> None:
         """Ask all tasks of the template anew what they claim, and look at all its instances."""
-        touched = set(self.world.instances_of(template))
+        touched = {template, *self.world.instances_of(template)}  # its own name is that of its baseline
         for name in self.world.claims.tasks_of(template):
             entry = self.world.store.get(TASK, name)
             if entry is not None:
@@ -153,9 +155,10 @@ class Router:
         if old is None or old.raw.get("data") != entry.raw.get("data"):
             self._ask_for_configuration(entry.raw)
 
-    def _significance(self, entry: Entry) -> tuple[str, bool, str | None]:
+    def _significance(self, entry: Entry) -> tuple[str, bool, str | None, bool]:
         """What of an object matters to its instance; workloads change their status far more often."""
-        return entry.uid, "deletionTimestamp" in entry.raw["metadata"], not_ready(entry.raw)
+        raw = entry.raw
+        return entry.uid, "deletionTimestamp" in raw["metadata"], not_ready(raw), pods_left(raw) > 0
 
     def _ask_for_owner(self, raw: Object) -> None:
         owner = _instance_of(raw)
@@ -186,9 +189,14 @@ class Router:
                 if name[0] == namespace:
                     self.rule((kind, name))
 
+    def look_at(self, name: Name) -> None:
+        """Ask for an instance, or for all of a template where the name stands for these."""
+        for each in self.world.meant(name):
+            self.instance(each)
+
     def _ask_all(self, instances: Iterable[Name]) -> None:
         for name in instances:
-            self.instance(name)
+            self.look_at(name)
 
 
 def _instance_of(raw: Object) -> Name | None:

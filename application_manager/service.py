@@ -40,6 +40,7 @@ from application_manager.router import Router
 from application_manager.rulework import RuleKey, RuleWork
 from application_manager.starting import until_answered
 from application_manager.store import Name
+from application_manager.suspending import Suspending
 from application_manager.tasks import TaskWork
 from application_manager.templates import TemplateWork
 from application_manager.workqueue import Key, WorkQueue
@@ -158,6 +159,7 @@ class Manager:
             client=client,
             applier=applier,
             recorder=self._recorder,
+            suspending=Suspending(client, applier, resources[INSTANCE], self._router.observe),
             instances=resources[INSTANCE],
             tasks=resources[TASK],
             again=self._instances.add_at,
@@ -198,7 +200,7 @@ class Manager:
             every=options.resync,
             measures=measures,
         )
-        self._leases = LeaseWatch(self._world, client, own[0], options.namespaces, self._instances.add)
+        self._leases = LeaseWatch(self._world, client, own[0], options.namespaces, self._router.look_at)
         self._rule_work = RuleWork(
             world=self._world,
             client=client,

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from application_manager.client import ApiError, Client, Object, Resource
-from application_manager.core.claims import Refused
+from application_manager.core.claims import Claim, Refused, template_of_all
 from application_manager.core.conditions import changed, holds
-from application_manager.core.operations import Standing, Verdict
-from application_manager.core.status import Service, difference, finished_since, task_status
+from application_manager.core.operations import Standing, Verdict, gathered
+from application_manager.core.status import Service, difference, finished_since, task_status, together
 from application_manager.measures import Measures
 from application_manager.recorder import Recorder
 from application_manager.store import Name
@@ -104,10 +104,27 @@ class TaskWork:
         if verdict is not None:
             return verdict, None
         claimed = self.world.claims.claim(name)
+        if claimed is not None and (template := template_of_all(claimed.instance)) is not None:
+            return self._of_all(name, claimed, (name[0], template))
         served = self.world.served.get((name[0], claimed.instance)) if claimed is not None else None
         if served is None or name[1] not in served.verdicts:
             return None
         return served.verdicts[name[1]], served.service
+
+    def _of_all(self, name: Name, claimed: Claim, template: Name) -> tuple[Verdict, Service | None] | None:
+        """What became of a task that means all instances of a template, from what was said of it by each."""
+        alone = self.world.served.get((name[0], claimed.instance))
+        if alone is None or name[1] not in alone.verdicts:
+            return None
+        each = {
+            instance[1]: served
+            for instance in self.world.meant((name[0], claimed.instance))
+            if (served := self.world.served.get(instance)) is not None and served is not alone
+        }
+        parts = {instance: served.verdicts[name[1]] for instance, served in each.items() if name[1] in served.verdicts}
+        verdict = gathered(claimed, parts, alone.verdicts[name[1]])
+        serving = [each[instance].service for instance, part in parts.items() if part.standing is Standing.COUNTS]
+        return verdict, together(serving) if serving else None
 
     async def _expire(self, name: Name) -> None:
         task = self.world.task(name)

@@ -8,8 +8,8 @@ from typing import Final, TypeVar
 
 from application_manager.apply import Applied
 from application_manager.claimbook import ClaimBook
-from application_manager.core.claims import InvalidTemplate
-from application_manager.core.demand import Decision, decide, written_deadline
+from application_manager.core.claims import Claim, InvalidTemplate, template_of_all
+from application_manager.core.demand import Decision, decide, decide_for_all, has_baseline, written_deadline
 from application_manager.core.leases import HealthyTime, LeaseBook, LeaseView
 from application_manager.core.operations import Verdict
 from application_manager.core.policy import KindKey, Policy
@@ -121,10 +121,13 @@ class World:
         """What should become of the instance as of `now`, in seconds since 1970; None: no one knows or wants it."""
         instance = self.instance(name)
         claims = self.claims.claims(name)
-        if instance is None and not claims:
+        if template_of_all(name[1]) is not None:
+            return self._decide_for_all(name, claims, now)
+        if instance is None and not claims and not has_baseline(self.template(name)):
             self.deadlines.pop(name, None)
             return None
-        of = instance.spec.template if instance is not None else claims[0].task.spec.template
+        of = instance.spec.template if instance else claims[0].task.spec.template if claims else name[1]
+        claims = self.claims.claims(name, of)
         holders = (each.task.spec.requester.holder for each in claims)
         decision = decide(
             name[1],
@@ -139,6 +142,24 @@ class World:
         if instance is not None:
             self.deadlines[name] = (instance.metadata.uid, decision.release_time)
         return decision
+
+    def _decide_for_all(self, name: Name, claims: list[Claim], now: float) -> Decision | None:
+        """What is said of tasks that mean all instances of a template, by the name that stands for these."""
+        if not claims:
+            return None
+        template = self.template((name[0], template_of_all(name[1]) or ""))
+        holders = (each.task.spec.requester.holder for each in claims)
+        leases = self.lease_views(name[0], holders)
+        return decide_for_all(name[1], template=template, claims=claims, leases=leases, now=now)
+
+    def meant(self, name: Name) -> set[Name]:
+        """The instances that a name means, which may stand for all of a template; that name is among them."""
+        of = template_of_all(name[1])
+        if of is None:
+            return {name}
+        template = (name[0], of)
+        own = {template} if has_baseline(self.template(template)) else set()
+        return {name} | own | set(self.instances_of(template)) | self.claims.claimed_of(template)
 
     def _deadline(self, name: Name, instance: ApplicationInstance) -> float | None:
         uid, decided = self.deadlines.get(name, ("", None))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ from application_manager.core.claims import unknown_members
 from application_manager.core.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
 from application_manager.core.labelling import labelled
 from application_manager.core.policy import Policy
+from application_manager.core.suspension import stated_replicas, stopped, yielded
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import API_VERSION
 from wayside.api.chart import Helm
@@ -47,10 +48,14 @@ class ChartPending(Exception):  # noqa: N818  no error: the answer is still to c
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """The objects of an instance: manifests without owner, which `owned` adds, and a digest of them all."""
+    """The objects of an instance: manifests without owner, which `owned` adds, and a digest of them all.
+
+    `replicas`: of each workload that can be scaled, what the template states; None where it leaves that to others.
+    """
 
     manifests: tuple[Manifest, ...]
     digest: str
+    replicas: Mapping[tuple[str, str, str], int | None] = field(default_factory=dict)
 
     def keys(self) -> set[tuple[str, str, str]]:
         """What tells the objects apart: apiVersion, kind and name of each."""
@@ -144,7 +149,11 @@ class Renderer:
         problems += _duplicates(manifests)
         if problems:
             raise RenderError(problems)
-        return Rendering(tuple(manifests), digest(manifests))
+        manifests = yielded(manifests)
+        replicas = stated_replicas(manifests)
+        if instance.spec.suspended:
+            manifests = stopped(manifests)
+        return Rendering(tuple(manifests), digest(manifests), replicas)
 
     def _chart_manifests(
         self,
@@ -190,13 +199,13 @@ class Renderer:
                 f"{namespace!r} is not the template's own namespace, {instance.namespace}: remove the field, "
                 "or make the template in that namespace",
             )
-        for field in _RESERVED_METADATA:
-            if field in metadata:
-                yield f"metadata.{field}", "is the manager's to say: remove it"
-        for field in ("labels", "annotations"):
-            texts = metadata.get(field)
+        for reserved in _RESERVED_METADATA:
+            if reserved in metadata:
+                yield f"metadata.{reserved}", "is the manager's to say: remove it"
+        for member in ("labels", "annotations"):
+            texts = metadata.get(member)
             if texts is not None and not isinstance(texts, dict):
-                yield f"metadata.{field}", f"{values.shown(texts)} is no map: give names and texts"
+                yield f"metadata.{member}", f"{values.shown(texts)} is no map: give names and texts"
         yield from self._policy.pod_problems(manifest)
 
 

@@ -6,7 +6,7 @@ written that is not news.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +14,13 @@ from application_manager.core import byhand
 from application_manager.core.conditions import Aspect, find, holds, updated
 from application_manager.core.demand import Decision
 from application_manager.core.operations import Standing, Verdict
+from application_manager.core.suspension import autoscalers, pods_left
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
 from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
 from wayside.api.base import Condition
+from wayside.api.operation import Operation
 from wayside.times import format_seconds, parse_seconds
 
 Json = dict[str, Any]
@@ -31,8 +33,12 @@ class Service:
     """What an instance has given to its tasks so far.
 
     Attributes:
+        applied: whether all objects are as they should be.
+        ready: whether its workloads are ready.
         problem: why it is not applied or not ready, in words; empty where only time is lacking.
         reason: the problem's word for programs, where it keeps the instance from being ready.
+        suspended: whether it is to be at zero.
+        stopped: whether it is at zero.
     """
 
     instance: str
@@ -40,6 +46,21 @@ class Service:
     ready: bool
     problem: str = ""
     reason: str = ""
+    suspended: bool = False
+    stopped: bool = False
+
+
+def together(services: Sequence[Service]) -> Service:
+    """What several instances, at least one, have given to a task that means them all."""
+    return Service(
+        instance=", ".join(sorted(each.instance for each in services)),
+        applied=all(each.applied for each in services),
+        ready=all(each.ready for each in services),
+        problem="; ".join(sorted(each.problem for each in services if each.problem)),
+        reason=next((each.reason for each in services if each.reason), ""),
+        suspended=any(each.suspended for each in services),
+        stopped=all(each.stopped for each in services),
+    )
 
 
 def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None, now: float) -> ApplicationTaskStatus:
@@ -48,21 +69,24 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
     finished = verdict.standing is Standing.FINISHED
     aspects: list[Aspect] = []
     if not finished:
-        accepted = verdict.standing is Standing.COUNTS
+        accepted = verdict.standing in (Standing.COUNTS, Standing.WAITING)
         aspects.append(Aspect("Accepted", accepted, verdict.reason, verdict.message))
         if find(old.conditions, "Finished") is not None:
             aspects.append(Aspect("Finished", False, "HolderReturned", "the holder is back"))
     else:
         aspects.append(Aspect("Finished", True, verdict.reason, verdict.message))
+    suspends = task.spec.operation is Operation.SUSPEND
     if verdict.standing is Standing.COUNTS and service is not None:
+        done = service.stopped if suspends else service.ready
+        word = "suspended" if suspends else "ready"
         aspects += [
             _latched(old.conditions, "Applied", service.applied, "Applied", "NotApplied", service),
-            _latched(old.conditions, "Ready", service.ready, "Ready", "NotReady", service),
+            _latched(old.conditions, "Ready", done, "Ready", "NotReady", service, word),
         ]
     conditions = updated(old.conditions, aspects, task.metadata.generation, now)
     instance = old.instance or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
-        phase=_task_phase(verdict, service),
+        phase=_task_phase(verdict, service, suspends),
         instance=instance,
         message=_task_message(verdict, service),
         observed_generation=task.metadata.generation,
@@ -77,18 +101,26 @@ def finished_since(task: ApplicationTask) -> float | None:
 
 
 def _latched(
-    known: Sequence[Condition], type_: str, now_holds: bool, reason: str, otherwise: str, service: Service
+    known: Sequence[Condition],
+    type_: str,
+    now_holds: bool,
+    reason: str,
+    otherwise: str,
+    service: Service,
+    word: str = "applied",
 ) -> Aspect:
     if now_holds or holds(known, type_):
         since = f"; now: {service.problem}" if service.problem and not now_holds else ""
-        return Aspect(type_, True, reason, f"instance {service.instance} was {type_.lower()}{since}")
+        return Aspect(type_, True, reason, f"instance {service.instance} was {word}{since}")
     if service.applied and service.reason:
         otherwise = service.reason
-    return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {type_.lower()} yet")
+    return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {word} yet")
 
 
-def _task_phase(verdict: Verdict, service: Service | None) -> TaskPhase:
+def _task_phase(verdict: Verdict, service: Service | None, suspends: bool) -> TaskPhase:
     match verdict.standing:
+        case Standing.WAITING:
+            return TaskPhase.WAITING
         case Standing.FINISHED:
             return TaskPhase.FINISHED
         case Standing.REFUSED:
@@ -97,6 +129,10 @@ def _task_phase(verdict: Verdict, service: Service | None) -> TaskPhase:
             return TaskPhase.LAPSED
     if service is None or not service.applied:
         return TaskPhase.PENDING
+    if suspends:
+        return TaskPhase.READY if service.stopped else TaskPhase.ACTIVE
+    if service.suspended:
+        return TaskPhase.SUSPENDED
     return TaskPhase.READY if service.ready else TaskPhase.ACTIVE
 
 
@@ -119,14 +155,21 @@ def instance_status(
     objects: Iterable[ObjectReference],
     spec_hash: str | None,
     now: float,
+    suspended: Aspect | None = None,
 ) -> ApplicationInstanceStatus:
-    """The instance's status. `applied` and `ready` are its conditions, `spec_hash` that of what was last applied."""
+    """The instance's status.
+
+    `applied`, `ready` and `suspended` are its conditions, the last of which is None where it was never suspended;
+    `spec_hash` is that of what was last applied.
+    """
     old = instance.status or ApplicationInstanceStatus()
     lingering = decision.release_time is not None
     if lingering:
         phase = InstancePhase.LINGERING
     elif not applied.holds:
         phase = InstancePhase.FAILED if applied.reason not in ("Waiting", "ChartPending") else InstancePhase.PENDING
+    elif instance.spec.suspended:
+        phase = InstancePhase.SUSPENDED
     else:
         phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
     generation = instance.metadata.generation
@@ -137,16 +180,43 @@ def instance_status(
         spec_hash=spec_hash,
         release_time=None if decision.release_time is None else format_seconds(decision.release_time),
         objects=list(objects),
+        suspended_replicas=old.suspended_replicas,
         demands=demands(decision),
         conditions=list(
             updated(
                 old.conditions,
-                (applied, ready, *_capped(old.conditions, decision), *byhand.aspects(instance)),
+                (
+                    applied,
+                    ready,
+                    *([suspended] if suspended else []),
+                    *_capped(old.conditions, decision),
+                    *byhand.aspects(instance),
+                ),
                 generation,
                 now,
             )
         ),
     )
+
+
+def suspension_aspect(
+    instance: ApplicationInstance, decision: Decision, objects: Iterable[Mapping[str, Any] | None]
+) -> Aspect | None:
+    """The condition Suspended of an instance with these live objects; None before it ever was suspended."""
+    known = instance.status.conditions if instance.status else ()
+    if not instance.spec.suspended:
+        if find(known, "Suspended") is None:
+            return None
+        return Aspect("Suspended", False, "NotSuspended", "no task suspends it")
+    there = [each for each in objects if each is not None]
+    left = [f"{each['kind']} {each['metadata']['name']} has {n} pods" for each in there if (n := pods_left(each))]
+    whose = (
+        f"task {decision.suspender} suspends it" if decision.suspender else "it was suspended when it was last demanded"
+    )
+    if left:
+        return Aspect("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
+    resting = "".join(f"; HorizontalPodAutoscaler {each} rests until then" for each in autoscalers(there))
+    return Aspect("Suspended", True, "Suspended", f"{whose}, and its workloads are at zero{resting}")
 
 
 def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:

@@ -74,6 +74,8 @@ def differences(api: Api, leases: Mapping[str, LeaseView], refused: Collection[s
         if decision.wanted:
             if instance.spec.parameters != decision.parameters:
                 yield f"{name}: parameters {instance.spec.parameters}, not {decision.parameters}"
+            if decision.suspended is not None and instance.spec.suspended != decision.suspended:
+                yield f"{name}: suspended is {instance.spec.suspended}, not {decision.suspended}"
         elif is_managed(instance) and not is_held(instance):
             if instance.status is None or instance.status.release_time is None:
                 yield f"{name}: nobody demands it, and it does not linger"

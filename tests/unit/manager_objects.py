@@ -40,13 +40,16 @@ def task(
     *,
     of: str = "app",
     priority: int = 0,
+    operation: str = "Deploy",
     created: int = 0,
     holder: str | None = None,
     ended: bool = False,
     accepted_condition: tuple[str, str, float] | None = None,
 ) -> ApplicationTask:
     """`accepted_condition`: status, reason and transition time of the condition Accepted."""
-    spec: dict[str, Any] = {"template": of, "priority": priority, "parameters": parameters or {}}
+    spec: dict[str, Any] = {
+        "template": of, "operation": operation, "priority": priority, "parameters": parameters or {},
+    }  # fmt: skip
     if holder:
         spec["requester"] = {"holder": holder}
     if ended:
@@ -74,6 +77,7 @@ def instance(
     of: str = "app",
     key: str | None = None,
     parameters: dict[str, Any] | None = None,
+    suspended: bool = False,
     by_person: bool = False,
     release_at: float | None = None,
     annotations: dict[str, str] | None = None,
@@ -87,7 +91,7 @@ def instance(
             "labels": {} if by_person else {"app.kubernetes.io/managed-by": "wayside"},
             "annotations": annotations or {},
         },
-        "spec": {"template": of, "key": key, "parameters": parameters or {}},
+        "spec": {"template": of, "key": key, "parameters": parameters or {}, "suspended": suspended},
     }
     if release_at is not None:
         raw["status"] = {"releaseTime": format_seconds(release_at)}

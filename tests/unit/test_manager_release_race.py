@@ -11,6 +11,7 @@ from application_manager.core.policy import Policy
 from application_manager.instances import InstanceWork
 from application_manager.recorder import Recorder
 from application_manager.store import Entry, Name
+from application_manager.suspending import Suspending
 from application_manager.world import INSTANCE, World
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api.base import API_VERSION
@@ -51,12 +52,14 @@ def test_an_instance_that_goes_while_its_release_is_checked_stays_gone_while_its
     server = GoingServer(world)
     client = cast("Client", server)
     absent: list[Name] = []
+    applier, instances = Applier(client, world.store, {}), Resource(API_VERSION, "ApplicationInstance", "instances")
     work = InstanceWork(
         world=world,
         client=client,
-        applier=Applier(client, world.store, {}),
+        applier=applier,
         recorder=Recorder(client),
-        instances=Resource(API_VERSION, "ApplicationInstance", "applicationinstances"),
+        suspending=Suspending(client, applier, instances, lambda raw: None),
+        instances=instances,
         tasks=Resource(API_VERSION, "ApplicationTask", "applicationtasks"),
         again=lambda name, at: None,
         done=lambda name: None,

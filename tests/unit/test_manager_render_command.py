@@ -66,7 +66,8 @@ def test_merged_instances_and_their_manifests_are_printed(render: Any) -> None:
     assert result.exit_code == 0, result.stderr
     instance, deployment = yaml.safe_load_all(result.stdout)
     assert instance["kind"] == "ApplicationInstance"
-    assert instance["spec"] == {"template": "fusion", "key": "n", "parameters": {"region": "n", "sources": ["x", "y"]}}
+    merged = {"region": "n", "sources": ["x", "y"]}
+    assert instance["spec"] == {"template": "fusion", "key": "n", "parameters": merged, "suspended": False}
     assert deployment["kind"] == "Deployment"
     assert deployment["metadata"]["name"] == instance["metadata"]["name"]
 

@@ -87,6 +87,7 @@ CONTROLLERS = (
     "statefulset-controller",
     "daemonset-controller",
     "job-controller",
+    "horizontal-pod-autoscaler-controller",
     "endpointslice-controller",
     "garbage-collector-controller",
     "namespace-controller",
@@ -105,6 +106,7 @@ def kube_controller_manager(setup: Setup) -> list[str]:
         f"--kubeconfig={setup.kubeconfig}",
         f"--controllers={','.join(CONTROLLERS)}",
         f"--root-ca-file={setup.serving_certificate}",
+        "--horizontal-pod-autoscaler-sync-period=1s",  # 15 s by default, which tests would wait for
         "--leader-elect=false",  # it is alone, and a lease would delay its restart
         "--secure-port=0",
         "--kube-api-qps=1000",  # the default of 20 a second would be what a test of 100 Deployments measures
