@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from detector.engine.episodes.demands import Demand, from_task, holder_label, to_task
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import HOLDER_LABEL
+from wayside.api.operation import Operation
 
 DEMAND = Demand(
     rule="lidar-vehicles-close",
@@ -32,6 +33,7 @@ DEMAND = Demand(
     classification={"overarchingPurpose": ["Safety"]},
     values={"distance": 149.5, "a": {"client": "car1"}},
     rule_digest="0123",
+    operation=Operation.RECONFIGURE,
 )
 NAME = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 

@@ -12,10 +12,14 @@ from detector.actions.deploy.steps import Step, next_step
 from detector.actions.deploy.stores import Snapshot, StoredTask, Update
 from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.test_demands import DEMAND
+from wayside.api.operation import Operation
 
 DEMANDS = st.builds(
-    lambda template, parameters: dataclasses.replace(DEMAND, template=template, parameters=parameters),
+    lambda template, operation, parameters: dataclasses.replace(
+        DEMAND, template=template, operation=operation, parameters=parameters
+    ),
     st.sampled_from(["one", "other"]),
+    st.sampled_from(Operation),
     st.dictionaries(st.sampled_from(["p", "q"]), st.none() | st.floats() | st.lists(st.integers(0, 2))),
 )
 STORED = st.builds(lambda demand, ended: StoredTask(to_task(demand, 5 if ended else None), 1), DEMANDS, st.booleans())

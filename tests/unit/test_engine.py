@@ -307,11 +307,15 @@ def test_parameters_that_cannot_be_rendered_at_the_start_are_rendered_as_soon_as
 
 
 def test_a_demand_is_held_from_the_start_of_its_episode_to_its_end() -> None:
-    drive = Drive(a_detector(), near(actions=[a_deploy("x", priority=3, parameters={"v": "${[a.client, b.client]}"})]))
+    drive = Drive(
+        a_detector(),
+        near(actions=[a_deploy("x", priority=3, operation="Suspend", parameters={"v": "${[a.client, b.client]}"})]),
+    )
     drive.take(place(0.5, "a", 0), place(0.5, "b", 100), until=1)
     (demand,) = drive.engine.demands().values()
     event = drive.events[0]
     assert (demand.rule, demand.action, demand.template, demand.priority) == ("near", "x", "app", 3)
+    assert demand.operation == "Suspend"
     assert (demand.holder, demand.subject, demand.subjects) == ("h", "a+b", ("a", "b"))
     assert (demand.episode, demand.onset_time, demand.start_time) == (event.episode, at(1), at(1))
     assert demand.parameters == {"v": ["a", "b"]}

@@ -6,7 +6,7 @@ import random
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -228,6 +228,8 @@ def test_a_baseline_that_does_not_fit_is_told_to_the_template_and_one_beside_a_k
 
 # --- Laws
 
+few = settings(max_examples=40)  # each of many evaluations
+
 parameters = st.fixed_dictionaries(
     {},
     optional={
@@ -275,6 +277,7 @@ def made(outcome: Outcome, existing: list[ApplicationInstance]) -> list[Applicat
     return [one(each) for each in outcome.instances.values()]
 
 
+@few
 @given(tasks(), st.randoms())
 def test_no_order_and_no_duplication_changes_anything(live: list[ApplicationTask], source: random.Random) -> None:
     shuffled = [*live, *source.sample(live, len(live) // 2)]
@@ -282,6 +285,7 @@ def test_no_order_and_no_duplication_changes_anything(live: list[ApplicationTask
     assert of(*shuffled) == of(*live)
 
 
+@few
 @given(tasks(), tasks(), st.randoms())
 def test_a_manager_that_saw_anything_before_comes_to_the_same_as_a_fresh_one(
     before: list[ApplicationTask], live: list[ApplicationTask], source: random.Random
@@ -299,6 +303,7 @@ def test_a_manager_that_saw_anything_before_comes_to_the_same_as_a_fresh_one(
         assert running[each.name] == each.spec
 
 
+@few
 @given(tasks(), tasks())
 def test_a_task_that_comes_and_goes_restores_what_was(
     live: list[ApplicationTask], others: list[ApplicationTask]
@@ -311,6 +316,7 @@ def test_a_task_that_comes_and_goes_restores_what_was(
     assert applications(after.instances) == applications(of(*live).instances)
 
 
+@few
 @given(tasks())
 def test_every_task_is_told_what_became_of_it_and_none_but_deploy_makes_anything_run(
     live: list[ApplicationTask],
