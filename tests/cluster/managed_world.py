@@ -25,7 +25,7 @@ from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import PATIENCE, wait_until
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 
-KINDS = ("Deployment", "ConfigMap", "Service")  # those that the tests' templates make
+KINDS = ("Deployment", "ConfigMap", "Service", "HorizontalPodAutoscaler")  # those that the tests' templates make
 MANAGED = "app.kubernetes.io/managed-by=wayside"
 
 
