@@ -40,7 +40,8 @@ class ClaimBook:
         self._by_template.setdefault(of, {})[name] = task
         claimed = claim_or_verdict(template, task)
         if isinstance(claimed, Verdict):
-            if claimed.standing is Standing.FINISHED and before is not None:  # its status may not name it yet
+            served = before is not None and template_of_all(before.instance) is None
+            if claimed.standing is Standing.FINISHED and before is not None and served:  # its status may not say so yet
                 claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched

@@ -210,9 +210,7 @@ def suspension_aspect(
         return Aspect("Suspended", False, "NotSuspended", "no task suspends it")
     there = [each for each in objects if each is not None]
     left = [f"{each['kind']} {each['metadata']['name']} has {n} pods" for each in there if (n := pods_left(each))]
-    whose = (
-        f"task {decision.suspender} suspends it" if decision.suspender else "it was suspended when it was last demanded"
-    )
+    whose = f"task {decision.suspender} suspends it" if decision.suspender else "spec.suspended is true"
     if left:
         return Aspect("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
     resting = "".join(f"; HorizontalPodAutoscaler {each} rests until then" for each in autoscalers(there))
