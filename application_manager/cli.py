@@ -140,13 +140,13 @@ def render(
 ) -> None:
     """Print what would run, as YAML: merged instances and their manifests, without a cluster.
 
-    What is refused is said on stderr; then the exit code is 1.
+    What waits, is held at a bound or is refused is said on stderr; where something is refused, the exit code is 1.
     """
     policy = _policy(allowed_kinds, service_accounts)
     result = render_files([*templates, *tasks], policy)
     sys.stdout.write(result.text)
-    for refusal in result.refusals:
-        typer.echo(refusal, err=True)
+    for line in (*result.notes, *result.refusals):
+        typer.echo(line, err=True)
     if result.refusals:
         raise typer.Exit(1)
 

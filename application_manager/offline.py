@@ -25,10 +25,12 @@ class Rendered:
     Attributes:
         objects: the instances, each followed by its manifests.
         refusals: what cannot be, one line each.
+        notes: what else is worth knowing: tasks that wait, sums that are held at a bound.
     """
 
     objects: list[dict[str, Any]] = field(default_factory=list)
     refusals: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def text(self) -> str:
@@ -53,8 +55,11 @@ def render_objects(objects: Sequence[Kind], policy: Policy, now: float) -> Rende
         tasks = [each for each in here if isinstance(each, ApplicationTask)]
         outcome = demand(templates.values(), tasks, [], {}, now)
         for name, verdict in sorted(outcome.verdicts.items()):
+            line = f"ApplicationTask {namespace}/{name}: {verdict.reason}: {verdict.message}"
             if verdict.standing is Standing.REFUSED:
-                result.refusals.append(f"ApplicationTask {namespace}/{name}: {verdict.reason}: {verdict.message}")
+                result.refusals.append(line)
+            elif verdict.standing is Standing.WAITING:
+                result.notes.append(line)
         for decision in outcome.instances.values():
             _render(decision, templates[decision.template], policy, result)
     return result
@@ -63,6 +68,7 @@ def render_objects(objects: Sequence[Kind], policy: Policy, now: float) -> Rende
 def _render(decision: Decision, template: ApplicationTemplate, policy: Policy, result: Rendered) -> None:
     instance = drafting.draft((template.namespace, decision.name), decision, None)
     result.objects.append(drafting.created(instance, template))
+    result.notes.extend(f"ApplicationInstance {template.namespace}/{decision.name}: {each}" for each in decision.capped)
     try:
         result.objects.extend(Renderer(template, policy).render(instance).manifests)
     except RenderError as error:

@@ -99,6 +99,20 @@ def test_a_kind_that_is_not_allowed_is_refused(render: Any) -> None:
     assert "allowed are v1/ConfigMap" in result.stderr
 
 
+def test_a_task_that_waits_and_a_capped_sum_are_said_without_an_error(render: Any) -> None:
+    load = {"type": "number", "merge": "Sum", "maximum": 5}
+    template = {
+        **TEMPLATE,
+        "spec": {**TEMPLATE["spec"], "parameters": {**TEMPLATE["spec"]["parameters"], "load": load}},
+    }
+    night = task("night", parameters={"region": "elsewhere"})
+    night["spec"]["operation"] = "Suspend"
+    result = render(template, *(task(name, parameters={"region": "n", "load": 4}) for name in ("a", "b")), night)
+    assert result.exit_code == 0, result.stderr
+    assert "night: NothingRuns: no task deploys instance" in result.stderr
+    assert "load: the sum of 2 values, 8, is held at the maximum of 5" in result.stderr
+
+
 def test_bad_files_and_bad_options_are_one_clear_line_and_exit_code_2(
     render: Any, command: Callable[..., Result], tmp_path: Path
 ) -> None:
