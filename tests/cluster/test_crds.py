@@ -227,7 +227,7 @@ class TestKubectl:
             (
                 "apptask",
                 APPLICATION_TASK,
-                ["NAME", "TEMPLATE", "RULE", "SUBJECT", "INSTANCE", "PHASE", "AGE", "MESSAGE"],
+                ["NAME", "TEMPLATE", "OPERATION", "RULE", "SUBJECT", "INSTANCE", "PHASE", "AGE", "MESSAGE"],
             ),
             (
                 "appinst",
