@@ -189,8 +189,8 @@ def decide(
         return Decision(name, template_name, key, None, (), {}, None, None, paused)
     live, verdicts, changes = _live(ordered, template, leases, now)
     settled = settle(name, template, live, instance is not None)
-    keyed = [each for each in live if each.task.name in settled.tasks]
-    key = keyed[0].key if keyed else instance.spec.key if instance else None
+    kept = instance.spec.key if instance else None
+    key = next((each.key for each in live if each.task.name in settled.tasks[:1]), kept)  # all that deploy it agree
     wanted = settled.parameters is not None
     suspended: bool | None = settled.suspender is not None
     release_time = None
