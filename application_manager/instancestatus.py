@@ -81,7 +81,9 @@ class InstanceStatusWork:
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message
         reason = ""
-        if applied.aspect.holds and not ready.holds and (troubles := self.world.pods.troubles(name)):
+        if applied.aspect.holds and suspended is not None and instance.spec.suspended:
+            why_not, reason = suspended.message, ready.reason
+        elif applied.aspect.holds and not ready.holds and (troubles := self.world.pods.troubles(name)):
             why_not, reason = _text(troubles), ready.reason
         if record.decision.withheld and applied.aspect.holds:
             why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): it does not get the task's values"

@@ -112,7 +112,7 @@ def _latched(
     if now_holds or holds(known, type_):
         since = f"; now: {service.problem}" if service.problem and not now_holds else ""
         return Aspect(type_, True, reason, f"instance {service.instance} was {word}{since}")
-    if service.applied and service.reason:
+    if service.applied and service.reason and word != "suspended":
         otherwise = service.reason
     return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {word} yet")
 
