@@ -21,20 +21,17 @@ from application_manager.core.claims import (
     claim,
     template_of_all,
 )
+from application_manager.core.lapses import live_claims
 from application_manager.core.leases import LeaseView
 from application_manager.core.operations import Standing, Verdict, gathered, settle, waiting_for_any
 from application_manager.core.parameters import baseline
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
-from wayside.api.applicationtemplate import Lifecycle, LossPolicy
+from wayside.api.applicationtemplate import Lifecycle
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Duration
-from wayside.leases import lease_name
 from wayside.times import parse_seconds
 
 LINGER_ANNOTATION = "wayside.dev/linger"
 """On an instance: its template's linger, for when the template is gone."""
-
-HOLDER_LOST = "HolderLost"
-FINISH_LOST_AFTER = 3600.0  # s that a holder may be lost before its tasks are finished
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +184,7 @@ def decide(
     if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
         key = instance.spec.key if instance else None
         return Decision(name, template_name, key, None, (), {}, None, None, paused)
-    live, verdicts, changes = _live(ordered, template, leases, now)
+    live, verdicts, changes = live_claims(ordered, template, leases, now)
     settled = settle(name, template, live, instance is not None)
     kept = instance.spec.key if instance else None
     key = next((each.key for each in live if each.task.name in settled.tasks[:1]), kept)  # all that deploy it agree
@@ -240,7 +237,7 @@ def decide_for_all(
     """
     ordered = sorted(claims, key=lambda each: precedence(each.task))
     usable = template if isinstance(template, ApplicationTemplate) else None
-    live, verdicts, changes = _live(ordered, usable, leases, now)
+    live, verdicts, changes = live_claims(ordered, usable, leases, now)
     verdicts |= {each.task.name: waiting_for_any(each) for each in live}
     return Decision(
         name=name,
@@ -252,25 +249,6 @@ def decide_for_all(
         release_time=None,
         next_change=min((change for change in changes if change > now), default=None),
     )
-
-
-def _live(
-    ordered: Iterable[Claim], template: ApplicationTemplate | None, leases: Mapping[str, LeaseView], now: float
-) -> tuple[list[Claim], dict[str, Verdict], list[float]]:
-    """The claims whose holders are not lost, the verdicts of the others, and when any of this changes by itself."""
-    lifecycle = template.spec.lifecycle if template else Lifecycle()
-    live: list[Claim] = []
-    verdicts: dict[str, Verdict] = {}
-    changes: list[float] = []
-    for each in ordered:
-        lapse, change = _lapse(each.task, lifecycle, leases, now)
-        if change is not None:
-            changes.append(change)
-        if lapse is None:
-            live.append(each)
-        else:
-            verdicts[each.task.name] = lapse
-    return live, verdicts, changes
 
 
 def precedence(task: ApplicationTask) -> tuple[int, str, str]:
@@ -310,37 +288,3 @@ def linger_of(instance: ApplicationInstance, template: ApplicationTemplate | Non
         return Duration.parse(noted) if noted else Lifecycle().linger
     except ValueError:
         return Lifecycle().linger  # somebody wrote something else into the annotation
-
-
-def _lapse(
-    task: ApplicationTask, lifecycle: Lifecycle, leases: Mapping[str, LeaseView], now: float
-) -> tuple[Verdict | None, float | None]:
-    """The task's verdict where its holder is lost, None where it counts; and when that changes by itself.
-
-    What the status says of a loss survives our own restart: the holder counts as lost until its Lease is seen to be
-    renewed, since a new manager has not observed anything yet.
-    """
-    holder = task.spec.requester.holder
-    view = leases.get(holder) if holder else None
-    if holder is None or view is None or lifecycle.on_detector_loss.policy is LossPolicy.HOLD:
-        return None, None
-    limit = view.duration + lifecycle.on_detector_loss.after.seconds
-    lost_since = _lost_since(task)
-    if view.unchanged < limit and (view.renewed or lost_since is None):
-        return None, now + limit - view.unchanged
-    since = now if lost_since is None else lost_since
-    if now - since >= FINISH_LOST_AFTER:
-        message = f"holder {holder} has been lost for over an hour"
-        return Verdict(Standing.FINISHED, "DetectorLost", message), None
-    message = (
-        f"holder {holder} is lost: its Lease {lease_name(holder)} was not renewed for {limit:g} s; "
-        "the demand counts again when it is"
-    )
-    return Verdict(Standing.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER
-
-
-def _lost_since(task: ApplicationTask) -> float | None:
-    for condition in task.status.conditions if task.status else ():
-        if condition.type == "Accepted" and condition.status == "False" and condition.reason == HOLDER_LOST:
-            return parse_seconds(condition.last_transition_time)
-    return None
