@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from application_manager.core import values
-from application_manager.core.claims import InvalidTemplate, claim
+from application_manager.core.claims import InvalidTemplate, claim, template_of_all
 from application_manager.core.conditions import find
-from application_manager.core.demand import HOLDER_LOST, Decision, Verdict, demand, is_managed, precedence
+from application_manager.core.demand import Decision, demand, is_managed, precedence
 from application_manager.core.explanation import (
     Contribution,
     ExplainedInstance,
@@ -24,10 +24,13 @@ from application_manager.core.explanation import (
     ExplainedTemplate,
     Explanation,
 )
+from application_manager.core.lapses import HOLDER_LOST
 from application_manager.core.leases import LeaseView
+from application_manager.core.operations import Standing, Verdict
 from application_manager.core.pods import trouble
 from application_manager.core.readiness import not_ready
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
+from wayside.api.operation import Operation
 from wayside.api.parameter import Merge
 from wayside.times import parse_seconds
 
@@ -41,6 +44,8 @@ _LATER = {
     Merge.ANY: "another task says true",
 }
 """Why a value is outbid."""
+
+_BELOW = "a task that reconfigures lies over it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +67,12 @@ class Found:
 
 
 def serving(found: Found, task: ApplicationTask) -> str | None:
-    """The name of the instance that the task claims, or that served it; None where there is none."""
+    """The name of the instance that the task claims, or that served it; None where there is none, or all are meant."""
     template = next((each for each in found.templates if each.name == task.spec.template), None)
     claimed = claim(template, task)
     name = getattr(claimed, "instance", None)
+    if name is not None and template_of_all(name) is not None:
+        name = None
     return name or (task.status.instance if task.status else None)
 
 
@@ -123,6 +130,7 @@ def _task(task: ApplicationTask, verdict: Verdict, leases: Mapping[str, Object],
         standing=str(verdict.standing.value),
         reason=verdict.reason,
         message=verdict.message,
+        operation=str(task.spec.operation.value),
         priority=task.spec.priority,
         created=task.metadata.creation_timestamp or None,
         detector=task.spec.requester.detector,
@@ -184,18 +192,37 @@ def _parameters(
         return []
     merged = decision.parameters if decision.parameters is not None else existing.spec.parameters if existing else {}
     counting = set(decision.tasks)
+    changing = {
+        each.name
+        for each in tasks
+        if each.spec.operation is Operation.RECONFIGURE
+        and each.name in decision.verdicts
+        and decision.verdicts[each.name].standing is Standing.COUNTS
+    }
+    always = template.spec.baseline.parameters if template.spec.baseline else {}
     result = []
     for name, parameter in sorted(template.spec.parameters.items()):
         value = merged.get(name)
+        layered = any(each.name in changing and each.spec.parameters.get(name) is not None for each in tasks)
         said = [
-            _contribution(each, each.spec.parameters[name], value, parameter.merge, counts=each.name in counting)
+            Contribution(task=each.name, value=each.spec.parameters[name], effect="outbid", why=_BELOW)
+            if layered and each.name in counting
+            else _contribution(
+                each, each.spec.parameters[name], value, parameter.merge, counts=each.name in counting | changing
+            )
             for each in tasks
             if each.spec.parameters.get(name) is not None and each.spec.end_time is None
         ]
         source = "tasks" if any(each.effect != "none" for each in said) else "none"
         if source == "none" and value is not None:
             is_default = values.canonical(value) == values.canonical(parameter.default)
-            source = "default" if parameter.default is not None and is_default else "earlier"
+            source = (
+                "baseline"
+                if name in always
+                else "default"
+                if parameter.default is not None and is_default
+                else "earlier"
+            )
         result.append(
             ExplainedParameter(name=name, merge=str(parameter.merge.value), value=value, source=source, said=said)
         )

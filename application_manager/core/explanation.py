@@ -28,7 +28,8 @@ class Contribution(Model):
 class ExplainedParameter(Model):
     """One parameter of the template.
 
-    `source` is `tasks`, `default`, `earlier` (no task gives it now; the instance keeps what it has), or `none`.
+    `source` is `tasks`, `default`, `baseline`, `earlier` (no task gives it now; the instance keeps what it
+    has), or `none`.
     """
 
     name: str
@@ -50,6 +51,7 @@ class ExplainedTask(Model):
     standing: str
     reason: str
     message: str
+    operation: str = "Deploy"
     priority: int
     created: str | None = None
     detector: str | None = None

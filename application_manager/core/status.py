@@ -88,7 +88,7 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, service, suspends),
         instance=instance,
-        message=_task_message(verdict, service),
+        message=_task_message(verdict, service, suspends),
         observed_generation=task.metadata.generation,
         conditions=list(conditions),
     )
@@ -136,14 +136,15 @@ def _task_phase(verdict: Verdict, service: Service | None, suspends: bool) -> Ta
     return TaskPhase.READY if service.ready else TaskPhase.ACTIVE
 
 
-def _task_message(verdict: Verdict, service: Service | None) -> str | None:
+def _task_message(verdict: Verdict, service: Service | None, suspends: bool) -> str | None:
     if verdict.standing is not Standing.COUNTS:
         return _short(verdict.message)
     if service is None:
         return f"instance {verdict.instance} is not made yet"
-    if service.applied and service.ready:
+    done, word = (service.stopped, "suspended") if suspends else (service.ready, "ready")
+    if service.applied and done:
         return None
-    lacks = "ready" if service.applied else "applied"
+    lacks = word if service.applied else "applied"
     return _short(service.problem or f"instance {service.instance} is not {lacks} yet")
 
 
