@@ -15,6 +15,7 @@ import asyncio
 import json
 import logging
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -26,6 +27,9 @@ from application_manager.store import Name
 _ALL = "wayside/instances/*/*/configuration"
 _RETRIES = (0.2, 0.5, 1.0, 2.0)
 """Seconds between attempts to reach the network; the last one repeats."""
+_REPEATS = (0.0, 1.0, 5.0)
+"""Seconds after a new connection at which all is published: what is put before the other side has told of its
+subscribers reaches nobody."""
 _CLOSING = 2.0  # s that the thread is given to end
 
 log = logging.getLogger(__name__)
@@ -77,7 +81,7 @@ class Publisher:
         self._lock = threading.Condition()
         self._contents: dict[str, bytes] = {}
         self._pending: dict[str, None] = {}  # keys whose content, or whose end, is not out yet, in order
-        self._connected = False
+        self._repeats: list[float] = []  # when all is to be published again, by the monotonic clock
         self._ended = False
 
     def publish(self, name: Name, files: Mapping[str, str]) -> None:
@@ -163,7 +167,13 @@ class Publisher:
     def _next(self) -> list[tuple[str, bytes | None]] | None:
         """Wait for news; None once we are to end."""
         with self._lock:
-            self._lock.wait_for(lambda: self._ended or self._pending)
+            while not self._ended and not self._pending:
+                now = time.monotonic()
+                if self._repeats and self._repeats[0] <= now:
+                    self._repeats.pop(0)
+                    self._pending |= dict.fromkeys(self._contents)
+                else:
+                    self._lock.wait(self._repeats[0] - now if self._repeats else None)
             if self._ended:
                 return None
             news = [(key, self._contents.get(key)) for key in self._pending]
@@ -174,7 +184,8 @@ class Publisher:
         """Zenoh's thread calls it for every connection that opens or closes."""
         with self._lock:
             if event.kind == zenoh.SampleKind.PUT:
-                self._pending |= dict.fromkeys(self._contents)
+                now = time.monotonic()
+                self._repeats = [now + each for each in _REPEATS]
                 self._lock.notify()
                 log.info("zenoh: connected, %d configurations are published", len(self._contents))
             elif not self._ended:
