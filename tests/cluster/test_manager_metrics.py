@@ -11,11 +11,11 @@ from prometheus_client.parser import text_string_to_metric_families
 from application_manager.measures import PREFIX
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.controlplane.ports import free_ports
 from tests.cluster.managed_world import start_manager, task, template
 from tests.cluster.pods import mark_pods_ready
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
+from tests.ports import free_port
 
 
 def get(port: int, path: str) -> tuple[int, str]:
@@ -37,7 +37,7 @@ def scraped(port: int) -> dict[tuple[str, ...], float]:
 def test_what_becomes_of_tasks_is_counted_and_timed_from_their_events(
     processes: Processes, namespace: str, api: Api
 ) -> None:
-    (port,) = free_ports(1)
+    port = free_port()
     start_manager(processes, namespace, "--metrics-port", str(port))
     wait_until(lambda: get(port, "/readyz"), lambda found: found == (200, "ok\n"), what="it is ready")
     assert get(port, "/healthz") == (200, "ok\n")
@@ -72,7 +72,7 @@ def test_what_becomes_of_tasks_is_counted_and_timed_from_their_events(
 def test_while_the_api_server_is_away_the_manager_is_healthy_but_not_ready(
     processes: Processes, namespace: str, api: Api, control_plane: ControlPlane
 ) -> None:
-    (port,) = free_ports(1)
+    port = free_port()
     start_manager(processes, namespace, "--metrics-port", str(port))
     wait_until(lambda: get(port, "/readyz")[0], lambda code: code == 200, what="it is ready")
     control_plane.stop_api_server()
@@ -85,7 +85,7 @@ def test_while_the_api_server_is_away_the_manager_is_healthy_but_not_ready(
 
 
 def test_a_port_that_is_taken_is_one_line_with_the_option(processes: Processes, namespace: str) -> None:
-    (port,) = free_ports(1)
+    port = free_port()
     start_manager(processes, namespace, "--metrics-port", str(port))
     second = processes.start("application-manager", "run", "--namespace", namespace, "--metrics-port", str(port))
     assert second.wait() == 2
