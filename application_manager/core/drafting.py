@@ -68,8 +68,7 @@ def created(wanted: ApplicationInstance, template: ApplicationTemplate | None) -
             "labels": {MANAGED_BY_LABEL: MANAGED_BY},
             "annotations": {LINGER_ANNOTATION: str(linger_of(wanted, template))},
         },
-        # Said also where there are none: fields that are taken away by an apply would leave a null.
-        "spec": {"parameters": {}, **wanted.spec.to_json()},
+        "spec": wanted.spec.to_json(),
     }
 
 
