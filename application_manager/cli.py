@@ -129,6 +129,7 @@ def run(
         chart_folder=chart_folder,
     )
     asyncio.run(serve(options))
+    commandline.leave()
 
 
 @app.command()

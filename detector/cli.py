@@ -35,7 +35,7 @@ from detector.streams.asking import NoAnswerError
 from detector.streams.zenoh import NetworkError
 from wayside import commandline
 from wayside.api.documents import DocumentError, load_documents
-from wayside.commandline import refuse
+from wayside.commandline import leave, refuse
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -101,6 +101,7 @@ def run(
             refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
         options = Options(Files(detector, tuple(rules or ()), output or Path("out")), record_intake, metrics_port)
     asyncio.run(run_service(options))
+    leave()
 
 
 @app.command()

@@ -5,6 +5,8 @@ Bad usage and bad input end with exit code 2; `--debug` may stand before or afte
 
 from __future__ import annotations
 
+import logging
+import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn, cast
@@ -41,6 +43,18 @@ def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], a
         for each in causes:
             _tell(program, each)
         return BAD_INPUT
+
+
+def leave() -> NoReturn:
+    """End the process with exit code 0, now that all is closed and written.
+
+    A thread in native code (Zenoh's, an action's that was left behind) may be on its way back into Python just then. The
+    interpreter's own end would unwind it, which native code answers by aborting: "exception not rethrown".
+    """
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def refuse(message: str) -> NoReturn:
