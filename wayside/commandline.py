@@ -48,8 +48,8 @@ def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], a
 def leave() -> NoReturn:
     """End the process with exit code 0, now that all is closed and written.
 
-    A thread in native code (Zenoh's, an action's that was left behind) may be on its way back into Python just then. The
-    interpreter's own end would unwind it, which native code answers by aborting: "exception not rethrown".
+    A thread in native code (Zenoh's, an action's that was left behind) may be on its way back into Python just then.
+    The interpreter's own end would unwind it, which native code answers by aborting: "exception not rethrown".
     """
     logging.shutdown()
     sys.stdout.flush()
