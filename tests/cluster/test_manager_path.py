@@ -101,6 +101,26 @@ def test_a_new_demand_within_the_linger_keeps_the_instance_untouched(api: Api, m
     assert (after["uid"], after["generation"]) == (before["uid"], before["generation"])
 
 
+def test_the_last_value_can_go_while_a_demand_without_values_stays(api: Api, manager: Process) -> None:
+    optional = {"parameters": {"sources": {"type": "array", "items": "string", "merge": "Union"}}}
+    name = instance_name("app", None)
+    given = {"sources": ["car1"]}
+    api.create({**template(), "spec": {"manifests": [deployment()], **optional}})
+    for task_name, parameters in (("with", given), ("without", {})):
+        spec = {"template": "app", "parameters": parameters}
+        api.create({**task(task_name), "spec": spec})
+    api.wait_for(
+        "ApplicationInstance",
+        name,
+        lambda raw: raw["spec"].get("parameters") == {"sources": ["car1"]},
+        what="it is there",
+    )
+    api.wait_for("ApplicationTask", "without", lambda raw: raw.get("status", {}).get("instance") == name, what="both")
+    end(api, "with")
+    api.wait_for("ApplicationInstance", name, lambda raw: not raw["spec"].get("parameters"), what="the value is gone")
+    wait_settled(api)
+
+
 def test_a_finished_task_is_deleted_after_its_time(processes: Processes, namespace: str, api: Api) -> None:
     start_manager(processes, namespace, "--ttl-after-finished", "1s")
     api.create(template())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from wayside.api.base import Condition, Identifier, JsonValue, Kind, Model, TemplateName, Time, conditions_field
 
@@ -20,11 +20,20 @@ class ApplicationInstanceSpec(Model):
         description="The value of the template's key, lists and maps as JSON; absent where it has none. Immutable.",
     )
     parameters: dict[Identifier, JsonValue] = Field(
-        default_factory=dict, max_length=64, description="The merged values of the template's parameters."
+        default_factory=dict,
+        max_length=64,
+        description="The merged values of the template's parameters.",
+        # Server-side apply makes a map null that loses the last entry which its manager had put there.
+        json_schema_extra={"nullable": True},
     )
     suspended: bool = Field(
         default=False, description="true: its workloads are at zero, whoever demands it; status says what they were."
     )
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _null_is_empty(cls, value: object) -> object:
+        return {} if value is None else value
 
 
 class ObjectReference(Model):

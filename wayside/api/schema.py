@@ -8,7 +8,7 @@ from wayside.api.base import GROUP, VERSION, Kind
 
 _KEPT = {
     "type", "description", "pattern", "minLength", "maxLength", "minimum", "maximum", "exclusiveMinimum",
-    "minItems", "maxItems", "minProperties", "maxProperties", "enum", "default", "required",
+    "minItems", "maxItems", "minProperties", "maxProperties", "enum", "default", "required", "nullable",
 }  # fmt: skip
 
 
