@@ -107,6 +107,8 @@ class Losses:
             yield Loss("samples dropped, their stamps being ahead of the rest", ahead, timeline.last, cause="ahead")
             yield Loss("samples dropped, their stamps being too old", late, timeline.last, cause="late")
             yield Loss("samples dropped, too many waiting for their time", timeline.dropped_full, cause="waiting_full")
+        too_late = "samples came when the window of an action that they belong to was complete: raise lateness"
+        yield Loss(too_late, self._engine.consequences.too_late, cause="window_late")
         for name, count in counters.undecodable.items():
             last = counters.last_undecodable.get(name, "")
             unread = f"times a sample of stream {name} could not be read"

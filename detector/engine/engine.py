@@ -351,6 +351,7 @@ class Engine:
 
     def _make_timeline(self, start: int) -> Timeline:
         spec = self.detector.spec
+        self.consequences.watch_late = spec.clock is Clock.DATA
         if spec.clock is Clock.WALL:
             return WallTimeline(self._ticks, start)
         return DataTimeline(

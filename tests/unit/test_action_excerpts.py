@@ -212,6 +212,24 @@ def test_a_changed_rule_ends_its_episodes_and_their_windows_go_on() -> None:
     assert [len(each.samples) for each in told if isinstance(each, Sampled)] == [1]
 
 
+def test_what_comes_when_its_window_is_complete_is_counted() -> None:
+    engine = an_engine(DATA, fast(an_action(streams=["speed"], before="1s")))
+    told = run(
+        engine,
+        [
+            [message(0.05, "car1", "speed", 1.0)],
+            [message(1.05, "car1", "speed", 0.0)],
+            [message(3.05, "car1", "speed", 0.0)],
+            [message(0.5, "car1", "speed", 1.0, late=3.0), message(1.9, "car1", "speed", 1.0, late=1.9)],
+        ],
+        4.0,
+    )
+    assert order(told)[-1] == "Completed"
+    assert engine.consequences.too_late == 1, "the second of them is in no window"
+    run(engine, [[message(20.0, "car1", "speed", 0.0)]], 21.0)
+    assert all(lane.came is None for lane in engine.buffer), "nobody waits for late ones any more"
+
+
 def test_what_is_rendered_for_an_action_is_of_the_start_and_each_by_itself() -> None:
     values = {"text": "${client} at ${v}", "missing": "${labels.plate}"}
     engine = an_engine(PLAIN, fast({"name": "n", "plugin": {"name": "teller", "values": values}}))

@@ -5,6 +5,7 @@ The engine notes what happens; the shell takes it and passes it on, to actions t
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -15,6 +16,10 @@ from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.rendering import Rendered
 from wayside.rules import CompiledAction, CompiledRule, CompiledWindow
+
+_WATCHED = 100
+_WATCHED_FOR = 10 * 10**9
+"""So many complete excerpts are watched for late samples, and so many nanoseconds."""
 
 REPLACED = "the action was changed or removed"
 
@@ -80,6 +85,12 @@ class Consequences:
         self._requested: dict[Run, Event] = {}
         """Of the runs, those that somebody asked for, with what they began with."""
         self._noted: list[Consequence] = []
+        self._complete_ones: deque[Excerpt] = deque()
+        """Excerpts that are complete and still watched, for what comes too late for them."""
+        self.watch_late = False
+        """Whether samples may come late, as with clock Data."""
+        self.too_late = 0
+        """Samples that came when the window to which they belong was complete."""
 
     def note(self, rule: CompiledRule, event: Event) -> None:
         """An episode of the rule started or ended just now, or before the rule changed."""
@@ -143,8 +154,19 @@ class Consequences:
                     self._sample(run, excerpt, now)
                     if excerpt.until is not None and now >= excerpt.until:
                         self._complete(run, "")
+        if self._complete_ones:
+            self._count_late(now)
         noted, self._noted = self._noted, []
         return noted
+
+    def _count_late(self, now: int) -> None:
+        self._excerpts.distribute()
+        for excerpt in self._complete_ones:
+            self.too_late += len(excerpt.take(now))
+        while self._complete_ones and (
+            len(self._complete_ones) > _WATCHED or now - (self._complete_ones[0].until or 0) > _WATCHED_FOR
+        ):
+            self._excerpts.stop(self._complete_ones.popleft())
 
     def cut(self, now: int, why: str) -> list[Consequence]:
         """The same, and the end of all runs: the detector stops."""
@@ -173,7 +195,9 @@ class Consequences:
         begun = self._requested.pop(run, None)
         if begun is not None and excerpt is not None and not cut:
             self._noted.append(Over(run, replace(begun, end_time=excerpt.until, reason=Reason.UNTIL)))
-        if excerpt is not None:
+        if excerpt is not None and self.watch_late and not cut:
+            self._complete_ones.append(excerpt)
+        elif excerpt is not None:
             self._excerpts.stop(excerpt)
         self._noted.append(Completed(run, cut))
 
