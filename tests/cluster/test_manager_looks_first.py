@@ -20,6 +20,7 @@ from application_manager.instances import InstanceWork
 from application_manager.recorder import Recorder
 from application_manager.router import Router
 from application_manager.store import Name
+from application_manager.suspending import Suspending
 from application_manager.world import World
 from tests.cluster.api import Api
 from tests.cluster.managed_world import deployment, task, template
@@ -45,6 +46,7 @@ def work_on(world: World, client: Client) -> tuple[Router, InstanceWork]:
         client=client,
         applier=applier,
         recorder=Recorder(client),
+        suspending=Suspending(client, applier, INSTANCES, router.observe),
         instances=INSTANCES,
         tasks=TASKS,
         again=ignore,
