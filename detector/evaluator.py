@@ -24,6 +24,7 @@ from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.evaluation import Answer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
+from detector.garbage import Sweeper
 from detector.losses import Losses
 from detector.overload import LONG, Overload
 from detector.plugins.outages import Outages
@@ -109,6 +110,7 @@ class Evaluator:
         self._ended = False
         self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
         self._overload = Overload()
+        self._sweeper = Sweeper()
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
         self.losses = Losses(engine, intake)
@@ -195,6 +197,7 @@ class Evaluator:
                     _answer(future, work)
                 self.status.looked()
                 self.losses.say()
+                self._sweeper.look()
             self._record(self._engine.now, {"kind": "end"})
             self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
         except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
 import re
 import time
@@ -205,17 +204,6 @@ def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:
         cause = "action_" + re.sub(r"[^a-z]+", "_", lost.what.lower()).strip("_")
         what = f"{lost.what} (action {lost.which.action} of EventRule {lost.which.rule})"
         yield Loss(what, lost.count, lost.last, cause=cause, rule=lost.which.rule)
-
-
-def tune_garbage_collection() -> None:
-    """Let Python look for reference cycles less often.
-
-    A sample is a tuple, and by default every 700 new ones start a search, although they never form cycles. That cost as
-    much as receiving and inserting them (`benchmarks/intake_rate.py`).
-    """
-    gc.collect()
-    gc.freeze()
-    gc.set_threshold(100_000, 20, 50)
 
 
 def _unused(path: Path) -> Path:

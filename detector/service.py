@@ -15,10 +15,11 @@ from pathlib import Path
 
 from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler
+from detector.garbage import tune_garbage_collection
 from detector.restoring import what_was_open
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files
-from detector.running import Running, tune_garbage_collection
+from detector.running import Running
 from detector.state import state_file
 
 _log = logging.getLogger(__name__)
