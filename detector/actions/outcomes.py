@@ -113,6 +113,11 @@ class Outcomes:
         with self._lock:
             return (which, episode) in self._said
 
+    def is_silent(self, which: Which, episode: str) -> bool:
+        """Whether nothing was said of the run yet."""
+        with self._lock:
+            return (which, episode) in self._said and self._said[which, episode] is None
+
     def lose(self, which: Which, what: str, count: int, last: str) -> None:
         """See `Setting.lose`."""
         with self._lock:

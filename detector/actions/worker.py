@@ -26,6 +26,8 @@ _log = logging.getLogger(__name__)
 MAXIMUM_BYTES = 256 * 2**20
 """So many bytes of samples wait for an action at most, overhead included."""
 
+SILENT = "the action ended without saying what became of it"
+
 _AGAIN = 1.0
 """Seconds after which `wake` is called again when it failed."""
 
@@ -48,7 +50,9 @@ class Worker:
         self._changed = threading.Condition()
         self._closing = False
         self._episodes: dict[Run, Episode] = {}
-        """Of the runs that the action works on."""
+        """Of the runs that the action is told of."""
+        self._completed: list[Episode] = []
+        """Episodes of which nothing more comes, and of which the action has not said anything yet."""
         self.open: set[Run] = set()
         """The runs that are not completed, as the one who tells sees it."""
         self._thread = threading.Thread(target=self._work, name=f"action {which.rule}/{which.action}", daemon=True)
@@ -118,6 +122,8 @@ class Worker:
                 action.close()
             except Exception as error:  # noqa: BLE001  somebody else's code, at its very end
                 self._failed_in(action, "close", error)
+            for episode in self._silent():
+                self._outcomes.report(self.which, episode, Outcome(OutcomeState.FAILED, SILENT))
 
     def _made(self) -> tuple[Action[Any] | None, str]:
         try:
@@ -144,7 +150,11 @@ class Worker:
                 _log.debug("action %s of EventRule %s", self.which.action, self.which.rule, exc_info=error)
             self._fail(run, _text(error))
         if isinstance(consequence, Completed):
-            self._episodes.pop(run, None)
+            told_of = self._episodes.pop(run, None)
+            self._completed = [*self._silent(), *(() if told_of is None else (told_of,))]
+
+    def _silent(self) -> list[Episode]:
+        return [each for each in self._completed if self._outcomes.is_silent(self.which, each.id)]
 
     def _call(self, action: Action[Any], consequence: Consequence) -> None:
         run = consequence.run

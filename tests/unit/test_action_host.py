@@ -24,6 +24,7 @@ from detector.actions import (
 )
 from detector.actions.host import ActionHost
 from detector.actions.outcomes import Tally, Which
+from detector.actions.worker import SILENT
 from detector.assembly import inlets
 from detector.engine.engine import Engine
 from tests.unit.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
@@ -87,6 +88,13 @@ class Hangs(Recorded):
         super().started(episode)
 
 
+class Silent(Recorded):
+    """Never says what became of its work."""
+
+    def completed(self, episode: Episode, completion: Completion) -> None:
+        self.note("completed", episode)
+
+
 class Wakes(Recorded):
     """Wants to be called again, and fails with it once."""
 
@@ -99,7 +107,14 @@ class Wakes(Recorded):
         return 0.01
 
 
-KINDS = {"recorded": Recorded, "raises": Raises, "impossible": Impossible, "hangs": Hangs, "wakes": Wakes}
+KINDS = {
+    "recorded": Recorded,
+    "raises": Raises,
+    "impossible": Impossible,
+    "hangs": Hangs,
+    "wakes": Wakes,
+    "silent": Silent,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -239,6 +254,14 @@ def test_one_is_woken_when_it_wishes_and_what_it_raises_then_is_counted() -> Non
     site.when(lambda: Wakes.calls > 5)
     assert [(each.what, each.count) for each in site.host.outcomes.lost()] == [("times Wakes.wake failed", 1)]
     site.host.close()
+
+
+def test_one_that_says_nothing_has_failed_at_the_end() -> None:
+    site = Site(fast(a="silent"))
+    one_episode(site)
+    site.host.close()
+    tally = site.tally("a")
+    assert (tally.running, tally.failed, tally.last_failure) == (0, 1, SILENT)
 
 
 def test_each_outcome_is_told_once() -> None:

@@ -161,8 +161,9 @@ class Record(Action[api.Record]):
     def _recover(self, place: Destination, left: Sequence[Path]) -> None:
         try:
             kept = recover(place, left)
-        except Exception:
+        except Exception as error:  # what a kill left may be anything, and must not keep new recordings from being made
             log.exception("recordings that were left behind cannot be completed")
+            self.setting.lose("times recordings that were left behind could not be completed", 1, str(error))
             return
         if kept:
             self.setting.lose("recordings cut short", len(kept), REASON)
