@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample
 
@@ -144,6 +144,10 @@ class Buffer:
         """The client's lane of the stream, if it has one."""
         lanes = self._lanes.get(client)
         return None if lanes is None else lanes.get(stream)
+
+    def of(self, clients: Iterable[str]) -> Iterator[Lane]:
+        """The lanes of these clients."""
+        return (lane for client in clients for lane in self._lanes.get(client, {}).values())
 
     def add(self, lane: Lane) -> Lane:
         """Take the lane in; the one that is there already where there is one."""

@@ -9,7 +9,7 @@ that the episode had not ended before.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -46,6 +46,8 @@ class Excerpt:
     """Samples up to this time belong to it; None while the episode is open."""
     waiting: list[tuple[Lane, Sample]] = field(default_factory=list)
     """What time has not reached yet, or nobody has asked for."""
+    lanes: list[Lane] = field(default_factory=list)
+    """Where its samples come from."""
 
     def wants(self, lane: Lane) -> bool:
         """Whether the lane's samples are of the window's streams and clients."""
@@ -85,7 +87,7 @@ class Excerpts:
         self.distribute()
         excerpt = Excerpt(window, clients, begin)
         self._excerpts.append(excerpt)
-        for lane in self._buffer:
+        for lane in self._candidates(excerpt):
             if excerpt.wants(lane):
                 self._watch(lane, excerpt)
                 excerpt.waiting.extend((lane, sample) for sample in lane.samples)
@@ -94,11 +96,17 @@ class Excerpts:
     def stop(self, excerpt: Excerpt) -> None:
         """There is nothing more to come of it."""
         self._excerpts.remove(excerpt)
-        for lane in [lane for lane, watchers in self._watchers.items() if excerpt in watchers]:
+        for lane in excerpt.lanes:
             self._watchers[lane].remove(excerpt)
             if not self._watchers[lane]:
                 del self._watchers[lane]
                 lane.record(None)
+
+    def _candidates(self, excerpt: Excerpt) -> Iterable[Lane]:
+        """The lanes that it may want: there may be many clients, and an episode is about one or two of them."""
+        if excerpt.clients is None or excerpt.window.shared:
+            return self._buffer
+        return self._buffer.of(sorted(excerpt.clients))
 
     def _added(self, lane: Lane) -> None:
         """A lane is new in the buffer."""
@@ -111,6 +119,7 @@ class Excerpts:
         if not watchers:
             lane.record([])
         watchers.append(excerpt)
+        excerpt.lanes.append(lane)
 
     def distribute(self) -> None:
         """Give each excerpt what came since the last time."""
