@@ -7,7 +7,7 @@ PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do $$eac
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo demo-cluster test unit cluster lint bench crds clean
+.PHONY: help demo demo-cluster tutorial examples test unit cluster e2e lint bench requirements crds clean
 
 help: ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -32,25 +32,45 @@ demo: $(BIN)/.installed ## the main job: vehicles, events, tasks and what would 
 demo-cluster: $(BIN)/.installed-dev ## the same against a real control plane; CONTEXT=current: that of the current kubeconfig
 	@$(BIN)/python examples/cooperative-recording/demo_cluster.py --output out $(if $(filter current,$(CONTEXT)),--current)
 
-test: lint unit cluster ## everything that CI runs
+tutorial: $(BIN)/.installed-dev ## the run that docs/tutorial.md tells of, step by step
+	@$(BIN)/python examples/cooperative-recording/tutorial.py --pause
+
+examples: $(BIN)/.installed-dev ## all use cases: what must be detected and done, and what is; without a cluster
+	@$(BIN)/python -m examples.running --output out/examples
+
+test: lint unit process cluster ## everything that CI runs
 
 lint: $(BIN)/.installed-dev ## style, types and the direction of the imports
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check --quiet . && $(BIN)/mypy && $(BIN)/lint-imports
 
-unit: $(BIN)/.installed-dev ## the tests that need no cluster
-	@$(BIN)/python -m tests.mongodb
+unit: $(BIN)/.installed-dev ## the tests of what is pure, and of files
 	@$(BIN)/python -m pytest tests/unit
+
+process: $(BIN)/.installed-dev ## the tests with a detector's processes, Zenoh, MQTT, HTTP and a database's server
+	@$(BIN)/python -m tests.mongodb
+	@$(BIN)/python -m tests.helm
+	@$(BIN)/python -m pytest tests/process
 
 cluster: $(BIN)/.installed-dev ## the tests against a real control plane; builds it first where it is missing
 	@$(BIN)/python -m tests.cluster.binaries
 	@$(BIN)/python -m tests.helm
 	@$(BIN)/python -m pytest tests/cluster
 
+e2e: $(BIN)/.installed-dev ## the tests on a real node with containers, as root; builds it first where it is missing
+	@$(BIN)/python -m tests.e2e.programs
+	@$(BIN)/python -m pytest tests/e2e
+
 bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its baseline
 	@for each in $(basename $(notdir $(wildcard benchmarks/*.py))); do echo "== $$each"; $(BIN)/python -m benchmarks.$$each || exit 1; done
 
-crds: $(BIN)/.installed ## write crds/ anew from the models
+crds: $(BIN)/.installed ## write crds/ anew from the models, and what of the chart follows from the code
 	@$(BIN)/python -m wayside.api crds
+	@$(BIN)/python -m charts.generate
+
+requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by the newest that pyproject.toml allows
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra certificates --extra etsi --extra mqtt --extra otel --upgrade \
+	  --generate-hashes --universal --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements.txt
 
 clean: ## remove what was made here; the caches outside the tree stay
 	rm -rf $(VENV) out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,4 +1,4 @@
-"""The command line: `application-manager run`, `render` and `explain`.
+"""The command line: `application-manager run`, `render`, `check`, `explain`, `inject`, and those that print manifests.
 
 That the API server refuses us at the start is bad input as well: the account and its rights are given to us.
 """
@@ -15,15 +15,23 @@ from typing import Annotated
 
 import typer
 
-from application_manager.chartcache import default_folder
-from application_manager.connection import ConfigurationError
-from application_manager.core.policy import Policy
-from application_manager.helm import Helm
-from application_manager.inquiry import InquiryError, inquire
-from application_manager.offline import render_files
-from application_manager.publishing import settings
-from application_manager.service import Options, serve
-from application_manager.telling import text
+from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
+from application_manager.charts.chartcache import default_folder
+from application_manager.charts.helm import Helm
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.cluster.leadership import LeaseKey, lease_key
+from application_manager.commands.checking import check_files
+from application_manager.commands.injecting import inject
+from application_manager.commands.inquiry import InquiryError, inquire
+from application_manager.commands.offline import charts_at_once, render_files
+from application_manager.commands.rbac import detector_rbac, rbac
+from application_manager.commands.telling import text
+from application_manager.commands.webhooks import webhooks
+from application_manager.core.objects.poddefaults import PodDefaults, PullPolicy, parse_environment
+from application_manager.core.objects.policy import Policy
+from application_manager.options import Options
+from application_manager.service import serve
+from application_manager.work.publishing import settings
 from wayside import commandline
 from wayside.api.base import Duration
 from wayside.api.documents import DocumentError
@@ -40,6 +48,7 @@ EXPECTED = (DocumentError, ConfigurationError, InquiryError)
 
 RESYNC = Duration("60s")
 TTL_AFTER_FINISHED = Duration("1h")
+STALLED = Duration("5m")
 
 AllowedKinds = Annotated[
     list[str] | None,
@@ -56,6 +65,12 @@ ChartFolder = Annotated[Path, typer.Option(help="The folder with charts that tem
 ServiceAccounts = Annotated[
     list[str] | None,
     typer.Option(help="A service account that templates may use; repeatable. Default: only `default`, without token."),
+]
+
+
+MaxInstances = Annotated[
+    int | None,
+    typer.Option(min=1, help="How many instances a namespace may have, over all templates. Default: any number."),
 ]
 
 
@@ -89,17 +104,55 @@ def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
         raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
 
 
+def _serving(port: int | None, certificates: Path | None) -> Serving | None:
+    if port is None and certificates is None:
+        return None
+    if port is None or certificates is None:
+        commandline.refuse(f"{PORT_OPTION} and {FOLDER_OPTION} go together: give both, or none")
+    return Serving(port, certificates)
+
+
+def _lease(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
+    try:
+        return lease_key(given, namespaces)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--lease") from None
+
+
+def _detectors(
+    image: str | None, policy: PullPolicy | None, secrets: list[str] | None, variables: list[str] | None
+) -> PodDefaults | None:
+    try:
+        environment = parse_environment(variables or ())
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--detector-env") from None
+    if image:
+        return PodDefaults(image, policy, tuple(secrets or ()), environment)
+    if policy or secrets or environment:
+        commandline.refuse(
+            "options for detectors' pods do nothing without --detector-image: give it, or leave them out"
+        )
+    return None
+
+
 @app.command()
 def run(
     namespace: Annotated[
         list[str] | None, typer.Option(help="A namespace to look after; repeatable. Default: all.")
     ] = None,
+    max_instances: MaxInstances = None,
     resync: Annotated[
         Duration, typer.Option(parser=_duration, metavar="DURATION", help="How often everything is listed anew.")
     ] = RESYNC,
     ttl_after_finished: Annotated[
         Duration, typer.Option(parser=_duration, metavar="DURATION", help="How long finished tasks are kept.")
     ] = TTL_AFTER_FINISHED,
+    stalled_after: Annotated[
+        Duration,
+        typer.Option(
+            parser=_duration, metavar="DURATION", help="After how long without progress the watchdog ends this manager."
+        ),
+    ] = STALLED,
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
     ] = None,
@@ -110,23 +163,67 @@ def run(
             "(repeatable), or as a Zenoh configuration file says (its name ends with .json5)."
         ),
     ] = None,
+    lease: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[NAMESPACE/]NAME",
+            help="The Lease by which one of several managers of the same namespaces is active. Default: "
+            "application-manager, in the pod's namespace, else in the first that is looked after.",
+        ),
+    ] = None,
     helm: HelmProgram = "helm",
     chart_cache: ChartCacheFolder = None,
     chart_folder: ChartFolder = CHART_FOLDER,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
+    detector_image: Annotated[
+        str | None,
+        typer.Option(
+            help="Run the Detectors of mode Standalone, and put those of mode Sidecar into pods, with this image where "
+            "they name none. Default: run none."
+        ),
+    ] = None,
+    detector_pull_policy: Annotated[
+        PullPolicy | None, typer.Option(help="Of detectors' images. Default: as Kubernetes chooses by the tag.")
+    ] = None,
+    detector_pull_secret: Annotated[
+        list[str] | None,
+        typer.Option(help="A Secret, in each namespace with detectors, by which their images are pulled; repeatable."),
+    ] = None,
+    detector_env: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="An environment variable of all detectors; repeatable."),
+    ] = None,
+    admission_port: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=65535,
+            help="Answer the API server here when it asks whether a template, rule or detector is in order, as "
+            "`application-manager webhooks` makes it do. Default: nowhere.",
+        ),
+    ] = None,
+    admission_certificates: Annotated[
+        Path | None,
+        typer.Option(help="With --admission-port: a folder with tls.crt and tls.key, which may change while it runs."),
+    ] = None,
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
     options = Options(
         policy=_policy(allowed_kinds, service_accounts),
         namespaces=tuple(namespace or ()),
+        max_instances=max_instances,
         resync=resync.seconds,
         ttl_after_finished=ttl_after_finished.seconds,
+        stalled_after=stalled_after.seconds,
         metrics_port=metrics_port,
         zenoh=settings(zenoh) if zenoh else None,
         helm=Helm(helm),
         chart_cache=chart_cache or default_folder(),
         chart_folder=chart_folder,
+        admission=_serving(admission_port, admission_certificates),
+        lease=_lease(lease, tuple(namespace or ())),
+        detectors=_detectors(detector_image, detector_pull_policy, detector_pull_secret, detector_env),
     )
     asyncio.run(serve(options))
     commandline.leave()
@@ -136,20 +233,52 @@ def run(
 def render(
     templates: Annotated[list[Path], typer.Option(help="A file or folder of ApplicationTemplates; repeatable.")],
     tasks: Annotated[list[Path], typer.Option(help="A file or folder of ApplicationTasks; repeatable.")],
+    max_instances: MaxInstances = None,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
+    helm: HelmProgram = "helm",
+    chart_cache: ChartCacheFolder = None,
+    chart_folder: ChartFolder = CHART_FOLDER,
 ) -> None:
     """Print what would run, as YAML: merged instances and their manifests, without a cluster.
+
+    Templates with a chart need the program helm; a chart that is not here is fetched.
 
     What waits, is held at a bound or is refused is said on stderr; where something is refused, the exit code is 1.
     """
     policy = _policy(allowed_kinds, service_accounts)
-    result = render_files([*templates, *tasks], policy)
+    result = render_files(
+        [*templates, *tasks], policy, max_instances, charts_at_once(Helm(helm), chart_cache, chart_folder)
+    )
     sys.stdout.write(result.text)
     for line in (*result.notes, *result.refusals):
         typer.echo(line, err=True)
     if result.refusals:
         raise typer.Exit(1)
+
+
+@app.command()
+def check(
+    files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
+    allowed_kinds: AllowedKinds = None,
+    service_accounts: ServiceAccounts = None,
+) -> None:
+    """Say of templates, rules and detectors what the webhook would say, without a cluster.
+
+    Exits with 1 where it would refuse something; what it would warn of is said alone.
+    """
+    try:
+        checked = check_files(files, _policy(allowed_kinds, service_accounts))
+    except DocumentError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from None
+    for line in checked.problems:
+        typer.echo(line, err=True)
+    for line in checked.warnings:
+        typer.echo(f"warning: {line}", err=True)
+    if checked.problems:
+        raise typer.Exit(1)
+    typer.echo(f"{checked.looked_at} looked at: nothing that would be refused", err=True)
 
 
 class Output(StrEnum):
@@ -171,6 +300,12 @@ def explain(
         sys.stdout.write(f"{json.dumps(explanation.to_json(), indent=2, ensure_ascii=False)}\n")
     else:
         sys.stdout.write(text(explanation))
+
+
+app.command()(webhooks)
+app.command()(rbac)
+app.command()(inject)
+app.command("detector-rbac")(detector_rbac)
 
 
 def main() -> None:

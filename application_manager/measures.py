@@ -39,9 +39,13 @@ class Measures:
         self._errors = self._counter("api_errors", "Requests that the API server refused or did not answer", "code")
         self._events = self._counter("kubernetes_events", "Kubernetes Events that were posted", "reason")
         self._unposted = self._counter("kubernetes_events_dropped", "Kubernetes Events that were not posted", "cause")
+        self._reviews = self._counter(
+            "reviews", "Questions of the API server about objects to be stored", "kind", "answer"
+        )
         self._resynced = Gauge(
             f"{PREFIX}resync_time_seconds", "When everything was last listed anew, since 1970", registry=self.registry
         )
+        self._active = Gauge(f"{PREFIX}active", "1 for the manager that acts, 0 for a standby", registry=self.registry)
         ProcessCollector(registry=self.registry)
 
     def text(self) -> bytes:
@@ -79,6 +83,14 @@ class Measures:
     def unposted(self, cause: str) -> None:
         """A Kubernetes Event was not posted: `full`, `limited` or `failed`."""
         self._unposted.labels(cause).inc()
+
+    def reviewed(self, kind: str, answer: str) -> None:
+        """A question of the API server was `allowed`, `warned` of or `refused`; or `failed`, then of no kind."""
+        self._reviews.labels(kind, answer).inc()
+
+    def active(self, active: bool) -> None:
+        """Whether this manager is the active one."""
+        self._active.set(active)
 
     def resynced(self, *, well: bool) -> None:
         """A resync ended."""

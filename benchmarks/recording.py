@@ -27,10 +27,10 @@ from mcap.writer import CompressionType, Writer
 
 from detector.actions.episode import Completion, EpisodeSample
 from detector.streams.codecs.ros import standard
+from tests.process.running import Process
 from tests.unit.driving import a_rule, a_stream, at
 from tests.unit.recording_bench import Bench, an_episode
 from tests.unit.ros_messages import cdr, point_cloud
-from tests.unit.running import Process
 
 POINTS = a_stream("points", encoding="cdr", type="sensor_msgs/msg/PointCloud2")
 CLOUD = cdr(point_cloud(83_000))

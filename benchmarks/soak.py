@@ -55,7 +55,7 @@ from benchmarks.soaking.traffic import (
     Sent,
     traffic,
 )
-from tests.unit.mqtt_broker import broker, publisher
+from tests.process.mqtt_broker import broker, publisher
 from tests.unit.onnx_models import mean_of, weighted
 
 SOAKING = Path(__file__).parent / "soaking"

@@ -28,11 +28,11 @@ from typing import Any
 
 import aiohttp
 
-from application_manager.client import Client, Resource
-from application_manager.connection import load_configuration
-from application_manager.core.claims import instance_name
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer, owned
+from application_manager.cluster.client import Client, Resource
+from application_manager.cluster.connection import load_configuration
+from application_manager.core.claims.claims import instance_name
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, owned
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import asdict
 from itertools import islice
 from typing import TypeVar
 
@@ -19,7 +20,7 @@ from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
 from detector.requested import Requested
 from detector.sources.supervision import SourceThread
-from detector.status.model import ActionStatus, Drops, Explanation, SourceStatus, Status, to_json
+from detector.status.model import ActionStatus, CertificateStatus, Drops, Explanation, SourceStatus, Status, to_json
 from wayside.times import format_time
 
 Result = TypeVar("Result")
@@ -43,8 +44,13 @@ class Answers:
         outlet: Callable[[], LiveOutlet],
         sources: Callable[[], list[SourceThread]],
         requested: Requested,
+        pulse: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        """`outlet` gives the outlet: the network that it has changes with the Detector, as do the `sources`."""
+        """`outlet` gives the outlet: the network that it has changes with the Detector, as do the `sources`.
+
+        `pulse` tells for how many seconds the event loop has not run.
+        """
+        self._pulse = pulse
         self._evaluator = evaluator
         self._sources = sources
         self._requested = requested
@@ -88,21 +94,34 @@ class Answers:
         return msgspec.structs.replace(
             latest,
             connected=outlet.network.connected,
+            certificate=CertificateStatus(**asdict(outlet.network.standing)),
             drops=[*latest.drops, *dropped],
             sources=sources,
             actions=actions,
         )
 
     def healthy(self) -> tuple[bool, bytes]:
-        """Whether the evaluation goes on, for /healthz."""
-        silent = self._evaluator.status.silence
-        return silent < _SILENT, f"the evaluation looked {silent:.1f} s ago\n".encode()
+        """Whether all goes on that no waiting brings back, for /healthz: a restart is the remedy for it alone."""
+        silent, hung, dead = self._evaluator.status.silence, self._pulse(), self._outlet().network.dead
+        lines = [f"the evaluation looked {silent:.1f} s ago"]
+        if hung >= _SILENT:
+            lines.append(f"the event loop has not run for {hung:.1f} s: tasks and the Lease stay as they are")
+        if dead is not None:
+            lines.append(f"nothing is received any more: {dead}")
+        return silent < _SILENT and hung < _SILENT and dead is None, "".join(f"{line}\n" for line in lines).encode()
 
     def ready(self) -> tuple[bool, bytes]:
-        """Whether samples can come in and be evaluated, for /readyz."""
+        """Whether samples can come in and be evaluated, for /readyz.
+
+        Who listens is ready with nobody connected: else no Service would lead anyone to it.
+        """
         well, text = self.healthy()
-        joined = self._outlet().network.joined
-        return well and joined, text + (b"" if joined else b"no Zenoh session yet\n")
+        network = self._outlet().network
+        if not network.joined:
+            return False, text + b"no Zenoh session yet\n"
+        if not network.listens and not network.connected:
+            return False, text + b"nobody is connected on Zenoh: it is sought, and the buffer is kept\n"
+        return well, text
 
     def _status(self, given: Mapping[str, str]) -> bytes:
         status = self.status()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 from detector.assembly import DetectorError, Inlets, inlets, offer_problems
 from detector.models.binding import bind_models
@@ -11,13 +12,27 @@ from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.rules import RuleError, RuleProblem, compile_rule, dependency_problems, unknown_rules
+from wayside.rules.contradictions import contradictions
 
 _CHECKED = (Detector, EventRule)
 
 
+class Findings(NamedTuple):
+    """What is wrong, and what is doubtful: where a rule's classification contradicts the rule."""
+
+    problems: list[Problem]
+    warnings: list[Problem]
+
+
 def check_documents(documents: Sequence[Document]) -> list[Problem]:
-    """Every problem of the Detectors, and of the rules against each Detector that selects them."""
+    """Every problem of the Detectors, and of the rules with each Detector that selects them."""
+    return findings(documents).problems
+
+
+def findings(documents: Sequence[Document]) -> Findings:
+    """What is to be said of the Detectors, and of the rules with each Detector that selects them."""
     problems: list[Problem] = []
+    warnings: list[Problem] = []
     detectors: list[tuple[Document, Detector, Inlets]] = []
     for document in documents:
         if isinstance(document.object, Detector):
@@ -39,21 +54,27 @@ def check_documents(documents: Sequence[Document]) -> list[Problem]:
         for _, detector, _ in detectors
     }
     for document in rules:
-        problems += _rule_problems(document, detectors, wrong)
+        problems += _rule_problems(document, detectors, wrong, _by_name(rules), warnings)
     names = [document.object.name for document in rules]
     for of_detector, detector, _ in detectors if rules else ():
         problems += [of_detector.problem(path, text) for path, text in unknown_rules(detector, names)]
-    return list(dict.fromkeys(problems))
+    return Findings(list(dict.fromkeys(problems)), list(dict.fromkeys(warnings)))
 
 
 def _objects(documents: Iterable[Document]) -> Iterator[EventRule]:
     return (document.object for document in documents if isinstance(document.object, EventRule))
 
 
+def _by_name(documents: Iterable[Document]) -> dict[str, EventRule]:
+    return {rule.name: rule for rule in _objects(documents)}
+
+
 def _rule_problems(
     document: Document,
     detectors: Sequence[tuple[Document, Detector, Inlets]],
     wrong: Mapping[str, Mapping[str, Sequence[RuleProblem]]],
+    others: Mapping[str, EventRule],
+    warnings: list[Problem],
 ) -> Iterator[Problem]:
     rule = document.object
     assert isinstance(rule, EventRule)  # noqa: S101  the caller picked it
@@ -64,10 +85,14 @@ def _rule_problems(
     for of_detector, detector, entries in selecting:
         try:
             known = (*wrong[detector.name].get(rule.name, ()), *offer_problems(rule, detector))
-            bind_models(compile_rule(rule, detector, entries.fields, known))
+            compiled = compile_rule(rule, detector, entries.fields, known)
+            bind_models(compiled)
         except RuleError as error:
             for each in error.problems:
                 yield (document if each.detector is None else of_detector).problem(each.path, each.message)
+        else:
+            doubts = contradictions(rule, compiled, detector, others)
+            warnings += [document.problem(each.path, each.message) for each in doubts]
 
 
 def summary(documents: Sequence[Document]) -> str:

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import sys
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
 from detector import inquiry, recordings
 from detector.actions.deploy.file_store import write_tasks_yaml
 from detector.assembly import DetectorError
-from detector.checking import check_documents, summary
+from detector.catalog.command import command as catalog_command
+from detector.checking import findings, summary
 from detector.cluster.errors import NoClusterError
 from detector.comparison import write_comparison
+from detector.engine.episodes.demands import from_task
+from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
@@ -33,7 +39,10 @@ from detector.service import Files, Named, Options
 from detector.service import run as run_service
 from detector.streams.asking import NoAnswerError
 from detector.streams.zenoh import NetworkError
+from detector.tracing import episode_traces
 from wayside import commandline
+from wayside.api import ApplicationTask
+from wayside.api.applicationtask import Holder
 from wayside.api.documents import DocumentError, load_documents
 from wayside.commandline import leave, refuse
 
@@ -44,7 +53,15 @@ app = typer.Typer(
     add_completion=False,
 )
 
-_EXPECTED = (DocumentError, DetectorError, RecordingError, NetworkError, NoAnswerError, NoClusterError, OSError)
+_EXPECTED = (
+    DocumentError,
+    DetectorError,
+    RecordingError,
+    NetworkError,
+    NoAnswerError,
+    NoClusterError,
+    OSError,
+)
 """Errors of the input: said in one line, without a trace."""
 
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
@@ -76,6 +93,14 @@ def run(
     namespace: Annotated[
         str | None, typer.Option(help="With --name: the namespace. Default: the kubeconfig's, or the pod's.")
     ] = None,
+    as_pod: Annotated[
+        bool,
+        typer.Option(
+            "--as-pod",
+            help="With --name: one of several that run this Detector, each in a pod of its own. The holder is "
+            "<name>.<pod>, by the environment variable POD_NAME.",
+        ),
+    ] = False,
     output: Annotated[
         Path | None,
         typer.Option(help="A folder for events.jsonl and, without a cluster, the tasks. Default there: out."),
@@ -94,14 +119,28 @@ def run(
     if name is not None:
         if rules:
             refuse("--rules goes with --detector; with --name the rules are read from the API server")
-        options = Options(Named(name, namespace, output), record_intake, metrics_port)
+        holder = _holder_in_pod(name) if as_pod else name
+        options = Options(Named(name, namespace, output, holder), record_intake, metrics_port)
     else:
         assert detector is not None  # noqa: S101  one of both is given
         if namespace is not None:
             refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
+        if as_pod:
+            refuse("--as-pod goes with --name; a Detector in a file is held by its name")
         options = Options(Files(detector, tuple(rules or ()), output or Path("out")), record_intake, metrics_port)
     asyncio.run(run_service(options))
     leave()
+
+
+def _holder_in_pod(name: str) -> str:
+    pod = os.environ.get("POD_NAME", "")
+    try:
+        return TypeAdapter(Holder).validate_python(f"{name}.{pod}" if pod else "")
+    except ValidationError:
+        refuse(
+            f"--as-pod: the holder {name}.{pod} is none: give POD_NAME by the downward API (metadata.name); the "
+            "two names have room for 252 characters"
+        )
 
 
 @app.command()
@@ -126,9 +165,10 @@ def replay(
     with Progress(Console(stderr=True)) as progress, closing(plugins):
         outcome = _replayed(recordings, detector, rules, progress, plugins)
     output.mkdir(parents=True, exist_ok=True)
+    events, tasks = _traced(outcome)
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
-        file.writelines(event.to_json() + "\n" for event in outcome.events)
-    write_tasks_yaml(output / "tasks.yaml", outcome.tasks.values())
+        file.writelines(event.to_json() + "\n" for event in events)
+    write_tasks_yaml(output / "tasks.yaml", tasks)
     if compared is not None:
         write_comparison(outcome, compared, output)
     for refusal in outcome.refusals:
@@ -152,22 +192,32 @@ def replay(
 
 
 @app.command()
-def check(files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")]) -> None:
-    """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong."""
+def check(
+    files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where there is a warning, too.")] = False,
+) -> None:
+    """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong.
+
+    A classification that contradicts its rule is a warning.
+    """
     try:
         documents = load_documents(files)
     except DocumentError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from None
-    problems = check_documents(documents)
+    problems, warnings = findings(documents)
     for problem in problems:
         typer.echo(str(problem), err=True)
-    if problems:
+    for warning in warnings:
+        typer.echo(warning.as_warning(), err=True)
+    if problems or (strict and warnings):
         raise typer.Exit(1)
-    typer.echo(f"{summary(documents)}: nothing wrong", err=True)
+    doubts = f", {len(warnings)} warning{'s' if len(warnings) > 1 else ''}" if warnings else ""
+    typer.echo(f"{summary(documents)}: nothing wrong{doubts}", err=True)
 
 
 app.add_typer(recordings.app, name="recordings")
+app.command("catalog")(catalog_command)
 
 for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume):
     app.command()(command)
@@ -201,6 +251,16 @@ def _replayed(
         keys = ", ".join(router.unrouted) or "none"
         typer.echo(f"no message belongs to a stream of the Detector; keys in the recording: {keys}", err=True)
     return outcome
+
+
+def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
+    """The events and tasks; with where they stand in traces, as live, where the environment asks for traces."""
+    with episode_traces(export=False) as traces:
+        if traces is None:
+            return outcome.events, outcome.tasks.values()
+        demands = ((task, from_task(task)) for task in outcome.tasks.values())
+        tasks = [task if demand is None else traces.task(demand, task) for task, demand in demands]
+        return [traces.event(event) for event in outcome.events], tasks
 
 
 def main() -> None:

@@ -24,8 +24,8 @@ from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.evaluation import Answer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
-from detector.garbage import Sweeper
 from detector.losses import Losses
+from detector.memory import Sweeper
 from detector.overload import LONG, Overload
 from detector.plugins.outages import Outages
 from detector.restoring import Restored
@@ -314,6 +314,7 @@ class Evaluator:
                 if name not in demands
             }
             self._demands = demands
+            self.status.demands = (*demands,)
             self._outlet.demands(demands, ended)
 
     def _record(self, time: int, document: Mapping[str, Any]) -> None:

@@ -19,38 +19,44 @@ from detector.restoring import what_was_open
 from detector.rules.kubernetes import ClusterRules
 from detector.running import Running
 from detector.state import state_file
+from detector.tracing import EpisodeTraces
 
 Result = TypeVar("Result")
+_OTHERWISE = "run without a cluster, with --detector FILE and --rules FILE"
 
 
 async def run_in_cluster(
     name: str,
     namespace: str | None,
+    holder: str,
     output: Path | None,
     record: Path | None,
     stopping: asyncio.Event,
     metrics_port: int | None,
+    traces: EpisodeTraces | None,
 ) -> None:
-    """Run the Detector of that name until it is to stop.
+    """Run the Detector of that name, and emit its tasks as the holder, until it is to stop.
 
     Raises:
         NoClusterError, DetectorError, NetworkError, OSError: it cannot start; the text says why.
     """
-    async with connect(namespace) as cluster:
+    async with connect(namespace, otherwise=_OTHERWISE) as cluster:
         rules = ClusterRules(cluster.api, cluster.namespace, name)
-        lease = HolderLease(cluster.api, cluster.namespace, name)
-        store = KubernetesTaskStore(cluster.api, cluster.namespace, name)
-        reconciler = DemandReconciler(store, permitted=lease.held)
+        lease = HolderLease(cluster.api, cluster.namespace, holder)
+        store = KubernetesTaskStore(cluster.api, cluster.namespace, holder)
+        reconciler = DemandReconciler(store, permitted=lease.held, traces=traces)
         async with asyncio.TaskGroup() as group:
             group.create_task(lease.run())
             try:
-                await _run_while_held(name, output, record, stopping, rules, lease, store, reconciler, metrics_port)
+                await _run_while_held(
+                    holder, output, record, stopping, rules, lease, store, reconciler, metrics_port, traces
+                )
             finally:
                 lease.stop()
 
 
 async def _run_while_held(
-    name: str,
+    holder: str,
     output: Path | None,
     record: Path | None,
     stopping: asyncio.Event,
@@ -59,19 +65,20 @@ async def _run_while_held(
     store: TaskStore,
     reconciler: DemandReconciler,
     metrics_port: int | None,
+    traces: EpisodeTraces | None,
 ) -> None:
     changes = rules.follow()
     first = await _unless(stopping, anext(changes))
     if first is None or await _unless(stopping, lease.held.wait()) is None:
         return
-    state = state_file(first.detector, name)
+    state = state_file(first.detector, holder)
     restored = await _unless(stopping, what_was_open(store, state))
     if restored is None:
         return
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            with Running(first, name, reconciler, output, record, restored, metrics_port, state) as running:
+            with Running(first, holder, reconciler, output, record, restored, metrics_port, state, traces) as running:
                 following = group.create_task(running.follow(changes))
                 await running.until(stopping)
                 following.cancel()

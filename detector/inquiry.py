@@ -13,6 +13,7 @@ from detector.rules.files import load_rules
 from detector.status.model import read_status
 from detector.status.table import status_view
 from detector.streams.asking import Asked, ask
+from wayside.api.pod import DetectorMode
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.commandline import refuse
 
@@ -99,7 +100,9 @@ def inquire(
     config, holder = Zenoh(mode=ZenohMode.PEER), "*"
     if detector is not None:
         given_detector = load_rules(detector, ()).rule_set.detector
-        holder, config = given_detector.name, _reaching(given_detector.spec.zenoh)
+        sidecars = given_detector.spec.mode is DetectorMode.SIDECAR  # each in a pod, which its holder names
+        holder = f"{given_detector.name}.$*" if sidecars else given_detector.name
+        config = _reaching(given_detector.spec.zenoh)
     if connect:
         config = config.model_copy(update={"connect": connect, "scouting": False, "mode": ZenohMode.CLIENT})
     if not config.connect and not config.scouting:

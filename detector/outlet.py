@@ -16,6 +16,7 @@ from detector.event_log import EventLog
 from detector.requested import with_requested
 from detector.state import StateFile
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
+from detector.tracing import EpisodeTraces
 from wayside.api import EventRule
 
 _log = logging.getLogger(__name__)
@@ -25,8 +26,15 @@ class LiveOutlet:
     """Events go to Zenoh and into the log, demands to the reconciler; nothing here waits."""
 
     def __init__(
-        self, network: Network, holder: str, log: EventLog | None, reconciler: DemandReconciler, state: StateFile | None
+        self,
+        network: Network,
+        holder: str,
+        log: EventLog | None,
+        reconciler: DemandReconciler,
+        state: StateFile | None,
+        traces: EpisodeTraces | None = None,
     ) -> None:
+        self._traces = traces
         self._state = state
         self.network = network
         self.actions = ActionHost(holder, self)
@@ -40,7 +48,7 @@ class LiveOutlet:
 
     def events(self, events: Sequence[Event]) -> None:
         """Publish and log what started and ended."""
-        for event in events:
+        for event in events if self._traces is None else map(self._traces.event, events):
             line = event.to_json()
             self.network.publish(event.key, line.encode(), EVENT_ENCODING)
             if self._log is not None:
@@ -52,6 +60,8 @@ class LiveOutlet:
                 "started" if event.started else "ended",
                 "" if event.reason is None else f" ({event.reason})",
             )
+            if self._traces is not None:
+                self._traces.over(event)
 
     def move(self, network: Network) -> None:
         """The Detector changed: leave the network, and join the other. Where that fails, it is said."""
@@ -75,7 +85,7 @@ class LiveOutlet:
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
         """Tell the actions."""
-        self.actions.tell(consequences)
+        self.actions.tell(consequences if self._traces is None else self._traces.consequences(consequences))
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """See `Messenger`: for the actions, which need not know that the network may be another tomorrow."""

@@ -29,10 +29,12 @@ from detector.rules.selection import RuleSet
 from detector.sources.registry import plugin_problems
 from detector.sources.supervision import Sources
 from detector.state import StateFile
+from detector.status.pulse import Pulse
 from detector.status.server import StatusServer
 from detector.streams.answering import Answering
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
+from detector.tracing import EpisodeTraces
 from wayside.api import Detector
 from wayside.api.source import ZENOH
 from wayside.api.stream import Stream
@@ -53,6 +55,7 @@ class Running:
         restored: Restored,
         metrics_port: int | None = None,
         state: StateFile | None = None,
+        traces: EpisodeTraces | None = None,
     ) -> None:
         """Raises DetectorError where the Detector cannot run, OSError where a file or the port cannot be had."""
         self._loop = asyncio.get_running_loop()
@@ -67,7 +70,7 @@ class Running:
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
         self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams, entries.types)
         self._log = None if output is None else EventLog(output / "events.jsonl")
-        self._outlet = LiveOutlet(self._network(detector), holder, self._log, reconciler, state)
+        self._outlet = LiveOutlet(self._network(detector), holder, self._log, reconciler, state, traces)
         self._state = state
         self._reconciler = reconciler
         self._evaluator = Evaluator(
@@ -81,13 +84,18 @@ class Running:
         )
         requested = Requested(self._engine, self._evaluator.call)
         self._outlet.actions.outcomes.heard = requested.heard
-        self.answers = Answers(self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested)
+        pulse = Pulse(self._loop)
+        self.answers = Answers(
+            self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence
+        )
         self._server = None if metrics_port is None else _server(metrics_port, self.answers)
 
         self._evaluator.losses.watch(self._tally)
         self._evaluator.losses.watch_also(lambda: _of_actions(self._outlet.actions.outcomes))
         if state is not None:
             self._evaluator.losses.watch_also(lambda: _of_state(state))
+        if traces is not None:
+            self._evaluator.losses.watch_also(lambda: _of_traces(traces))
         self._sources = Sources(self._intake.putter, self._tally)
 
     def __enter__(self) -> Running:
@@ -196,6 +204,12 @@ def _of_state(state: StateFile) -> Iterator[Loss]:
     unwritten = "times the state volume could not be written, and was tried again"
     yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
     yield Loss("files of the state volume set aside, being unreadable", state.set_aside, cause="state_unreadable")
+
+
+def _of_traces(traces: EpisodeTraces) -> Iterator[Loss]:
+    """Spans that nobody got."""
+    yield Loss("spans dropped, too many being on their way", traces.tracing.dropped, cause="spans_dropped")
+    yield Loss("spans not taken", traces.tracing.failed, f"by {traces.tracing.endpoint}", cause="spans_failed")
 
 
 def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:

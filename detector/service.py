@@ -15,12 +15,13 @@ from pathlib import Path
 
 from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler
-from detector.garbage import tune_garbage_collection
+from detector.memory import tune_garbage_collection
 from detector.restoring import what_was_open
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files
 from detector.running import Running
 from detector.state import state_file
+from detector.tracing import EpisodeTraces, episode_traces
 
 _log = logging.getLogger(__name__)
 
@@ -41,6 +42,8 @@ class Named:
     name: str
     namespace: str | None
     output: Path | None
+    holder: str
+    """By whose name tasks are emitted: the Detector's, or `<name>.<pod>` where several pods run it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,33 +67,43 @@ async def run(options: Options) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stopping.set)
+    with episode_traces() as traces:
+        await _run(options, stopping, traces)
+
+
+async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces | None) -> None:
     match options.source:
         case Files() as files:
-            await _run_from_files(files, options, stopping)
+            await _run_from_files(files, options, stopping, traces)
         case Named() as named:
             # Not at the top: the Kubernetes client takes half a second to import, which nobody without a cluster owes.
             from detector.in_cluster import run_in_cluster  # noqa: PLC0415
 
+            record, port = options.record_intake, options.metrics_port
             await run_in_cluster(
-                named.name, named.namespace, named.output, options.record_intake, stopping, options.metrics_port
+                named.name, named.namespace, named.holder, named.output, record, stopping, port, traces
             )
 
 
-async def _run_from_files(files: Files, options: Options, stopping: asyncio.Event) -> None:
+async def _run_from_files(
+    files: Files, options: Options, stopping: asyncio.Event, traces: EpisodeTraces | None
+) -> None:
     loaded = load_rules(files.detector, files.rules)
     for warning in loaded.warnings:
         _log.warning("%s", warning)
     holder = loaded.rule_set.detector.name
     folder = files.output / "tasks"
     store = FileTaskStore(folder, holder)
-    reconciler = DemandReconciler(store)
+    reconciler = DemandReconciler(store, traces=traces)
     state = state_file(loaded.rule_set.detector, holder)
     restored = await what_was_open(store, state)
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
             record, port = options.record_intake, options.metrics_port
-            with Running(loaded.rule_set, holder, reconciler, files.output, record, restored, port, state) as running:
+            with Running(
+                loaded.rule_set, holder, reconciler, files.output, record, restored, port, state, traces
+            ) as running:
                 following = group.create_task(running.follow(follow_files(files.detector, files.rules)))
                 await running.until(stopping)
                 following.cancel()

@@ -12,6 +12,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from detector.actions.base import Action
+from detector.actions.secrets import secret_problems
 from detector.entrypoints import Offers, PluginError
 from wayside.api import Detector, EventRule
 from wayside.api.actions import action as api
@@ -47,6 +48,7 @@ def prepare(action: api.Action, streams: Sequence[str] | None = None) -> tuple[t
 
 def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
     """What is wrong with a rule's actions, as far as their classes can tell here."""
+    yield from secret_problems(rule, detector)
     streams = [stream.name for stream in detector.spec.streams]
     for index, action in enumerate(rule.spec.actions):
         if action.field != DEPLOY:

@@ -32,12 +32,15 @@ class Cluster:
 
 
 @asynccontextmanager
-async def connect(namespace: str | None = None, kubeconfig: Path | None = None) -> AsyncIterator[Cluster]:
+async def connect(
+    namespace: str | None = None, kubeconfig: Path | None = None, *, otherwise: str = ""
+) -> AsyncIterator[Cluster]:
     """Set up the one connection that all parts share. Nothing is sent yet: the server may be away.
 
     Args:
         namespace: where to work. Default: the kubeconfig context's, or the pod's own.
         kubeconfig: a file. Default: `KUBECONFIG`; in a pod without it, the pod's account; else `~/.kube/config`.
+        otherwise: what else can be done where there is no API server; the error's text ends with it.
 
     Raises:
         NoClusterError: there is neither, or it cannot be read.
@@ -50,7 +53,7 @@ async def connect(namespace: str | None = None, kubeconfig: Path | None = None) 
     except _BROKEN as error:
         raise NoClusterError(
             f"no API server: {error or type(error).__name__}. Set KUBECONFIG to a kubeconfig file, or run in a pod "
-            "with a service account; or run without a cluster, with --detector FILE and --rules FILE"
+            "with a service account" + (f"; or {otherwise}" if otherwise else "")
         ) from error
     try:
         yield Cluster(api, namespace or found)

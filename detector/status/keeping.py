@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from importlib.metadata import version
 from itertools import islice
@@ -86,6 +86,8 @@ class StatusKeeper:
         self._version = version("wayside")
         self._watching: list[Watching] = []
         self.gaps = 0
+        self.demands: Collection[str] = ()
+        """The names of the tasks that are demanded now."""
         self.latest: Status = self._take(self._started)
 
     @property
@@ -134,6 +136,7 @@ class StatusKeeper:
         self._counts.append((now, {name: counters.samples[name] for name in lanes}))
         self._forget(lanes)
         metadata = engine.detector.metadata
+        missing = engine.clients.missing(self._axis())
         return Status(
             detector=engine.identity.detector,
             holder=engine.identity.holder,
@@ -149,6 +152,10 @@ class StatusKeeper:
             maximum_bytes=buffer.maximum_bytes,
             client_count=len(engine.clients),
             clients=[*self._clients()],
+            missing=missing[:_CLIENTS],
+            missing_count=len(missing),
+            demands=sorted(self.demands)[:_CLIENTS],
+            demand_count=len(self.demands),
             streams=[self._stream(name, of_stream) for name, of_stream in lanes.items()],
             rules=[*self._rules()],
             drops=[

@@ -23,6 +23,21 @@ DETECTOR: tuple[tuple[str, type, str, Callable[[Status], float | None]], ...] = 
     ("gaps", CounterMetricFamily, "Times at which ticks were not made up for", lambda s: s.gaps),
     ("buffer_bytes", GaugeMetricFamily, "Held in the buffer, overhead included", lambda s: s.buffered_bytes),
     ("buffer_limit_bytes", GaugeMetricFamily, "The cap over all streams", lambda s: s.maximum_bytes),
+    ("demands", GaugeMetricFamily, "Tasks that are demanded now", lambda s: s.demand_count),
+    ("clients_missing", GaugeMetricFamily, "Expected clients that send nothing", lambda s: s.missing_count),
+    (
+        "certificate_expiry_time_seconds",
+        GaugeMetricFamily,
+        "When the certificate in use expires, since the epoch; without one, not there",
+        lambda s: s.certificate.expires,
+    ),
+    (
+        "certificate_refused",
+        GaugeMetricFamily,
+        "1 while the files' new certificates are not used, being of no use",
+        lambda s: bool(s.certificate.problem),
+    ),
+    ("certificate_renewals", CounterMetricFamily, "Times new ones were taken", lambda s: s.certificate.renewals),
 )
 """Without labels: name, kind, what it tells, and its value; None: not there."""
 

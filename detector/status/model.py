@@ -175,6 +175,17 @@ class ActionStatus(msgspec.Struct, frozen=True, rename="camel"):
     """By episode, what was last said of those that run, of at most 20."""
 
 
+class CertificateStatus(msgspec.Struct, frozen=True, rename="camel"):
+    """What the detector proves itself with on Zenoh."""
+
+    expires: float | None = None
+    """When the first certificate of its own chain expires, seconds since the epoch; None: it has none."""
+    renewals: int = 0
+    """How often new certificates or passwords were taken into use."""
+    problem: str = ""
+    """Why what the files hold now is not used."""
+
+
 class Status(msgspec.Struct, frozen=True, rename="camel"):
     """All that a detector says of itself."""
 
@@ -206,6 +217,13 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     """Whether a router, a peer or a client is connected."""
     sources: list[SourceStatus] = []
     actions: list[ActionStatus] = []
+    certificate: CertificateStatus = CertificateStatus()
+    demands: list[str] = []
+    """The names of the tasks that are demanded now; at most 200."""
+    demand_count: int = 0
+    missing: list[str] = []
+    """Expected clients without a token from which nothing has come for `clientTimeout`; at most 200, by name."""
+    missing_count: int = 0
 
 
 def to_json(value: msgspec.Struct) -> bytes:

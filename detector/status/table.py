@@ -12,6 +12,7 @@ from rich.table import Table
 from detector.status.model import Explanation, Histogram, RuleStatus, Status
 
 _CLIENTS = 20
+_DEMANDS = 10
 
 
 def status_view(status: Status) -> RenderableType:
@@ -29,6 +30,7 @@ def _parts(status: Status) -> Iterator[RenderableType]:
         f"buffer {_size(status.buffered_bytes)} of {_size(status.maximum_bytes)}, {status.client_count} clients, "
         f"{status.gaps} gaps; evaluated up to {_ago(status.taken - status.now)}"
     )
+    yield from _proving(status)
     streams = _table("stream", "samples", "per s", "clients", "newest", "buffered", "size", "latency")
     for stream in status.streams:
         streams.add_row(
@@ -64,6 +66,9 @@ def _parts(status: Status) -> Iterator[RenderableType]:
     for rule in status.rules:
         yield from _remarks(rule)
     yield from _acting(status)
+    if status.explanation is None and status.demand_count:
+        more = status.demand_count - _DEMANDS
+        yield f"demands: {', '.join(status.demands[:_DEMANDS])}" + (f" and {more} more" if more > 0 else "")
     if status.explanation is not None:
         yield from _explained(status.explanation)
         return
@@ -77,6 +82,20 @@ def _parts(status: Status) -> Iterator[RenderableType]:
         shown = ", ".join(f"{client.name} ({_ago(client.age)})" for client in status.clients[:_CLIENTS])
         more = status.client_count - _CLIENTS
         yield f"clients: {shown}" + (f" and {more} more" if more > 0 else "")
+    if status.missing:
+        more = status.missing_count - _CLIENTS
+        yield f"missing: {', '.join(status.missing[:_CLIENTS])}" + (f" and {more} more" if more > 0 else "")
+
+
+def _proving(status: Status) -> Iterator[RenderableType]:
+    """What the detector proves itself with, where that is certificates or does not do."""
+    certificate = status.certificate
+    if certificate.expires is not None:
+        left = certificate.expires - status.taken
+        lasts = f"expires in {_lasting(left)}" if left > 0 else f"expired {_lasting(-left)} ago"
+        yield f"certificate {lasts}, renewed {certificate.renewals} times"
+    if certificate.problem:
+        yield f"new certificates are not used: {certificate.problem}"
 
 
 def _acting(status: Status) -> Iterator[RenderableType]:
@@ -158,6 +177,10 @@ def _median(histogram: Histogram | None) -> str:
 
 def _ago(seconds: float) -> str:
     return f"{seconds:.1f} s ago" if seconds < 120 else f"{seconds / 60:.0f} min ago"
+
+
+def _lasting(seconds: float) -> str:
+    return f"{seconds / 86400:.1f} days" if seconds >= 86400 else f"{seconds / 3600:.1f} hours"
 
 
 def _size(count: int) -> str:

@@ -1,11 +1,11 @@
-"""How a stream is subscribed to and taken from its channel, by the layout of its keys.
+"""How a stream is subscribed to and its samples are handed over, by the layout of its keys.
 
 A layout has a pump of its own, so that what one asks of every sample costs the others nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import zenoh
@@ -16,8 +16,8 @@ from detector.streams.tally import Tally
 from wayside.api.stream import Layout, Stream
 from wayside.keys import KeyPattern
 
-Pump = Callable[[zenoh.handlers.Handler[zenoh.Sample]], None]
-"""Hands over all samples of a subscription; raises ZError once the session is closed and none is left."""
+Pump = Callable[[Iterable[Sequence[zenoh.Sample]]], None]
+"""Hands over all samples, burst by burst; raises what taking the next burst raises."""
 
 
 def expression(stream: Stream) -> zenoh.KeyExpr:

@@ -28,48 +28,96 @@ _DOUBT = 10.0
 _CHANNEL = 16_384
 
 
+Report = tuple[str, zenoh.SampleKind]
+
+Tokens = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
+
+
+def subscribe_tokens(session: zenoh.Session, key: str) -> Tokens:
+    """`key` is a pattern in key-format notation; tokens that are there are told of. Raises KeyPatternError, ZError."""
+    expression = zenoh.KeyExpr.autocanonize(KeyPattern.parse(key).expression)
+    return session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(_CHANNEL), history=True)
+
+
 class TokenWatch:
-    """Tells of tokens while its session is open; at its end, that nothing is known of them any more."""
+    """Tells of tokens while a session is open; at the last one's end, that nothing is known of them any more."""
 
     def __init__(
         self,
-        session: zenoh.Session,
+        subscriber: Tokens,
         connections: Connections,
-        key: str,
         put: Callable[[Sequence[tuple[str, bytes]]], None],
     ) -> None:
-        """`key` is a pattern in key-format notation. Raises KeyPatternError."""
+        """`connections`: of the subscriber's session."""
         self._put = put
         self._connections = connections
         self._stop = threading.Event()
         self._held: dict[str, int] = {}
         """The tokens that are there, and how many routers had left when they were declared."""
-        expression = zenoh.KeyExpr.autocanonize(KeyPattern.parse(key).expression)
-        self._subscriber = session.liveliness().declare_subscriber(
-            expression, zenoh.handlers.FifoChannel(_CHANNEL), history=True
-        )
+        self._subscriber = subscriber
+        self._following: tuple[Tokens, Connections] | None = None
+        self._changed = threading.Condition()
+        self._expecting = False
         self._thread = threading.Thread(target=self._run, name="liveliness", daemon=True)
         self._thread.start()
+
+    def expect(self) -> None:
+        """The session that is used now will be closed, and `follow` or `close` be called."""
+        with self._changed:
+            self._expecting = True
+
+    def follow(self, subscriber: Tokens, connections: Connections) -> None:
+        """Go on with this one, of another session, once the present one is undeclared or its session closed."""
+        with self._changed:
+            self._following = subscriber, connections
+            self._changed.notify_all()
+
+    @property
+    def alive(self) -> bool:
+        """Whether tokens are still followed."""
+        return self._thread.is_alive()
 
     def close(self, timeout: float) -> None:
         """Ends once the session is closed; waits at most that many seconds for it."""
         self._stop.set()
+        with self._changed:
+            self._changed.notify_all()
         self._thread.join(timeout)
 
     def _run(self) -> None:
-        tokens = self._subscriber.handler
-        try:
-            while True:
-                self._tell([tokens.recv()], tokens)
-        except zenoh.ZError:  # the session is closed
-            self._put([(key, Token.UNSURE.value) for key in self._held])
+        while True:
+            tokens = self._subscriber.handler
+            try:
+                while True:
+                    self._tell([_report(tokens.recv())], tokens)
+            except zenoh.ZError:  # undeclared, or the session is closed
+                with self._changed:
+                    self._changed.wait_for(
+                        lambda: self._following is not None or self._stop.is_set() or not self._expecting
+                    )
+                    if self._following is None:
+                        self._put([(key, Token.UNSURE.value) for key in self._held])
+                        return
+                    (self._subscriber, self._connections), self._following = self._following, None
+                    self._expecting = False
+            self._compare()
 
-    def _tell(self, reports: list[zenoh.Sample], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+    def _compare(self) -> None:
+        """Another session tells of all tokens that are there: those that it does not tell of are gone meanwhile."""
+        self._held = dict.fromkeys(self._held, self._connections.departures)
+        tokens = self._subscriber.handler
+        reports = [_report(each) for each in iter(tokens.try_recv, None)]
+        there = {key for key, kind in reports if kind == zenoh.SampleKind.PUT}
+        gone = [(key, zenoh.SampleKind.DELETE) for key in self._held if key not in there]
+        new = [(key, kind) for key, kind in reports if kind == zenoh.SampleKind.DELETE or key not in self._held]
+        if gone or new:
+            self._tell([*gone, *new], tokens)
+
+    def _tell(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """What a report and those that follow it at once come to, a token at a time."""
-        if reports[0].kind == zenoh.SampleKind.DELETE and not self._stop.wait(_SETTLE):
-            while (report := tokens.try_recv()) is not None:
-                reports.append(report)
-        newest = {str(report.key_expr): report.kind for report in reports}
+        if reports[0][1] == zenoh.SampleKind.DELETE and not self._stop.wait(_SETTLE):
+            reports.extend(_report(each) for each in iter(tokens.try_recv, None))
+        newest = dict(reports)
         for key, kind in newest.items():
             if kind == zenoh.SampleKind.PUT:
                 self._held[key] = self._connections.departures
@@ -78,3 +126,7 @@ class TokenWatch:
                 departed = self._held.pop(key) != self._connections.departures
                 unsure = self._stop.is_set() or (departed and self._connections.router_left_within(_DOUBT))
                 self._put([(key, (Token.UNSURE if unsure else Token.DROPPED).value)])
+
+
+def _report(sample: zenoh.Sample) -> Report:
+    return str(sample.key_expr), sample.kind

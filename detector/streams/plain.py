@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from itertools import compress
 from operator import itemgetter
 
 import zenoh
 
-from detector.streams.bursts import Put, bursts
+from detector.streams.bursts import Put
 
 _PAYLOAD = itemgetter(1)
 
 
-def pump(samples: zenoh.handlers.Handler[zenoh.Sample], put: Put) -> None:
-    """Hands over every message, burst by burst; raises ZError once the session is closed and none is left."""
+def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put) -> None:
+    """Hands over every message, burst by burst; raises what taking the next burst raises."""
     put_kind = zenoh.SampleKind.PUT
-    for burst in bursts(samples):
+    for burst in bursts:
         messages = [(str(sample.key_expr), sample.payload.to_bytes()) for sample in burst]
         if not all(map(_PAYLOAD, messages)):  # a deletion is no message; asking each for its kind would cost more
             messages = list(compress(messages, [sample.kind == put_kind for sample in burst]))

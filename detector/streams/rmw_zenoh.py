@@ -11,9 +11,11 @@ timestamp is not used: a recording of topics does not have it, and would give ot
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import zenoh
 
-from detector.streams.bursts import Put, bursts
+from detector.streams.bursts import Put
 from detector.streams.sequences import Sequences
 from detector.streams.tally import Cause, Tally
 
@@ -97,10 +99,10 @@ class Reader:
             self._sequences.follow(*told, topic)
 
 
-def pump(samples: zenoh.handlers.Handler[zenoh.Sample], put: Put, reader: Reader) -> None:
+def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: Reader) -> None:
     """Hands over every message by its topic, as `plain.pump` does by its key."""
     put_kind = zenoh.SampleKind.PUT
-    for burst in bursts(samples):
+    for burst in bursts:
         messages = []
         for sample in burst:
             topic = reader.topic(str(sample.key_expr)) if sample.kind == put_kind else None

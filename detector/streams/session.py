@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import logging
 import threading
@@ -9,7 +10,8 @@ import time
 
 import zenoh
 
-from detector.access import AccessError, login, tls_files
+from detector.access import AccessError
+from detector.credentials import Material, read_material
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 log = logging.getLogger(__name__)
@@ -24,27 +26,34 @@ class NetworkError(ValueError):
     """The Zenoh session cannot be had as configured; the text names the field and the reason."""
 
 
-def open_session(config: Zenoh) -> zenoh.Session:
-    """Opens a session. A peer or router connects in the background; a client must reach a router now.
-
-    Raises NetworkError.
-    """
+def material_of(config: Zenoh) -> Material:
+    """What to prove oneself with now. Raises NetworkError."""
     try:
-        return zenoh.open(_settings(config))
+        return read_material(config, _FIELD)
     except AccessError as error:
         raise NetworkError(str(error)) from error
+
+
+def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Session:
+    """Opens a session. A peer or router connects in the background; a client must reach a router now.
+
+    `material`: default: what the configuration means now. Raises NetworkError.
+    """
+    try:
+        return zenoh.open(_settings(config, material_of(config) if material is None else material))
     except zenoh.ZError as error:
         raise NetworkError(
             f"zenoh: no session as {config.mode} with connect {[*config.connect]}, listen {[*config.listen]}: {error}"
         ) from error
 
 
-def await_session(config: Zenoh, stop: threading.Event) -> zenoh.Session | None:
+def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, Material] | None:
     """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
     attempt, said = 0, ""
     while not stop.is_set():
         try:
-            return open_session(config)
+            material = material_of(config)
+            return open_session(config, material), material
         except NetworkError as error:
             if str(error) != said:
                 said = str(error)
@@ -101,8 +110,7 @@ class Connections:
                 log.warning("zenoh: the connection to %s %s is lost, nobody is connected; trying on", role, other)
 
 
-def _settings(config: Zenoh) -> zenoh.Config:
-    """Raises AccessError."""
+def _settings(config: Zenoh, material: Material) -> zenoh.Config:
     waits = config.mode is ZenohMode.CLIENT
     values: dict[str, object] = {
         "mode": config.mode.value,
@@ -113,12 +121,12 @@ def _settings(config: Zenoh) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
         "scouting/multicast/enabled": config.scouting,
         "transport/shared_memory/enabled": config.shared_memory,
-        **_tls(config),
+        **_tls(material),
     }
     if config.listen:
         values["listen/endpoints"] = [*config.listen]
         values["listen/exit_on_failure"] = True
-    if (credentials := login(config, _FIELD)) is not None:
+    if (credentials := material.login) is not None:
         values["transport/auth/usrpwd/user"] = credentials.username
         values["transport/auth/usrpwd/password"] = credentials.password
     settings = zenoh.Config()
@@ -127,21 +135,25 @@ def _settings(config: Zenoh) -> zenoh.Config:
     return settings
 
 
-def _tls(config: Zenoh) -> dict[str, object]:
-    """Raises AccessError."""
-    files = tls_files(config, _FIELD)
-    if files is None:
+def _tls(material: Material) -> dict[str, object]:
+    """As contents and not as files: those may change while Zenoh reads them, one after the other."""
+    if not material.tls:
         return {}
     at = "transport/link/tls/"
-    values: dict[str, object] = {f"{at}verify_name_on_connect": files.verify_name}
-    if files.ca is not None:
-        values[f"{at}root_ca_certificate"] = str(files.ca)
-    if files.certificate is not None and files.key is not None:
+    values: dict[str, object] = {f"{at}verify_name_on_connect": material.verify_name}
+    if material.ca is not None:
+        values[f"{at}root_ca_certificate_base64"] = _base64(material.ca)
+    if material.certificate is not None and material.key is not None:
+        certificate, key = _base64(material.certificate), _base64(material.key)
         values |= {
-            f"{at}connect_certificate": str(files.certificate),
-            f"{at}connect_private_key": str(files.key),
-            f"{at}listen_certificate": str(files.certificate),
-            f"{at}listen_private_key": str(files.key),
-            f"{at}enable_mtls": files.ca is not None,
+            f"{at}connect_certificate_base64": certificate,
+            f"{at}connect_private_key_base64": key,
+            f"{at}listen_certificate_base64": certificate,
+            f"{at}listen_private_key_base64": key,
+            f"{at}enable_mtls": material.ca is not None,
         }
     return values
+
+
+def _base64(text: bytes) -> str:
+    return base64.b64encode(text).decode("ascii")

@@ -23,6 +23,9 @@ class Subscription(Protocol):
     def handler(self) -> zenoh.handlers.Handler[zenoh.Sample]:
         """The channel in which samples wait."""
 
+    def undeclare(self) -> None:
+        """Withdraws it; what waits in the channel can still be taken."""
+
 
 class _Watched:
     """An Advanced Subscriber and what listens to its misses, which live as long as each other."""
@@ -36,6 +39,9 @@ class _Watched:
     @property
     def handler(self) -> zenoh.handlers.Handler[zenoh.Sample]:
         return self._subscriber.handler
+
+    def undeclare(self) -> None:
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
 def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tally) -> Subscription:

@@ -15,13 +15,16 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
+from detector.credentials import Material
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.streams.answering import Answering
 from detector.streams.bursts import Put
+from detector.streams.inlets import Inlet
 from detector.streams.layouts import Pump, pump_for
 from detector.streams.liveliness import TokenWatch
-from detector.streams.session import Connections, NetworkError, await_session, open_session
-from detector.streams.subscribing import Subscription, subscribe
+from detector.streams.membership import Membership
+from detector.streams.renewal import LOOK_EVERY, Renewal, Standing
+from detector.streams.session import NetworkError, await_session, material_of, open_session
 from detector.streams.tally import Tally
 from wayside.api.stream import Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -31,13 +34,10 @@ log = logging.getLogger(__name__)
 __all__ = ["EVENT_ENCODING", "Network", "NetworkError", "Put", "open_session"]
 
 EVENT_ENCODING = "application/cloudevents+json"
-_CHANNEL = 16_384
-"""So many samples of a stream wait for its thread while the evaluation holds the interpreter's lock. Once they are full
-Zenoh's own queues fill, and then it is the sender's congestion control that says whether it waits or drops."""
 
 
 class Network:
-    """One session: subscribed to all streams, and the way out for events."""
+    """Subscribed to all streams, and the way out for events: one session, or another after it with new certificates."""
 
     def __init__(
         self,
@@ -49,28 +49,30 @@ class Network:
         on_failure: Callable[[BaseException], None] = lambda error: None,
         answering: Callable[[zenoh.Session], Answering] | None = None,
         tally: Tally | None = None,
+        look_every: float = LOOK_EVERY,
     ) -> None:
         """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
 
         `answering` answers queries once there is a session. What was lost before the detector goes into the `tally`.
-        `on_failure` is told if a thread dies of an error.
+        `on_failure` is told if a thread dies of an error. Certificates are looked at every so many seconds.
         """
         self._on_failure = on_failure
         self._config = config
         self._tally = Tally() if tally is None else tally
-        self._streams = [(stream, pump_for(stream, putter(stream.name), self._tally)) for stream in streams]
-        self._liveliness = config.liveliness
+        self._streams = [*streams]
+        self._pumps = [pump_for(stream, putter(stream.name), self._tally) for stream in self._streams]
         self._put_token = putter(LIVELINESS)
         self._tokens: TokenWatch | None = None
+        self._look_every = look_every
+        self._renewal: Renewal | None = None
         self._capacity = capacity
         self._events: deque[tuple[str, bytes, str]] = deque()
         self._changed = threading.Condition()
         self._stop = threading.Event()
-        self._session: zenoh.Session | None = None
-        self._connections: Connections | None = None
+        self._member: Membership | None = None
+        self._inlets: list[Inlet] = []
         self._receivers: list[threading.Thread] = []
         self._make_answering = answering
-        self._answering: Answering | None = None
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
         self.dropped_events = 0
         """Events that found the queue full, or that Zenoh refused."""
@@ -78,7 +80,8 @@ class Network:
     def start(self) -> None:
         """Opens the session: a client's in the background until it succeeds, else at once (raises NetworkError)."""
         if self._config.mode is not ZenohMode.CLIENT:
-            self._join(open_session(self._config))
+            material = material_of(self._config)
+            self._begin(open_session(self._config, material), material)
         self._thread.start()
 
     def publish(self, key: str, payload: bytes, encoding: str = EVENT_ENCODING) -> None:
@@ -95,19 +98,20 @@ class Network:
 
         Raises NetworkError where there is no session, nobody answers in time, or an answer is an error.
         """
-        session = self._session
-        if session is None:
+        member = self._member
+        if member is None:
             raise NetworkError("there is no Zenoh session yet")
         try:
-            replies = session.get(
-                selector, payload=payload, attachment=attachment, timeout=timeout, target=zenoh.QueryTarget.ALL
-            )
-            answers, errors = [], []
-            for reply in replies:
-                if reply.ok is not None:
-                    answers.append(reply.ok.payload.to_bytes())
-                elif reply.err is not None:
-                    errors.append(reply.err.payload.to_bytes().decode(errors="replace"))
+            with member.used() as session:
+                replies = session.get(
+                    selector, payload=payload, attachment=attachment, timeout=timeout, target=zenoh.QueryTarget.ALL
+                )
+                answers, errors = [], []
+                for reply in replies:
+                    if reply.ok is not None:
+                        answers.append(reply.ok.payload.to_bytes())
+                    elif reply.err is not None:
+                        errors.append(reply.err.payload.to_bytes().decode(errors="replace"))
         except zenoh.ZError as error:
             raise NetworkError(f"{selector}: {error}") from error
         if errors:
@@ -119,55 +123,99 @@ class Network:
     @property
     def joined(self) -> bool:
         """Whether there is a session: samples come in as soon as somebody is connected."""
-        return self._session is not None
+        return self._member is not None
 
     @property
     def connected(self) -> bool:
         """Whether a router, a peer or a client is connected right now."""
-        connections = self._connections
-        return connections is not None and connections.any
+        member = self._member
+        return member is not None and member.connections.any
+
+    @property
+    def listens(self) -> bool:
+        """Whether others may come by themselves, and it need not connect to anybody."""
+        return self._config.mode is not ZenohMode.CLIENT
+
+    @property
+    def standing(self) -> Standing:
+        """What is known of the certificates in use."""
+        renewal = self._renewal
+        return Standing() if renewal is None else renewal.standing
+
+    @property
+    def dead(self) -> str | None:
+        """What has ended that never should, so that nothing comes in any more; None where all is alive.
+
+        A router that is away is no such thing: the session seeks it.
+        """
+        if self._stop.is_set() or not self._thread.ident:
+            return None
+        ended = [each.name for each in (self._thread, *self._receivers) if not each.is_alive()]
+        if self._tokens is not None and not self._tokens.alive:
+            ended.append("liveliness")
+        return f"the thread of {ended[0]} has ended" if ended else None
 
     def close(self, timeout: float = 2.0) -> None:
         """Publishes what still waits, for at most `timeout` seconds, and leaves the network."""
+        if self._renewal is not None:
+            self._renewal.stop()
         with self._changed:
             self._stop.set()
             self._changed.notify()
         if self._thread.is_alive():
             self._thread.join(timeout)
-        if (session := self._session) is not None:
-            self._session = None
-            if self._connections is not None:
-                self._connections.close()
-                self._connections = None
-            session.close()  # type: ignore[no-untyped-call]  # frees the threads: of a put that waits, and of receiving
+        if self._renewal is not None:
+            self._renewal.join(timeout)
+        for inlet in self._inlets:
+            inlet.close()
+        if (member := self._member) is not None:
+            self._member = None
+            member.close(timeout)  # frees the threads: of a put that waits, and of receiving
         for receiver in self._receivers:
             receiver.join(timeout)
         if self._tokens is not None:
             self._tokens.close(timeout)
-        if self._answering is not None:
-            self._answering.join(timeout)
         if (left := len(self._events)) > 0:
             self.dropped_events += left
             log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
 
-    def _join(self, session: zenoh.Session) -> None:
-        self._connections = Connections(session)
-        for stream, pump in self._streams:
-            subscription = subscribe(session, stream, _CHANNEL, self._tally)
-            name = f"stream {stream.name}"
-            thread = threading.Thread(target=self._receive, args=(subscription, pump), name=name, daemon=True)
-            thread.start()
-            self._receivers.append(thread)
-        if self._liveliness is not None:
-            self._tokens = TokenWatch(session, self._connections, self._liveliness, self._put_token)
-        self._session = session
-        if self._make_answering is not None:
-            self._answering = self._make_answering(session)
+    def _join(self, session: zenoh.Session, material: Material) -> Membership:
+        return Membership(session, material, self._streams, self._config.liveliness, self._tally)
 
-    def _receive(self, subscription: Subscription, pump: Pump) -> None:
+    def _begin(self, session: zenoh.Session, material: Material) -> None:
+        member = self._join(session, material)
+        for stream, pump, subscription in zip(self._streams, self._pumps, member.subscriptions, strict=True):
+            inlet = Inlet(subscription, history=stream.history is not None)
+            name = f"stream {stream.name}"
+            thread = threading.Thread(target=self._receive, args=(inlet, pump), name=name, daemon=True)
+            thread.start()
+            self._inlets.append(inlet)
+            self._receivers.append(thread)
+        if member.tokens is not None:
+            self._tokens = TokenWatch(member.tokens, member.connections, self._put_token)
+        self._use(member)
+        self._renewal = Renewal(
+            self._config,
+            member,
+            self._inlets,
+            self._tokens,
+            self._join,
+            self._use,
+            look_every=self._look_every,
+            on_failure=self._on_failure,
+        )
+        self._renewal.start()
+
+    def _use(self, member: Membership) -> None:
+        """Events go out here from now on, and queries are answered."""
+        self._member = member
+        if self._make_answering is not None:
+            member.answer(self._make_answering)
+
+    def _receive(self, inlet: Inlet, pump: Pump) -> None:
         """Hands over what comes on a stream, until the session is closed."""
         try:
-            pump(subscription.handler)
+            pump(inlet.bursts())
         except Exception as error:  # noqa: BLE001  this thread's edge: without it, the stream would be silent for ever
             if not self._stop.is_set():
                 log.critical("a stream's thread ended, nothing is received on it any more: %s", error)
@@ -181,11 +229,11 @@ class Network:
             self._on_failure(error)
 
     def _serve(self) -> None:
-        if self._session is None:
-            session = await_session(self._config, self._stop)
-            if session is None:
+        if self._member is None:
+            opened = await_session(self._config, self._stop)
+            if opened is None:
                 return
-            self._join(session)
+            self._begin(*opened)
         while (event := self._next()) is not None:
             self._send(*event)
 
@@ -196,18 +244,30 @@ class Network:
             return self._events.popleft() if self._events else None
 
     def _send(self, key: str, payload: bytes, encoding: str) -> None:
-        if (session := self._session) is None:  # closed meanwhile, the time for what still waited being over
-            self.dropped_events += 1
-            return
-        try:
-            # BLOCK: events are few and should survive a short congestion; only this thread waits for it.
-            session.put(
-                key,
-                payload,
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                express=True,
-            )
-        except zenoh.ZError as error:
-            self.dropped_events += 1
-            log.warning("event on %s was not published: %s", key, error)
+        member = self._member
+        while member is not None:  # None: closed meanwhile, the time for what still waited being over
+            try:
+                # BLOCK: events are few and should survive a short congestion; only this thread waits for it.
+                with member.used() as session:
+                    session.put(
+                        key,
+                        payload,
+                        encoding=encoding,
+                        congestion_control=zenoh.CongestionControl.BLOCK,
+                        express=True,
+                    )
+                return
+            except zenoh.ZError as error:
+                before, member = member, self._successor(member)
+                if member is before:
+                    log.warning("event on %s was not published: %s", key, error)
+                    break
+        self.dropped_events += 1
+
+    def _successor(self, member: Membership) -> Membership | None:
+        """What has taken its place, or will in a moment; itself where nothing has, None once all is closed."""
+        renewal = self._renewal
+        while renewal is not None and renewal.reopening.is_set() and self._member is member:
+            if self._stop.wait(0.01):
+                break
+        return self._member

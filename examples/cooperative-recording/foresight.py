@@ -9,9 +9,11 @@ from typing import Any
 
 import yaml
 
-from application_manager.core.demand import LINGER_ANNOTATION, Decision, demand
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer, Rendering
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.demand.demand import demand
+from application_manager.core.demand.lingering import LINGER_ANNOTATION
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, Rendering
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 from wayside.api.applicationinstance import ApplicationInstanceSpec, ApplicationInstanceStatus
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata

@@ -78,7 +78,7 @@ class Fusion:
                 print(f"a configuration that cannot be read is left aside: {error}", flush=True)
                 return
             for source in self._sources.keys() - wanted:
-                self._sources.pop(source).undeclare()
+                self._sources.pop(source).undeclare()  # type: ignore[no-untyped-call]
             for source in wanted - self._sources.keys():
                 self._sources[source] = self._session.declare_subscriber(f"vehicles/{source}/pose", self._take)
             print(f"following {', '.join(sorted(wanted)) or 'nobody'} (by {way})", flush=True)
@@ -128,7 +128,7 @@ def main() -> None:
                 continue  # not there yet
             if latest.by_file(content, time.monotonic()):
                 fusion.follow("file")
-        subscriber.undeclare()
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
 if __name__ == "__main__":

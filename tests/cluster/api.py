@@ -119,10 +119,13 @@ class Api:
         path = self._path(_kind(manifest), _namespace(manifest))
         return self._object("POST", path, {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}, manifest)
 
-    def apply(self, manifest: Object, *, field_manager: str = FIELD_MANAGER, subresource: str = "") -> Object:
-        """Apply the manifest on the server, forced, and return the object as stored."""
+    def apply(
+        self, manifest: Object, *, field_manager: str = FIELD_MANAGER, subresource: str = "", dry_run: bool = False
+    ) -> Object:
+        """Apply the manifest on the server, forced, and return the object as stored, or as it would be."""
         path = self._path(_kind(manifest), _namespace(manifest), manifest["metadata"]["name"], subresource)
         query = {"fieldManager": field_manager, "force": "true", "fieldValidation": "Strict"}
+        query |= {"dryRun": "All"} if dry_run else {}
         return self._object("PATCH", path, query, manifest, APPLY_PATCH)
 
     def replace(self, manifest: Object, *, subresource: str = "") -> Object:

@@ -18,7 +18,7 @@ from detector.streams.zenoh import open_session
 from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import condition, start_manager, wait_settled
 from tests.cluster.processes import Process, Processes
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_endpoint
 from tests.unit.ros_messages import cdr, pose_stamped
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -102,32 +102,23 @@ class Vehicles:
             self._failure = failure
 
 
-class Chain:
-    """Both programs on a namespace with a Detector, a rule and a template."""
+class Town:
+    """A namespace in which the demands of pairs are served, however the programs run.
 
-    def __init__(self, api: Api, namespace: str, processes: Processes, folder: Path) -> None:
+    Attributes:
+        api: for the namespace.
+        patience: seconds that each wait may take.
+    """
+
+    def __init__(self, api: Api, patience: float = PATIENCE) -> None:
         self.api = api
-        self.namespace = namespace
-        self.processes = processes
-        self.folder = folder
-        self.endpoint = free_endpoint()
-        self.detector: Process | None = None
-        self.manager: Process | None = None
+        self.patience = patience
 
     def apply(self, *manifests: Object) -> None:
-        """Apply them in the test's namespace."""
+        """Apply them in the town's namespace."""
         for manifest in manifests:
-            metadata = {**manifest["metadata"], "namespace": self.namespace}
+            metadata = {**manifest["metadata"], "namespace": self.api.namespace}
             self.api.apply({**manifest, "metadata": metadata})
-
-    def start(self, *options: str, rules: int = 1) -> Process:
-        """Start both programs; returns once they are at work. `options` are the detector's."""
-        self.manager = start_manager(self.processes, self.namespace)
-        self.detector = self.processes.start(
-            "detector", "run", "--name", HOLDER, "--namespace", self.namespace, "--output", str(self.folder), *options
-        )
-        self.detector.wait_for_output(f"Detector {HOLDER} runs with {rules} rules")
-        return self.detector
 
     def task(self, pair: Pair) -> Object | None:
         """The pair's task that is in force, if there is one; AssertionError if there are several."""
@@ -137,9 +128,7 @@ class Chain:
 
     def wait_task(self, pair: Pair) -> Object:
         """Wait for the pair's task."""
-        found = wait_until(lambda: self.task(pair), lambda task: task is not None, what=f"{pair} has a task")
-        assert found is not None
-        return found
+        return self._wait(lambda: self.task(pair), f"{pair} has a task")
 
     def deployment(self, pair: Pair) -> Object | None:
         """The pair's Deployment, if there is one."""
@@ -149,17 +138,58 @@ class Chain:
 
     def wait_deployed(self, pair: Pair) -> Object:
         """Wait for the pair's Deployment."""
-        found = wait_until(lambda: self.deployment(pair), lambda it: it is not None, what=f"{pair} has a Deployment")
-        assert found is not None
-        return found
+        return self._wait(lambda: self.deployment(pair), f"{pair} has a Deployment")
 
     def wait_removed(self, pair: Pair) -> None:
         """Wait until the pair's Deployment is gone."""
-        wait_until(lambda: self.deployment(pair), lambda it: it is None, what=f"{pair} has no Deployment")
+        what = f"{pair} has no Deployment"
+        wait_until(lambda: self.deployment(pair), lambda it: it is None, timeout=self.patience, what=what)
 
     def live(self) -> set[str]:
         """The subjects of all tasks that are in force."""
         return {str(task["spec"]["event"]["subject"]) for task in self.api.list("ApplicationTask") if _live(task)}
+
+    def wait_condition(self, kind: str, name: str, type_: str, status: str) -> Object:
+        """Wait until the object has the condition with this status; return the condition."""
+        found = self.api.wait_for(
+            kind,
+            name,
+            lambda it: condition(it, type_).get("status") == status,
+            timeout=self.patience,
+            what=f"{name} is {type_}={status}",
+        )
+        return condition(found, type_)
+
+    def settled(self) -> None:
+        """Wait until the cluster is as its live tasks demand, and nothing else is there."""
+        wait_settled(self.api, timeout=self.patience)
+
+    def _wait(self, read: Callable[[], Object | None], what: str) -> Object:
+        found = wait_until(read, lambda it: it is not None, timeout=self.patience, what=what)
+        assert found is not None
+        return found
+
+
+class Chain(Town):
+    """Both programs, as processes, on a namespace with a Detector, a rule and a template."""
+
+    def __init__(self, api: Api, namespace: str, processes: Processes, folder: Path) -> None:
+        super().__init__(api)
+        self.namespace = namespace
+        self.processes = processes
+        self.folder = folder
+        self.endpoint = free_endpoint()
+        self.detector: Process | None = None
+        self.manager: Process | None = None
+
+    def start(self, *options: str, rules: int = 1) -> Process:
+        """Start both programs; returns once they are at work. `options` are the detector's."""
+        self.manager = start_manager(self.processes, self.namespace)
+        self.detector = self.processes.start(
+            "detector", "run", "--name", HOLDER, "--namespace", self.namespace, "--output", str(self.folder), *options
+        )
+        self.detector.wait_for_output(f"Detector {HOLDER} runs with {rules} rules")
+        return self.detector
 
     def events(self, *subject: str) -> list[Object]:
         """The events of a client or pair so far, as the detector wrote them."""
@@ -174,17 +204,6 @@ class Chain:
             lambda events: [kind_of(event) for event in events] == list(kinds),
             what=f"the events of {pair} are {kinds}",
         )
-
-    def wait_condition(self, kind: str, name: str, type_: str, status: str) -> Object:
-        """Wait until the object has the condition with this status; return the condition."""
-        found = self.api.wait_for(
-            kind, name, lambda it: condition(it, type_).get("status") == status, what=f"{name} is {type_}={status}"
-        )
-        return condition(found, type_)
-
-    def settled(self) -> None:
-        """Wait until the cluster is as its live tasks demand, and nothing else is there."""
-        wait_settled(self.api)
 
 
 def detector(endpoint: str, **spec: Any) -> Object:

@@ -6,18 +6,17 @@ the report.
 
 from __future__ import annotations
 
-import re
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.cluster.api import Api, ApiError, Unreachable
+from tests.cluster.api import Api
 from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
-from tests.cluster.pods import Kubelet
+from tests.cluster.namespaces import fresh_namespace
+from tests.cluster.pods import kubelet as playing_kubelet
 from tests.cluster.processes import Processes
 
 HERE = Path(__file__).parent
@@ -60,20 +59,8 @@ def control_plane(request: pytest.FixtureRequest) -> Iterator[ControlPlane]:
 def namespace(control_plane: ControlPlane, request: pytest.FixtureRequest) -> Iterator[str]:
     """A fresh namespace that has its default service account; deleted afterwards without waiting."""
     control_plane.recover()
-    api = control_plane.api()
-    readable = re.sub(r"[^a-z0-9]+", "-", request.node.name.removeprefix("test_").lower()).strip("-")[:40].rstrip("-")
-    name = f"{readable}-{secrets.token_hex(3)}"
-    api.create({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}})
-    # Admission refuses pods until their account exists.
-    api.wait_for("ServiceAccount", "default", lambda _: True, namespace=name, what=f"{name} has its service account")
-    yield name
-    try:
-        api.delete("Namespace", name)
-    except Unreachable:
-        return  # a test that failed while the API server was away: the session's data goes soon anyway
-    except ApiError as error:
-        if error.code != 404:  # the test may have deleted it
-            raise
+    with fresh_namespace(control_plane.api(), request.node.name) as name:
+        yield name
 
 
 @pytest.fixture
@@ -95,5 +82,5 @@ def processes(control_plane: ControlPlane, namespace: str, tmp_path: Path) -> It
 @pytest.fixture
 def kubelet(api: Api) -> Iterator[None]:
     """Every pod of the test's namespace becomes ready by itself, soon after it was made."""
-    with Kubelet(api):
+    with playing_kubelet(api):
         yield

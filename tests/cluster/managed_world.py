@@ -6,20 +6,23 @@ through, after a while the world must equal this pure function of it, and nothin
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from application_manager.core.byhand import is_held
-from application_manager.core.claims import InvalidTemplate
-from application_manager.core.demand import Outcome, demand, is_managed
-from application_manager.core.leases import LeaseView
-from application_manager.core.operations import Standing
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer, RenderError
-from application_manager.core.status import task_status
+from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.claims.operations import Standing
+from application_manager.core.demand.byhand import is_held
+from application_manager.core.demand.decisions import is_managed
+from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.holders.leases import LeaseView
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, RenderError
+from application_manager.core.statuses.status import task_status
 from tests.cluster.api import Api, Object
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import PATIENCE, wait_until
@@ -29,16 +32,29 @@ KINDS = ("Deployment", "ConfigMap", "Service", "HorizontalPodAutoscaler")  # tho
 MANAGED = "app.kubernetes.io/managed-by=wayside"
 
 
-def start_manager(processes: Processes, namespace: str | None = None, *options: str) -> Process:
-    """Start `application-manager run` for the namespace (default: all) and wait until it watches."""
+def start_manager(
+    processes: Processes, namespace: str | None = None, *options: str, kubeconfig: Path | None = None
+) -> Process:
+    """Start `application-manager run` for the namespace (default: all) and wait until it watches.
+
+    It is told who it is, as a pod's container is: started again it takes its own Lease at once.
+    """
     where = ["--namespace", namespace] if namespace is not None else []
-    manager = processes.start("application-manager", "run", *where, "--resync", "5s", *options)
+    environment = {"POD_NAME": "manager", "POD_UID": secrets.token_hex(8)}
+    if kubeconfig is not None:
+        environment["KUBECONFIG"] = str(kubeconfig)
+    manager = processes.start("application-manager", "run", *where, "--resync", "5s", *options, environment=environment)
     manager.wait_for_output("watching")
     return manager
 
 
 def wait_settled(
-    api: Api, *, timeout: float = PATIENCE, lost: Mapping[str, LeaseView] | None = None, refused: Collection[str] = ()
+    api: Api,
+    *,
+    timeout: float = PATIENCE,
+    lost: Mapping[str, LeaseView] | None = None,
+    refused: Collection[str] = (),
+    limit: int | None = None,
 ) -> None:
     """Wait until the namespace is as what is live in it demands.
 
@@ -47,16 +63,19 @@ def wait_settled(
         timeout: seconds.
         lost: holders that are to count as lost.
         refused: instances whose objects the API server refuses; these are not looked at.
+        limit: how many instances the namespace may have.
     """
     wait_until(
-        lambda: list(differences(api, lost or {}, refused)),
+        lambda: list(differences(api, lost or {}, refused, limit)),
         lambda found: not found,
         timeout=timeout,
         what="the world equals the pure function of what is live",
     )
 
 
-def differences(api: Api, leases: Mapping[str, LeaseView], refused: Collection[str]) -> Iterator[str]:
+def differences(
+    api: Api, leases: Mapping[str, LeaseView], refused: Collection[str] = (), limit: int | None = None
+) -> Iterator[str]:
     """Where the world differs from what should be."""
     templates = {raw["metadata"]["name"]: _template(raw) for raw in api.list("ApplicationTemplate")}
     tasks = [ApplicationTask.model_validate(raw) for raw in api.list("ApplicationTask")]
@@ -64,7 +83,7 @@ def differences(api: Api, leases: Mapping[str, LeaseView], refused: Collection[s
         raw["metadata"]["name"]: ApplicationInstance.model_validate(raw) for raw in api.list("ApplicationInstance")
     }
     objects = {(raw["kind"], raw["metadata"]["name"]): raw for kind in KINDS for raw in api.list(kind, labels=MANAGED)}
-    outcome = demand(templates.values(), tasks, instances.values(), leases, time.time())
+    outcome = demand(templates.values(), tasks, instances.values(), leases, time.time(), limit)
     expected: set[tuple[str, str]] = set()
     for name, instance in instances.items():
         decision = outcome.instances[name]

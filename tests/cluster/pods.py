@@ -1,14 +1,15 @@
 """Playing the kubelet: there are no nodes here, so nothing but a test says that a pod runs.
 
-`mark_pods_ready` does it once, `Kubelet` goes on doing it.
+`mark_pods_ready` does it once, `kubelet` goes on doing it.
 """
 
 from __future__ import annotations
 
-import threading
-from types import TracebackType
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 from tests.cluster.api import Api, ApiError, Object, Unreachable
+from tests.cluster.repeating import repeated
 
 KUBELET_INTERVAL = 0.2  # s between two looks at the pods
 
@@ -56,34 +57,13 @@ def running(pod: Object) -> Object:
     }
 
 
-class Kubelet:
-    """Marks each new pod of a namespace ready, for the duration of a `with` block."""
+@contextmanager
+def kubelet(api: Api) -> Iterator[None]:
+    """Mark each new pod of the default namespace of `api` ready, for the duration of a `with` block."""
 
-    def __init__(self, api: Api):
-        """Prepare, for the default namespace of `api`."""
-        self._api = api
-        self._ended = threading.Event()
-        self._failure: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="kubelet", daemon=True)
+    def mark() -> None:
+        with suppress(Unreachable):  # an outage that the test brought about
+            mark_pods_ready(api)
 
-    def _run(self) -> None:
-        try:
-            while not self._ended.wait(KUBELET_INTERVAL):
-                try:
-                    mark_pods_ready(self._api)
-                except Unreachable:
-                    continue  # an outage that the test brought about
-        except Exception as error:  # noqa: BLE001  not lost: the end of the block raises it
-            self._failure = error
-
-    def __enter__(self) -> Kubelet:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ended.set()
-        self._thread.join()
-        if self._failure is not None and error is None:
-            raise self._failure
+    with repeated("kubelet", mark, KUBELET_INTERVAL):
+        yield

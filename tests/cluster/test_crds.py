@@ -222,8 +222,8 @@ class TestKubectl:
         ("short", "manifest", "columns"),
         [
             ("er", EVENT_RULE, ["NAME", "ENABLED", "ACCEPTED", "DETECTORS", "WHEN", "AGE", "MESSAGE"]),
-            ("det", DETECTOR, ["NAME", "CLOCK", "RULES", "ACCEPTED", "AGE", "MESSAGE"]),
-            ("apptpl", APPLICATION_TEMPLATE, ["NAME", "KEY", "INSTANCES", "ACCEPTED", "AGE", "MESSAGE"]),
+            ("det", DETECTOR, ["NAME", "CLOCK", "RULES", "ACCEPTED", "RUNNING", "AGE", "MESSAGE"]),
+            ("apptpl", APPLICATION_TEMPLATE, ["NAME", "KEY", "INSTANCES", "MAX", "ACCEPTED", "AGE", "MESSAGE"]),
             (
                 "apptask",
                 APPLICATION_TASK,

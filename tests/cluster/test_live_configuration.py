@@ -14,13 +14,13 @@ import pytest
 import yaml
 import zenoh
 
-from application_manager.core.following import ANNOTATION, fingerprint
+from application_manager.core.objects.following import ANNOTATION, fingerprint
 from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import end, start_manager, task, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until
+from tests.networks import router
 from tests.ports import free_endpoint
-from tests.unit.networks import router
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "live-configuration"
 CONFIG_MAP = "fusion-configuration"

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.claims import instance_name
+from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import start_manager, task, template, wait_settled
@@ -101,11 +101,11 @@ def test_explain_goes_from_the_event_over_merged_values_to_the_pods(
         what="the manager has written what belongs to the instance",
     )
     for line in (
-        "event: scene of car1, began 2026-01-02T03:04:05Z",
+        "event: scene of car1, started 2026-01-02T03:04:05Z",
         "distance = 7",
         "asked for by detector town, holder town",
         "rate = 9 (merge Max)",
-        "5 of one is outbid: a larger value counts",
+        "5 of one (car1) is outbid: a larger value counts",
         "9 of two is it",
         f"{pods[0]['metadata']['name']} Pending: not ready yet",
     ):
@@ -125,3 +125,31 @@ def test_what_cannot_be_explained_is_one_line_with_the_remedy(control_plane: Con
     told = explain(control_plane, api, "waits").stdout
     assert "template missing: does not exist" in told
     assert "the manager has not looked at it as it is now" in told
+
+
+def test_explain_knows_who_has_no_place_and_what_stands_in_for_whom(
+    control_plane: ControlPlane, api: Api, processes: Processes, namespace: str
+) -> None:
+    start_manager(processes, namespace, "--max-instances", "2")
+    instead = instance_name("lite", "north")
+    in_time = {"linger": "1s", "readyTimeout": "1s", "fallback": {"template": "lite"}}
+    api.create(template("lite"))
+    api.create(template(lifecycle=in_time))
+    api.create(task("north"))
+    api.wait_for(
+        "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("instance") == instead, what="served"
+    )
+    api.create(task("south", of="lite"))
+    api.wait_for("ApplicationTask", "south", lambda raw: raw.get("status", {}).get("phase") == "Waiting", what="waits")
+
+    north = explain(control_plane, api, "task/north").stdout
+    assert f"Counts, FallenBack: instance {NORTH} is not ready: instance {instead} of template lite serves" in north
+    assert "\ntemplate app\n" in north
+    assert f"\ninstance {instead} of template lite (" in north
+    assert '"north" of north is it' in north
+    south = explain(control_plane, api, "task/south").stdout
+    assert "Waiting, LimitReached: " in south
+    assert "the namespace is at its limit of 2 instances" in south
+    its = explain(control_plane, api, f"instance/{instead}").stdout
+    assert f"template lite\ninstance {instead} (" in its
+    assert f"tasks of instance {instead}\n  north (by a person, Deploy, priority 0) Counts\n" in its

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.claims import instance_name
+from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import condition, config, deployment, start_manager, task, template, wait_settled

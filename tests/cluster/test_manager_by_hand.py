@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from application_manager.core.claims import instance_name
+from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import condition, end, start_manager, task, template, wait_settled
 from tests.cluster.processes import Process, Processes

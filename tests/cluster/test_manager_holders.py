@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.claims import instance_name
-from application_manager.core.leases import LeaseView
+from application_manager.core.claims.claims import instance_name
+from application_manager.core.holders.leases import LeaseView
 from tests.cluster.api import Api
 from tests.cluster.managed_world import condition, start_manager, task, template, wait_settled
 from tests.cluster.processes import Process, Processes

@@ -10,18 +10,18 @@ from collections.abc import Callable
 
 import pytest
 
-from application_manager.apply import Applier
-from application_manager.client import Client, Object, Resource
-from application_manager.connection import load_configuration
-from application_manager.core.claims import instance_name
-from application_manager.core.demand import Decision
-from application_manager.core.policy import Policy
-from application_manager.instances import InstanceWork
-from application_manager.recorder import Recorder
-from application_manager.router import Router
-from application_manager.store import Name
-from application_manager.suspending import Suspending
-from application_manager.world import World
+from application_manager.cluster.apply import Applier
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.store import Name
+from application_manager.core.claims.claims import instance_name
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.objects.policy import Policy
+from application_manager.knowledge.world import World
+from application_manager.watching.router import Router
+from application_manager.work.instances import InstanceWork
+from application_manager.work.recorder import Recorder
+from application_manager.work.suspending import Suspending
 from tests.cluster.api import Api
 from tests.cluster.managed_world import deployment, task, template
 from wayside.api import API_VERSION

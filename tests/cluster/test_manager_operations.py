@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.claims import instance_name
+from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import (
     condition,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, start_manager
+from tests.cluster.managed_world import condition, config, start_manager, template
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.processes import Processes
 
@@ -27,6 +27,16 @@ def test_a_rule_follows_its_detectors_and_what_is_wrong_is_told(api: Api, proces
     api.create(detector)
     accepted = api.wait_for("EventRule", name, lambda raw: judged(raw) == "Accepted", what="it is accepted")
     assert accepted["status"]["detectors"] == ["intersection-a"]
+    assert "there is no ApplicationTemplate recorder" in condition(accepted, "Accepted")["message"]
+    recorder = template("recorder", parameters={"vehicles": {"type": "array"}}, manifests=[config({})])
+    del recorder["spec"]["key"]
+    api.create(recorder)
+    api.wait_for(
+        "EventRule",
+        name,
+        lambda raw: "recorder" not in condition(raw, "Accepted")["message"],
+        what="its template is there",
+    )
     api.wait_for(
         "Detector",
         "intersection-a",

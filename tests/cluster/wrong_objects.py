@@ -119,6 +119,18 @@ WRONG: list[tuple[str, str, Changes, str]] = [
     ("Detector", "no streams", {"spec.streams": []}, r"spec\.streams: .*at least 1 items"),
     (
         "Detector",
+        "accounts of a detector that is no sidecar",
+        {"spec.serviceAccountNames": ["vehicle"]},
+        r"spec: .*serviceAccountNames says nothing without mode Sidecar",
+    ),
+    (
+        "Detector",
+        "a sidecar on nodes of its own",
+        {"spec.mode": "Sidecar", "spec.pod": {"nodeSelector": {"a": "b"}}},
+        r"spec: .*with mode Sidecar the detector runs where the pod does",
+    ),
+    (
+        "Detector",
         "a cdr stream without its type",
         {f"{STREAM}.type": ABSENT},
         r"spec\.streams\[0\]: .*type is for cdr streams, and they need it, e\.g\. geometry_msgs",

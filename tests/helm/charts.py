@@ -14,8 +14,8 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from tests.helm import Tools
+from tests.networks import wait_for
 from tests.ports import free_port
-from tests.unit.networks import wait_for
 
 DEPLOYMENT = """\
 apiVersion: apps/v1

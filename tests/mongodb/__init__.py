@@ -27,8 +27,8 @@ import pymongo
 from pymongo.errors import PyMongoError
 from rich.console import Console
 
-from tests.cluster.binaries import locked
 from tests.cluster.toolchain import GoUnavailableError, find_go
+from tests.gobuild import locked
 from tests.ports import free_port
 
 MODULE = Path(__file__).parent / "server"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
+import tempfile
 from pathlib import Path
 
 from cryptography import x509
@@ -27,11 +28,13 @@ class Authority:
         )
         self.ca.write_bytes(certificate.sign(self._key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
 
-    def sign(self, name: str, host: str = "localhost") -> tuple[Path, Path]:
+    def sign(
+        self, name: str, host: str = "localhost", lasting: datetime.timedelta = _DAY, folder: Path | None = None
+    ) -> tuple[Path, Path]:
         """The files of a certificate and its key, for a host and 127.0.0.1, to be used by either side."""
         key = ec.generate_private_key(ec.SECP256R1())
         builder = (
-            self._builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)]), key.public_key())
+            self._builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)]), key.public_key(), lasting)
             .add_extension(
                 x509.SubjectAlternativeName([x509.DNSName(host), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]),
                 critical=False,
@@ -41,7 +44,8 @@ class Authority:
                 critical=False,
             )
         )
-        files = self._folder / f"{name}.crt", self._folder / f"{name}.key"
+        where = folder or self._folder
+        files = where / f"{name}.crt", where / f"{name}.key"
         files[0].write_bytes(builder.sign(self._key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
         files[1].write_bytes(
             key.private_bytes(
@@ -50,7 +54,30 @@ class Authority:
         )
         return files
 
-    def _builder(self, subject: x509.Name, key: ec.EllipticCurvePublicKey) -> x509.CertificateBuilder:
+    def mount(self, volume: Path, name: str, lasting: datetime.timedelta = _DAY) -> None:
+        """A new certificate of that name as a Secret's mount has it: the kubelet changes all its files at one go."""
+        self.change(volume, dict(zip(("tls.crt", "tls.key"), self._signed(name, lasting), strict=True)))
+
+    def change(self, volume: Path, files: dict[str, bytes]) -> None:
+        """These files, and the authority's, become the content of a Secret's mount."""
+        new = volume / f"..{x509.random_serial_number()}"
+        new.mkdir(parents=True)
+        for each, content in ({"ca.crt": self.ca.read_bytes()} | files).items():
+            (new / each).write_bytes(content)
+            if not (volume / each).is_symlink():
+                (volume / each).symlink_to(f"..data/{each}")
+        link = volume / "..data_tmp"
+        link.symlink_to(new.name)
+        link.rename(volume / "..data")
+
+    def _signed(self, name: str, lasting: datetime.timedelta) -> tuple[bytes, bytes]:
+        with tempfile.TemporaryDirectory() as folder:
+            certificate, key = self.sign(name, lasting=lasting, folder=Path(folder))
+            return certificate.read_bytes(), key.read_bytes()
+
+    def _builder(
+        self, subject: x509.Name, key: ec.EllipticCurvePublicKey, lasting: datetime.timedelta = _DAY
+    ) -> x509.CertificateBuilder:
         now = datetime.datetime.now(datetime.UTC)
         return (
             x509.CertificateBuilder()
@@ -59,5 +86,5 @@ class Authority:
             .public_key(key)
             .serial_number(x509.random_serial_number())
             .not_valid_before(now - _DAY)
-            .not_valid_after(now + _DAY)
+            .not_valid_after(now + lasting)
         )

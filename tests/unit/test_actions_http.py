@@ -13,8 +13,8 @@ from pydantic import ValidationError
 
 from detector.actions.http import Answer, HttpClient, HttpError, Verdict, judge
 from detector.actions.http.answer import wait_asked
+from tests.http_servers import Behaviour, answers, drips, echoes_headers, endpoint, endpoint_for, hangs, sends
 from tests.unit.certificates import Authority
-from tests.unit.http_servers import Behaviour, answers, drips, echoes_headers, endpoint, endpoint_for, hangs, sends
 from wayside.api.actions.http import HttpAccess, HttpHeader
 
 OK = b"HTTP/1.1 200 OK\r\n"

@@ -16,8 +16,8 @@ from detector.replay.recordings import open_recordings
 from detector.sources.supervision import SourceThread, State
 from detector.streams.codecs import CdrDecoder
 from detector.streams.tally import Tally
+from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from tests.unit.driving import a_detector
-from tests.unit.networks import PATIENCE, Arrivals, stream, wait_for
 from wayside.api.source import DataSource
 from wayside.api.stream import Encoding, Stream
 

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from application_manager.core.charts import ChartFailure, ChartObjects, ChartRequest, ChartSource, parse
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import ChartPending, Renderer, RenderError, Rendering
+from application_manager.core.objects.charts import ChartFailure, ChartObjects, ChartRequest, ChartSource, parse
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from tests.unit.manager_objects import instance, template
 from wayside.api.applicationtemplate import ApplicationTemplateSpec
 from wayside.api.chart import Helm

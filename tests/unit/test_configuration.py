@@ -10,8 +10,8 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from application_manager.core.policy import DEFAULT_KINDS, Policy
-from application_manager.core.rendering import Renderer, RenderError, Rendering
+from application_manager.core.objects.policy import DEFAULT_KINDS, Policy
+from application_manager.core.objects.rendering import Renderer, RenderError, Rendering
 from tests.unit.manager_objects import DEPLOYMENT, instance, template
 
 DECLARED = {"sources": {"type": "array", "items": "string", "merge": "Union"}, "rate": {"type": "number"}}

@@ -21,11 +21,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer
+from tests.networks import PATIENCE
 from tests.ports import free_endpoint
 from tests.unit.manager_objects import instance
-from tests.unit.networks import PATIENCE
 from wayside.api import ApplicationTemplate, Detector, EventRule, Kind
 from wayside.api.documents import load_documents
 from wayside.rules import compile_rule

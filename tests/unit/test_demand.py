@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from application_manager.core.demand import Outcome, demand
-from application_manager.core.leases import LeaseView
-from application_manager.core.operations import Standing
+from application_manager.core.claims.operations import Standing
+from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.holders.leases import LeaseView
 from tests.unit.manager_objects import NOW, instance, task, template
 
 FUSION = {

@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from application_manager.core.explaining import Found, explain, serving
-from application_manager.core.explanation import Explanation
-from application_manager.telling import text
+from application_manager.commands.telling import text
+from application_manager.core.statuses.explaining import Found, explain, serving
+from application_manager.core.statuses.explanation import Explanation
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.times import format_seconds
@@ -79,7 +79,7 @@ TASKS = [
 def explained(about: str | None = "scene-a", tasks: Any = TASKS, **more: Any) -> Explanation:
     found = Found([template(**FUSION)], tasks, more.pop("instances", [running()]), **more)
     asked = next((each for each in tasks if each.name == about), None)
-    return explain(found, task=about, instance=serving(found, asked) if asked else NAME, now=NOW)
+    return explain(found, task=about, instance=serving(found, asked, NOW) if asked else NAME, now=NOW)
 
 
 def contributions(explanation: Explanation, parameter: str) -> dict[str, str]:
@@ -150,6 +150,47 @@ def test_objects_and_pods_say_why_they_are_not_ready() -> None:
         ("Service", "does not exist"),
     ]
     assert [each.problem for each in found.pods] == ["image fusion:9 cannot be pulled: not found"]
+
+
+def test_the_text_says_what_each_task_does_and_whose_values_lost_and_why() -> None:
+    tasks = [
+        *TASKS[:2],
+        task("thin", {"rateHz": 2}, operation="Reconfigure"),
+        task("rest", {"region": "north"}, operation="Suspend", priority=5),
+    ]
+    lines = [each.strip() for each in text(explained("scene-a", tasks)).splitlines()]
+    assert "scene-a (scene of car1+car2, Deploy, priority 3) Counts" in lines
+    assert "thin (by a person, Reconfigure, priority 0) Counts" in lines
+    assert "rest (by a person, Suspend, priority 5) Counts" in lines
+    assert "20 of scene-a (car1+car2) is outbid: a task that reconfigures lies over it" in lines
+    assert "2 of thin is it" in lines
+    assert not [each for each in lines if " of rest " in each], "its parameters only say which instance it means"
+    of_all = text(explained("thin", tasks)).splitlines()
+    assert "instances: it is for all of the template" in of_all
+
+
+def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> None:
+    one, two = task("one", {"region": "north"}), task("two", {"region": "south"}, created=1)
+    found = Found([template(**FUSION, maxInstances=1)], [one, two], [running()])
+    told = explain(found, task="two", instance=serving(found, two, NOW), now=NOW)
+    assert told.task is not None
+    assert (told.task.standing, told.task.reason) == ("Waiting", "LimitReached")
+
+
+def test_a_sum_that_is_held_at_its_bound_says_what_it_would_be() -> None:
+    spec = {"parameters": {"uplink": {"type": "number", "maximum": 100, "merge": "Sum"}}}
+    tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
+    found = Found([template(**spec)], tasks, [])
+    told = text(explain(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
+    assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is held at the maximum of 100\n" in told
+
+
+def test_what_is_over_does_not_push_what_counts_out_of_sight() -> None:
+    over = [emitted(f"over-{number:02}", {"region": "north"}, ended=True, created=-60) for number in range(30)]
+    told = text(explained(None, [*over, TASKS[0]])).splitlines()
+    listed = told.index(f"tasks of instance {NAME}")
+    assert told[listed + 1].startswith("  scene-a (scene of car1+car2, Deploy")
+    assert "  and 11 more: -o json lists all" in told
 
 
 def test_the_guide_shows_what_is_printed() -> None:

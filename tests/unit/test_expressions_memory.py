@@ -37,12 +37,16 @@ def test_nothing_is_left_behind(source: str, values: dict[str, Any]) -> None:
         for _ in range(times):
             expression.evaluate_or_unknown({"msg": values})
 
+    def left_behind() -> int:
+        gc.collect()
+        before = sys.getallocatedblocks()
+        evaluate(1000)
+        gc.collect()
+        return sys.getallocatedblocks() - before
+
     evaluate(100)
-    gc.collect()
-    before = sys.getallocatedblocks()
-    evaluate(1000)
-    gc.collect()
-    assert sys.getallocatedblocks() - before < 100
+    # What leaks does so each time; another thread of the interpreter allocates now and then.
+    assert min(left_behind() for _ in range(3)) < 100
 
 
 def test_arguments_and_results_stay_whole_for_those_who_keep_them() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.following import ANNOTATION, behind, fingerprint, selectors
+from application_manager.core.objects.following import ANNOTATION, behind, fingerprint, selectors
 
 FILE = Path(__file__).parents[2] / "examples" / "live-configuration" / "follow.py"
 

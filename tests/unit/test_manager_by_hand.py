@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.byhand import HOLD_ANNOTATION, PAUSE_ANNOTATION, aspects, is_held, is_paused
 from application_manager.core.conditions import Aspect
-from application_manager.core.demand import Decision, Standing, demand
-from application_manager.core.status import instance_status
+from application_manager.core.demand.byhand import HOLD_ANNOTATION, PAUSE_ANNOTATION, aspects, is_held, is_paused
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.demand.demand import Standing, demand
+from application_manager.core.statuses.status import instance_status
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus

@@ -8,17 +8,17 @@ from typing import Any
 
 from kubernetes.aio.client import Configuration
 
-from application_manager.client import LEASES, ApiError, Client, Resource
-from application_manager.core.leases import (
+from application_manager.cluster.client import LEASES, ApiError, Client, Resource
+from application_manager.cluster.store import Entry
+from application_manager.core.holders.leases import (
     RAREST_LOOK,
     HealthyTime,
     LeaseBook,
     LeaseView,
 )
-from application_manager.core.policy import Policy
-from application_manager.leasewatch import LeaseWatch
-from application_manager.store import Entry
-from application_manager.world import World
+from application_manager.core.objects.policy import Policy
+from application_manager.knowledge.world import World
+from application_manager.watching.leasewatch import LeaseWatch
 from tests.unit.manager_objects import task, template
 from wayside.leases import DEFAULT_DURATION, lease_name
 

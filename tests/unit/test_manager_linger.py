@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from application_manager.core.demand import Decision
-from application_manager.core.policy import Policy
-from application_manager.store import Entry
-from application_manager.world import INSTANCE, World
+from application_manager.cluster.store import Entry
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.objects.policy import Policy
+from application_manager.knowledge.world import INSTANCE, World
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.base import API_VERSION

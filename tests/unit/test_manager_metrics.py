@@ -5,23 +5,26 @@ from __future__ import annotations
 import asyncio
 import re
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import aiohttp
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from application_manager.client import ApiError
-from application_manager.connection import ConfigurationError
-from application_manager.core.limiting import BURST, REFILL, Allowance
-from application_manager.core.policy import Policy
+from application_manager.cluster.client import ApiError
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.core.objects.policy import Policy
+from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
+from application_manager.knowledge.world import World
 from application_manager.measures import PREFIX, Measures
-from application_manager.overview import Overview
-from application_manager.pages import STALLED_AFTER, pages, stalled
-from application_manager.recorder import Reason
-from application_manager.workqueue import WorkQueue
-from application_manager.world import World
+from application_manager.observability.overview import Overview
+from application_manager.observability.pages import STALLED_AFTER, pages, stalled
+from application_manager.observability.tracing import LostSpans
+from application_manager.work.recorder import Reason
+from application_manager.work.workqueue import WorkQueue
 from tests.unit.manager_objects import instance, task, template
+from wayside.tracing import Tracing
 
 GUIDE = Path("docs/manager.md").read_text()
 
@@ -144,6 +147,7 @@ def test_an_object_that_changes_all_the_time_is_told_of_now_and_then() -> None:
 def test_the_guide_describes_every_metric() -> None:
     measures = Measures()
     measures.registry.register(Overview(World(Policy()), list))
+    measures.registry.register(LostSpans(cast("Tracing", SimpleNamespace(dropped=0, failed=0))))
     names = {each.name + ("_total" if each.type == "counter" else "") for each in measures.registry.collect()}
     own = {each.removeprefix(PREFIX) for each in names if each.startswith(PREFIX)}
     assert len(own) > 12

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from application_manager.connection import ConfigurationError
-from application_manager.publishing import Publisher, key_of, settings
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.work.publishing import Publisher, key_of, settings
+from tests.networks import PATIENCE, router, wait_for
 from tests.ports import free_endpoint, free_port
-from tests.unit.networks import PATIENCE, router, wait_for
 
 NAME = ("site", "fusion")
 KEY = "wayside/instances/site/fusion/configuration"

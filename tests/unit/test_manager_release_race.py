@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 from typing import Any, cast
 
-from application_manager.apply import Applier
-from application_manager.client import Client, Resource
-from application_manager.core.policy import Policy
-from application_manager.instances import InstanceWork
-from application_manager.recorder import Recorder
-from application_manager.store import Entry, Name
-from application_manager.suspending import Suspending
-from application_manager.world import INSTANCE, World
+from application_manager.cluster.apply import Applier
+from application_manager.cluster.client import Client, Resource
+from application_manager.cluster.store import Entry, Name
+from application_manager.core.objects.policy import Policy
+from application_manager.knowledge.world import INSTANCE, World
+from application_manager.work.instances import InstanceWork
+from application_manager.work.recorder import Recorder
+from application_manager.work.suspending import Suspending
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api.base import API_VERSION
 

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from kubernetes.aio.client import Configuration
 
-from application_manager.client import Client, Resource
-from application_manager.core.policy import Policy
-from application_manager.core.rulestatus import detector_status, rule_status
-from application_manager.recorder import Recorder
-from application_manager.rulework import RuleWork
-from application_manager.world import World
+from application_manager.cluster.client import Client, Resource
+from application_manager.core.objects.policy import Policy
+from application_manager.core.statuses.rulestatus import detector_status, rule_status
+from application_manager.knowledge.world import World
+from application_manager.work.recorder import Recorder
+from application_manager.work.rulework import RuleWork
 from tests.unit.manager_objects import NOW
 from wayside.api import API_VERSION, Detector, EventRule
 
@@ -131,6 +131,12 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
     (condition,) = status["conditions"]
     assert (condition["status"], condition["reason"], condition["observedGeneration"]) == ("False", reason, 2)
     assert "spec.odd: there is no such field" in condition["message"]
+
+
+def test_what_may_go_wrong_with_a_good_rule_is_said_and_it_stays_accepted() -> None:
+    (condition,) = rule_status(rule(), [detector()], NOW, remarks=["there is no template"]).conditions
+    assert condition.status == "True"
+    assert condition.message.endswith("; but there is no template")
 
 
 def test_the_same_state_gives_the_same_status() -> None:

@@ -7,8 +7,8 @@ import logging
 
 import pytest
 
-from application_manager.client import ApiError, Unreachable
-from application_manager.starting import until_answered
+from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.cluster.starting import until_answered
 
 
 def asked(*failures: Exception) -> str:

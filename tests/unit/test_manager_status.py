@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from application_manager.claimbook import ClaimBook
+from application_manager.cluster.store import Entry
+from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import Aspect, changed, updated
-from application_manager.core.operations import Standing, Verdict
-from application_manager.core.status import Service, difference, finished_since, task_status
-from application_manager.store import Entry
+from application_manager.core.statuses.status import Service, difference, finished_since, task_status
+from application_manager.knowledge.claimbook import ClaimBook
 from tests.unit.manager_objects import NOW, task, template
 from wayside.api.applicationtask import TaskPhase
 from wayside.times import format_seconds, parse_seconds

@@ -9,9 +9,9 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from application_manager import workqueue
-from application_manager.client import ApiError, Unreachable
-from application_manager.workqueue import WorkQueue
+from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.work import workqueue
+from application_manager.work.workqueue import WorkQueue
 
 
 @asynccontextmanager
@@ -160,3 +160,32 @@ async def test_a_queue_that_comes_after_another_waits_while_that_has_work() -> N
     async with running(before, after):
         await finished.wait()
     assert done.index("words") >= 2
+
+
+@in_a_loop
+async def test_a_worker_whose_cancellation_is_lost_to_an_error_ends_all_the_same() -> None:
+    begun = asyncio.Event()
+    times = 0
+
+    async def part() -> None:
+        begun.set()
+        await asyncio.sleep(0)
+        raise Unreachable("gone")
+
+    async def work(_: str) -> None:
+        nonlocal times
+        times += 1
+        try:
+            await asyncio.gather(part(), asyncio.sleep(60))
+        except asyncio.CancelledError:
+            raise Unreachable("gone") from None  # as gather does where a part fails at that very moment
+
+    queue = WorkQueue("q", work, 1)
+    queue.add("a")
+    queue.add("b")
+    running = asyncio.create_task(queue.run())
+    await begun.wait()
+    running.cancel()
+    await asyncio.wait({running}, timeout=60)
+    assert running.cancelled()
+    assert times == 1

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from application_manager.core.claims import claim
+from application_manager.core.claims.claims import claim
+from application_manager.core.claims.merging import Contribution, merge
 from application_manager.core.conditions import Aspect
-from application_manager.core.demand import demand
-from application_manager.core.merging import Contribution, merge
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer, RenderError
-from application_manager.core.status import instance_status
+from application_manager.core.demand.demand import demand
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, RenderError
+from application_manager.core.statuses.status import instance_status
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api.parameter import Parameter
 

@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from application_manager.core.claims import instance_name
-from application_manager.core.demand import Decision, Outcome, demand
-from application_manager.core.drafting import draft
-from application_manager.core.leases import LeaseView
-from application_manager.core.operations import Standing
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer, RenderError
+from application_manager.core.claims.claims import instance_name
+from application_manager.core.claims.operations import Standing
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.drafting import draft
+from application_manager.core.holders.leases import LeaseView
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, RenderError
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.labelling import INSTANCE_LABEL
-from application_manager.core.pods import Trouble, TroubleReason, summary, trouble
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer
-from application_manager.podbook import PodBook
+from application_manager.core.health.pods import Trouble, TroubleReason, summary, trouble
+from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer
+from application_manager.knowledge.podbook import PodBook
 from tests.unit.manager_objects import DEPLOYMENT, instance, template
 
 CAUSE = 'failed to resolve reference "app:1": app:1: not found'

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.readiness import not_ready
+from application_manager.core.health.readiness import not_ready
 
 
 def judged(kind: str, status: dict[str, Any] | None = None, generation: int = 0, **spec: Any) -> str | None:

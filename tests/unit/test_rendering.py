@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer, RenderError, owned
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, RenderError, owned
 from tests.unit.manager_objects import DEPLOYMENT, instance, template
 
 CONFIG: dict[str, Any] = {

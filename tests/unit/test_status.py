@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import msgspec
 import pytest
+from rich.console import Console
 
 from detector.assembly import Refusal
 from detector.engine.samples.intake import Intake
@@ -15,7 +18,7 @@ from detector.inquiry import inquire
 from detector.losses import Losses
 from detector.status.explaining import Watching
 from detector.status.keeping import StatusKeeper
-from detector.status.model import Explanation, RuleState, Status, read_status, to_json
+from detector.status.model import CertificateStatus, Explanation, RuleState, Status, read_status, to_json
 from detector.status.table import status_view
 from detector.streams.answering import Answering
 from detector.streams.asking import NoAnswerError, ask
@@ -250,3 +253,25 @@ def test_a_rule_that_is_gone_is_watched_no_more_and_one_at_a_time() -> None:
     assert watching.future.result(0).subjects == []
     with pytest.raises(ValueError, match="rule fast is not evaluated"):
         Watching(drive.engine, "fast", None)
+
+
+def test_the_status_names_what_is_demanded_and_who_is_missing() -> None:
+    detector = a_detector(
+        clients=[{"name": "rsu-1", "expected": True}, {"name": "rsu-2", "expected": True}], clientTimeout="4s"
+    )
+    kept = Kept(Drive(detector, FAST))
+    kept.keeper.demands = ("fast-b", "fast-a")
+    status = kept.take(arrival(0.5, "rsu-1", {"v": 20}), until=1)
+    assert (status.demands, status.demand_count, status.missing) == (["fast-a", "fast-b"], 2, [])
+    status = kept.take(arrival(9.5, "rsu-1", {"v": 20}), until=10)
+    assert (status.missing, status.missing_count) == (["rsu-2"], 1)
+    shown = Console(width=160, file=io.StringIO(), record=True)
+    told = msgspec.structs.replace(
+        status, certificate=CertificateStatus(expires=status.taken + 90 * 86400, renewals=2, problem="expired")
+    )
+    shown.print(status_view(told))
+    text = shown.export_text()
+    assert "certificate expires in 90.0 days, renewed 2 times" in text
+    assert "new certificates are not used: expired" in text
+    assert "demands: fast-a, fast-b" in text
+    assert "missing: rsu-2" in text

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.demand import demand
-from application_manager.core.operations import Standing, Verdict
-from application_manager.core.policy import Policy
-from application_manager.core.rendering import Renderer
-from application_manager.core.status import Service, suspension_aspect, task_status, together
+from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.demand.demand import demand
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer
+from application_manager.core.statuses.status import Service, suspension_aspect, task_status, together
 from tests.unit.manager_objects import DEPLOYMENT, NOW, instance, task, template
 from wayside.api import ApplicationInstance
 

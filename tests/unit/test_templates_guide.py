@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from application_manager.core.policy import Policy
-from application_manager.offline import render_objects
+from application_manager.commands.offline import render_objects
+from application_manager.core.objects.policy import Policy
 from detector.engine.episodes.demands import to_task
 from tests.unit.driving import Drive, a_detector, a_stream, arrival
 from tests.unit.manager_objects import NOW

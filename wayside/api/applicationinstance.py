@@ -111,7 +111,8 @@ class ApplicationInstanceStatus(Model):
         "Applied: all objects are as the template says. Ready: its workloads are ready. Capped: a merged Sum is held "
         "Applied: all objects are as the template says. Ready: its workloads are ready. Capped: a merged Sum is held "
         "at its parameter's bound. Suspended: its workloads are at zero. Paused, Held: a person wants it left as it is "
-        "(annotation wayside.dev/pause), or kept without demand (wayside.dev/hold)."
+        "(annotation wayside.dev/pause), or kept without demand (wayside.dev/hold). TimedOut: it was not ready for its "
+        "template's readyTimeout. StandsIn: it serves tasks of instances that are."
     )
 
 

@@ -15,6 +15,8 @@ from wayside.api.base import (
     JsonValue,
     Kind,
     Model,
+    PositiveDuration,
+    TemplateName,
     conditions_field,
     validations,
 )
@@ -40,15 +42,48 @@ class OnDetectorLoss(Model):
     )
 
 
+class FallbackTemplate(Model):
+    """What serves where an application does not become ready."""
+
+    template: TemplateName = Field(description="An ApplicationTemplate of the same namespace, and another one.")
+
+
+FALLBACK_WITHOUT_TIMEOUT = (
+    "fallback needs readyTimeout, which says when an instance counts as not becoming ready: give it, e.g. 60s"
+)
+
+
 class Lifecycle(Model):
     """How long instances live."""
+
+    model_config = validations(("!has(self.fallback) || has(self.readyTimeout)", FALLBACK_WITHOUT_TIMEOUT))
 
     linger: Duration = Field(
         default=Duration("30s"), description="How long an instance stays after its last demand has ended."
     )
+    minimum_uptime: Duration = Field(
+        default=Duration("0s"),
+        description="How long an instance stays at least, from its creation: neither released nor preempted before.",
+    )
+    ready_timeout: PositiveDuration | None = Field(
+        default=None,
+        description="How long an instance may be not ready in one go; then its condition TimedOut is True, until it "
+        "was ready for as long. Absent: any time.",
+    )
+    fallback: FallbackTemplate | None = Field(
+        default=None,
+        description="What serves the tasks of an instance that is beyond its readyTimeout, until it is ready again. It "
+        "gets those of their parameters that it has.",
+    )
     on_detector_loss: OnDetectorLoss = Field(
         default=OnDetectorLoss(), description="What becomes of demands whose holder's Lease lapsed."
     )
+
+    @model_validator(mode="after")
+    def _fallback_has_its_time(self) -> Lifecycle:
+        if self.fallback is not None and self.ready_timeout is None:
+            raise ValueError(FALLBACK_WITHOUT_TIMEOUT)
+        return self
 
 
 BASELINE_WITH_KEY = (
@@ -98,6 +133,13 @@ class ApplicationTemplateSpec(Model):
         default=None,
         description="One instance that runs always, also without tasks. Not with a key: a rule with when: true then "
         "says which instances run.",
+    )
+    max_instances: int | None = Field(
+        default=None,
+        ge=1,
+        le=100_000,
+        description="How many instances there may be at once; further demands wait, or preempt what has a lower "
+        "priority. Absent: any number.",
     )
     lifecycle: Lifecycle = Field(default=Lifecycle(), description="How long instances live.")
     configuration: dict[FileName, JsonValue] = Field(
@@ -167,15 +209,21 @@ class ApplicationTemplate(Kind):
     printer_columns: ClassVar[list[dict[str, str]]] = [
         {"name": "Key", "type": "string", "jsonPath": ".spec.key"},
         {"name": "Instances", "type": "integer", "jsonPath": ".status.instances"},
+        {"name": "Max", "type": "integer", "jsonPath": ".spec.maxInstances"},
         {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
-        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].message'},
+        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},
     ]
     object_validations: ClassVar[list[dict[str, str]]] = [
         {
             "rule": "has(self.spec.key) == has(oldSelf.spec.key)"
             " && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
             "message": "spec.key is immutable, also in being there: make a template of another name instead",
+        },
+        {
+            "rule": "!has(self.spec.lifecycle) || !has(self.spec.lifecycle.fallback)"
+            " || self.spec.lifecycle.fallback.template != self.metadata.name",
+            "message": "spec.lifecycle.fallback.template is this template itself: name another",
         },
     ]
 

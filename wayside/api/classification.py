@@ -1,127 +1,39 @@
-"""The classification of event-detection use cases: 13 dimensions, 39 characteristic values.
-
-The scheme is that of Table 1 of Reiher et al., "Event Detection in C-ITS: Classification, Use Cases, and
-Reference Implementation". A use case may fall on several values of one dimension, so each is a list.
-"""
+"""Where a rule's use case stands in the scheme: in each dimension on one value, or on several."""
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
+from pydantic.alias_generators import to_snake
 
 from wayside.api.base import Model
+from wayside.api.scheme import (
+    SCHEME,
+    ActingEntity,
+    AffectedEntity,
+    DataSourceEntity,
+    DetectionAlgorithm,
+    Dimension,
+    EventDetectionEntity,
+    Incidence,
+    NumberOfParticipants,
+    ObservationPeriod,
+    OverarchingPurpose,
+    ScopeOfImpact,
+    TimeSensitivity,
+    TypeOfAction,
+    TypeOfParticipants,
+    Value,
+)
+
+_DESCRIPTIONS = {dimension.values: dimension.described() for dimension in SCHEME}
 
 
-class OverarchingPurpose(StrEnum):
-    """The goal that the use case serves."""
-
-    SAFETY = "Safety"
-    EFFICIENCY = "Efficiency"
-    USER_SATISFACTION = "UserSatisfaction"
-
-
-class TypeOfParticipants(StrEnum):
-    """What kinds of entity take part in the processing of the data."""
-
-    VEHICLE = "Vehicle"
-    VRU = "VRU"
-    ROAD_INFRASTRUCTURE = "RoadInfrastructure"
-    REMOTE_INFRASTRUCTURE = "RemoteInfrastructure"
-
-
-class NumberOfParticipants(StrEnum):
-    """How many entities take part."""
-
-    ONE = "One"
-    TWO = "Two"
-    MULTIPLE = "Multiple"
-
-
-class DataSourceEntity(StrEnum):
-    """Who first produces the data: the entity whose state changes, or another."""
-
-    EVENT_SOURCE_ENTITY = "EventSourceEntity"
-    EXTERNAL = "External"
-
-
-class EventDetectionEntity(StrEnum):
-    """Who detects the event in the data."""
-
-    EVENT_SOURCE_ENTITY = "EventSourceEntity"
-    DATA_SOURCE_ENTITY = "DataSourceEntity"
-    EXTERNAL = "External"
-
-
-class ActingEntity(StrEnum):
-    """Who carries out the action."""
-
-    EVENT_DETECTION_ENTITY = "EventDetectionEntity"
-    EXTERNAL = "External"
-
-
-class AffectedEntity(StrEnum):
-    """Whom the action directly affects."""
-
-    ACTING_ENTITY = "ActingEntity"
-    EXTERNAL = "External"
-
-
-class ScopeOfImpact(StrEnum):
-    """How far the consequences of the action reach."""
-
-    PARTICIPANT = "Participant"
-    ENVIRONMENT = "Environment"
-    BEYOND_ENVIRONMENT = "BeyondEnvironment"
-
-
-class ObservationPeriod(StrEnum):
-    """How much time the data must cover: one sample, seconds to minutes, or hours and longer."""
-
-    IMMEDIATE = "Immediate"
-    SHORT_TERM = "ShortTerm"
-    LONG_TERM = "LongTerm"
-
-
-class TimeSensitivity(StrEnum):
-    """How soon the action shows its consequences: at once, in seconds to minutes, or in hours and later."""
-
-    IMMEDIATE = "Immediate"
-    SHORT_TERM = "ShortTerm"
-    LONG_TERM = "LongTerm"
-
-
-class Incidence(StrEnum):
-    """How often the event and its action occur."""
-
-    FREQUENT = "Frequent"
-    COMMON = "Common"
-    RARE = "Rare"
-    UNEXPECTED = "Unexpected"
-
-
-class DetectionAlgorithm(StrEnum):
-    """Whether rules or a learned model detect the event."""
-
-    RULE_BASED = "RuleBased"
-    LEARNING_BASED = "LearningBased"
-
-
-class TypeOfAction(StrEnum):
-    """What the action does."""
-
-    DATA_COLLECTION = "DataCollection"
-    RECONFIGURATION = "Reconfiguration"
-    DEPLOYMENT = "Deployment"
-    NOTIFICATION = "Notification"
-    OTHER = "Other"
-
-
-def _dimension(values: type[StrEnum]) -> Any:
+def _dimension(values: type[Value]) -> Any:
     return Field(
         default_factory=list,
-        description=values.__doc__,
+        description=_DESCRIPTIONS[values],
         max_length=len(values),
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
@@ -144,6 +56,19 @@ class Classification(Model):
     detection_algorithm: list[DetectionAlgorithm] = _dimension(DetectionAlgorithm)
     type_of_action: list[TypeOfAction] = _dimension(TypeOfAction)
 
+    @field_validator("*")
+    @classmethod
+    def _once(cls, values: list[Value]) -> list[Value]:
+        twice = [value for value in values if values.count(value) > 1]
+        if twice:
+            raise ValueError(f"{twice[0].value} is given twice: remove one")
+        return values
+
     def to_json(self) -> dict[str, Any]:
         """The dimensions that have a value; empty ones are left out."""
         return {dimension: values for dimension, values in super().to_json().items() if values}
+
+    def values_of(self, dimension: Dimension) -> list[Value]:
+        """The values in a dimension of the scheme, in the order in which they are written."""
+        values: list[Value] = getattr(self, to_snake(dimension.name))
+        return values

@@ -18,9 +18,11 @@ from wayside.api.base import (
     PositiveDuration,
     PositiveQuantity,
     conditions_field,
+    validations,
 )
 from wayside.api.constants import Constants
 from wayside.api.database import Database
+from wayside.api.pod import DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
 from wayside.api.source import DataSource
 from wayside.api.stream import (
@@ -90,9 +92,47 @@ class RuleSelector(Model):
         return all(labels.get(key) == value for key, value in self.match_labels.items())
 
 
+_POD_WITHOUT_MODE = "pod says nothing without a mode: give mode Standalone or Sidecar, or remove pod"
+_ACCOUNTS_WITHOUT_SIDECAR = "serviceAccountNames says nothing without mode Sidecar: give it, or remove the names"
+_SIDECAR_ON_NODES = (
+    "pod.nodeSelector and pod.tolerations: with mode Sidecar the detector runs where the pod does that it is in: "
+    "remove them"
+)
+
+
 class DetectorSpec(Model):
     """Streams, buffer, time and rules of a detector."""
 
+    model_config = validations(
+        ("has(self.mode) || !has(self.pod)", _POD_WITHOUT_MODE),
+        (
+            "!has(self.serviceAccountNames) || (has(self.mode) && self.mode == 'Sidecar')",
+            _ACCOUNTS_WITHOUT_SIDECAR,
+        ),
+        (
+            "!has(self.mode) || self.mode != 'Sidecar' || !has(self.pod) || "
+            "!(has(self.pod.nodeSelector) || has(self.pod.tolerations))",
+            _SIDECAR_ON_NODES,
+        ),
+    )
+
+    mode: DetectorMode | None = Field(
+        default=None,
+        description="Standalone: the application manager runs the detector, as a Deployment of this namespace. "
+        "Sidecar: it puts the detector into the pods of this namespace that are labelled wayside.dev/detector: <name>. "
+        "Default: somebody else runs it.",
+    )
+    pod: DetectorPod | None = Field(
+        default=None,
+        description="With a mode: the detector's pod, or its container in others' pods. Default: all of its defaults.",
+    )
+    service_account_names: list[ObjectName] | None = Field(
+        default=None,
+        max_length=64,
+        description="With mode Sidecar: the service accounts whose pods may run it. They, and no others, get the "
+        "rights of this detector.",
+        json_schema_extra={"x-kubernetes-list-type": "set"},
+    )
     zenoh: Zenoh = Field(default=Zenoh(), description="The Zenoh session.")
     sources: list[DataSource] = Field(
         default_factory=list,
@@ -169,6 +209,51 @@ class DetectorSpec(Model):
         return self
 
     @model_validator(mode="after")
+    def _accounts(self) -> DetectorSpec:
+        names = self.service_account_names
+        if names is None:
+            return self
+        if self.mode is not DetectorMode.SIDECAR:
+            raise ValueError(_ACCOUNTS_WITHOUT_SIDECAR)
+        twice = sorted({each for each in names if names.count(each) > 1})
+        if twice:
+            raise ValueError(f"serviceAccountNames: {twice[0]} is given twice: give it once")
+        return self
+
+    @model_validator(mode="after")
+    def _in_a_pod(self) -> DetectorSpec:
+        if self.mode is None:
+            if self.pod is not None:
+                raise ValueError(_POD_WITHOUT_MODE)
+            return self
+        if (
+            self.mode is DetectorMode.SIDECAR
+            and self.pod is not None
+            and (self.pod.node_selector or self.pod.tolerations)
+        ):
+            raise ValueError(_SIDECAR_ON_NODES)
+        for field, path in self.folders.items():
+            if not path.startswith("/") or path.strip("/") == "" or ":" in path or ".." in path.split("/"):
+                raise ValueError(
+                    f"{field}: {path!r} is no folder for a volume: in a pod, give an absolute path without .. and :, "
+                    "such as /var/lib/wayside"
+                )
+        return self
+
+    @property
+    def folders(self) -> dict[str, str]:
+        """The folders that the detector writes to, by their fields."""
+        database = self.database
+        spool, files = (None, None) if database is None else (database.spool, database.files)
+        given = {
+            "state.path": self.state,
+            "recordings.path": self.recordings,
+            "database.spool.path": spool,
+            "database.files.path": files,
+        }
+        return {field: each.path for field, each in given.items() if each is not None}
+
+    @model_validator(mode="after")
     def _streams_on_request(self) -> DetectorSpec:
         allowed = None if self.recordings is None else self.recordings.on_request
         for name in (allowed.streams or ()) if allowed is not None else ():
@@ -197,7 +282,9 @@ class DetectorStatus(Model):
 
     observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
     rules: int = Field(default=0, description="How many EventRules it selects.")
-    conditions: list[Condition] = conditions_field("Accepted: whether the detector can run.")
+    conditions: list[Condition] = conditions_field(
+        "Accepted: whether the detector can run. Running, with a mode: whether it does, and if not, why."
+    )
 
 
 class Detector(Kind):
@@ -209,8 +296,9 @@ class Detector(Kind):
         {"name": "Clock", "type": "string", "jsonPath": ".spec.clock"},
         {"name": "Rules", "type": "integer", "jsonPath": ".status.rules"},
         {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
+        {"name": "Running", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Running")].status'},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
-        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].message'},
+        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},
     ]
 
     kind: str = "Detector"

@@ -39,8 +39,15 @@ class Problem:
     message: str
 
     def __str__(self) -> str:
+        return self._said("")
+
+    def as_warning(self) -> str:
+        """The same for what is doubtful, not wrong."""
+        return self._said("warning: ")
+
+    def _said(self, how: str) -> str:
         where = f"{self.file}:{self.line}:{self.column}: " if self.line else f"{self.file}: "
-        return where + (f"{self.field}: " if self.field else "") + self.message
+        return where + how + (f"{self.field}: " if self.field else "") + self.message
 
 
 class DocumentError(Exception):

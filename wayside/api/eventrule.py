@@ -229,7 +229,7 @@ class EventRule(Kind):
         {"name": "Detectors", "type": "string", "jsonPath": ".status.detectors"},
         {"name": "When", "type": "string", "jsonPath": ".spec.when"},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
-        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].message'},
+        {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},
     ]
 
     kind: str = "EventRule"

@@ -24,6 +24,7 @@ from wayside.expressions.errors import EvaluationError, ExpressionError, positio
 from wayside.expressions.failures import clean, says_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import settle
+from wayside.expressions.growth import MOST, growth
 from wayside.expressions.handles import begin, end, value_of
 from wayside.expressions.numbers import MAX_EXACT, doubled
 from wayside.expressions.projection import Leaf, missing_path, normalise, project, tree
@@ -77,6 +78,9 @@ _RESERVED: Final = (
 )
 
 
+_SMALLER: Final = "a loop within a loop multiplies what it joins with `+`: join less"
+
+
 class Environment:
     """The variables that expressions may use. Immutable; compiled expressions are cached."""
 
@@ -116,11 +120,16 @@ class Environment:
         rewritten = doubled(source)
         try:
             program = self._env.compile(rewritten.text)
-            read, leaves = self._reads(parse(program.serialize()))
+            parsed = parse(program.serialize())
+            read, leaves = self._reads(parsed)
             # `has(a.b)` asks for a member of a map: with `a.b` a variable of its own it would not be a question.
             typed = program if self._typed is None or "has(" in rewritten.text else self._typed.compile(rewritten.text)
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
             raise diagnose(str(error), source, rewritten, self.variables) from None
+        if growth(parsed) > MOST:
+            raise ExpressionError(
+                f"a value in it would hold more than {MOST} copies of others", source=source, hint=_SMALLER
+            )
         _check_static(typed.return_type(), result, source)
         expression = Expression(source, program, read, leaves, result)
         if len(self._cache) >= _CACHE_SIZE:

@@ -1,5 +1,6 @@
 """Rules, checked and compiled against a Detector: the manager reports what is wrong, the engine runs what is right."""
 
+from wayside.rules.alone import own_problems
 from wayside.rules.compiled import (
     ClientSubject,
     CompiledAction,
@@ -47,6 +48,7 @@ __all__ = [
     "depends",
     "episode_stream",
     "in_order",
+    "own_problems",
     "source_problems",
     "stream_problems",
     "unknown_rules",

@@ -30,6 +30,7 @@ from detector.actions.deploy.stores import (
 )
 from detector.cluster.backoff import Backoff
 from detector.engine.episodes.demands import Demand, plain, to_task
+from detector.tracing import EpisodeTraces
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +64,7 @@ class DemandReconciler:
         now: Callable[[], int] = time.time_ns,
         concurrency: int = 16,
         permitted: asyncio.Event | None = None,
+        traces: EpisodeTraces | None = None,
     ) -> None:
         """Prepare.
 
@@ -71,7 +73,9 @@ class DemandReconciler:
             now: nanoseconds since the epoch: when a task ends whose demand is gone and nobody says since when.
             concurrency: how many tasks are changed at the same time; the changes of one task are always in order.
             permitted: nothing is changed while this is not set, e.g. `HolderLease.held`. Default: always permitted.
+            traces: told of the tasks that were created.
         """
+        self._traces = traces
         self._store = store
         self._now = now
         self._slots = asyncio.Semaphore(concurrency)
@@ -203,8 +207,9 @@ class DemandReconciler:
                     raise
 
     async def _create(self, name: str, demand: Demand) -> None:
+        began = self._now()
         try:
-            task = to_task(demand)
+            task = to_task(demand) if self._traces is None else self._traces.task(demand, to_task(demand))
         except ValueError as error:
             raise TaskRefusedError("Invalid", f"the demand makes no ApplicationTask: {error}") from error
         deleted = name in self._ledger.held
@@ -223,6 +228,8 @@ class DemandReconciler:
                 _log.info("created the task %s again, since somebody deleted it", name)
             else:
                 self.counts.created += 1
+            if self._traces is not None and not deleted:
+                self._traces.created(demand, began)
 
     async def _change(self, step: Step, name: str, demand: Demand | None, stored: StoredTask) -> None:
         if step is Step.END:

@@ -82,6 +82,15 @@ class Clients:
             presence.since = min(presence.since, time)
             presence.last = time
 
+    def missing(self, now: int) -> list[str]:
+        """The expected clients that would be lost if they were not expected, by name; `now` in nanoseconds."""
+        present = self._present
+        return [
+            name
+            for name in sorted(self._expected)
+            if now - present[name].last > self._timeout and not self.tokens.hold(name)
+        ]
+
     def since(self, client: str) -> int:
         """Since when the client is known, in nanoseconds since the epoch."""
         return self._present[client].since

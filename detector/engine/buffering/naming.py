@@ -13,8 +13,8 @@ from detector.engine.samples.sample import DecodeError, Decoder
 from wayside.expressions import CompiledTemplate, InterpolationError
 from wayside.rules import CompiledStream
 
-CLIENT_NAME = re.compile(r"[A-Za-z0-9._:-]{1,63}")
-"""What a client's name is made of."""
+CLIENT_NAME = re.compile(r"(?!\.*$)[A-Za-z0-9._:-]{1,63}")
+"""What a client's name is made of. Dots alone are none: they would be a way out of a folder or of a URL's path."""
 
 
 class MessageClients:
@@ -47,7 +47,9 @@ class MessageClients:
             return None
         name = rendered if isinstance(rendered, str) else None if rendered is None else str(rendered)
         if name is None or not CLIENT_NAME.fullmatch(name):
-            self._unnamed(stream, f"{key}: client: {name!r} is no name: it takes 1 to 63 of A-Z a-z 0-9 . _ : -")
+            self._unnamed(
+                stream, f"{key}: client: {name!r} is no name: it takes 1 to 63 of A-Z a-z 0-9 . _ : -, not dots alone"
+            )
             return None
         return name
 

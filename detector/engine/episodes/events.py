@@ -43,6 +43,9 @@ class Event:
     rendered: Mapping[str, Rendered] = field(default_factory=dict)
     """Of a start: what is rendered for the actions, by their names. It is for them alone."""
 
+    traceparent: str | None = None
+    """Where the episode stands in a trace; None where traces are off. The engine knows nothing of it."""
+
     @property
     def started(self) -> bool:
         """Whether the episode started; else it ended."""
@@ -82,6 +85,7 @@ class Event:
             "subject": self.subject,
             "time": format_time(time),
             "datacontenttype": "application/json",
+            **({} if self.traceparent is None else {"traceparent": self.traceparent}),
             "data": data,
         }
 

@@ -55,7 +55,7 @@ def publish(
         UnreachableError: no session could be opened within wait_s.
     """
     stop = stop or threading.Event()
-    with _open(connect, listen, wait_s) as session:
+    with open_session(connect, listen, wait_s) as session:
         publishers = {
             key: session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP) for key in keys()
         }
@@ -88,7 +88,8 @@ def _has_listener(publisher: zenoh.Publisher) -> bool:
     return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]  # zenoh's stub takes it for a bool
 
 
-def _open(connect: Sequence[str], listen: Sequence[str], wait_s: float) -> zenoh.Session:
+def open_session(connect: Sequence[str], listen: Sequence[str], wait_s: float) -> zenoh.Session:
+    """A session with these endpoints. Raises UnreachableError where there is none within `wait_s` seconds."""
     config = zenoh.Config()
     settings = {
         "mode": "peer",

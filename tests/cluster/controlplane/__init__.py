@@ -26,6 +26,7 @@ from tests.cluster.binaries import Binaries, ensure_binaries
 from tests.cluster.children import Child, remove_afterwards
 from tests.cluster.controlplane import commands
 from tests.cluster.controlplane.kubeconfig import new_token, write_kubeconfig
+from tests.cluster.controlplane.site import LOOPBACK, Site
 from tests.cluster.crds import apply_crds
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_ports
@@ -44,8 +45,8 @@ class ControlPlane:
         started_in: seconds that each program took to be ready.
     """
 
-    def __init__(self, binaries: Binaries | None = None, crds: Path | None = None):
-        """Prepare; nothing runs yet. `crds`: the folder to install CRDs from."""
+    def __init__(self, binaries: Binaries | None = None, crds: Path | None = None, site: Site = LOOPBACK):
+        """Prepare; nothing runs yet. `crds`: the folder to install CRDs from; `site`: where it is to run."""
         self.binaries = binaries or ensure_binaries()
         self.crds = crds
         self.folder = Path(tempfile.mkdtemp(prefix="wayside-controlplane-"))
@@ -54,7 +55,7 @@ class ControlPlane:
         self.refused_crds: Mapping[str, ApiError] = {}
         self.started_in: dict[str, float] = {}
         etcd_port, etcd_peer_port, api_port = free_ports(3)
-        self._setup = commands.Setup(self.binaries, self.folder, etcd_port, etcd_peer_port, api_port)
+        self._setup = commands.Setup(self.binaries, self.folder, etcd_port, etcd_peer_port, api_port, site)
         self._token = new_token()
         self._etcd: Child | None = None
         self._api_server: Child | None = None
@@ -63,7 +64,7 @@ class ControlPlane:
     @property
     def url(self) -> str:
         """Where the API server listens; the same after a restart."""
-        return f"https://127.0.0.1:{self._setup.api_port}"
+        return f"https://{self._setup.site.address}:{self._setup.api_port}"
 
     def api(self, namespace: str = "default") -> Api:
         """Return an administrator's client whose default namespace is `namespace`."""
@@ -96,7 +97,10 @@ class ControlPlane:
 
     def _start_etcd(self) -> Child:
         # Not waited for: the API server does so itself, and starts loading meanwhile.
-        return Child("etcd", commands.etcd(self._setup), self.folder / "etcd.log")
+        return self._child("etcd", commands.etcd(self._setup))
+
+    def _child(self, name: str, command: list[str]) -> Child:
+        return Child(name, [*self._setup.site.enter, *command], self.folder / f"{name}.log")
 
     def start_api_server(self) -> None:
         """Start the API server, on the same port and data as before, and wait until it is ready.
@@ -105,8 +109,7 @@ class ControlPlane:
         after an outage of 20 s it took 49 s until a Deployment had pods. That is Kubernetes' matter, not what we test.
         """
         began = time.monotonic()
-        log = self.folder / "kube-apiserver.log"
-        child = self._api_server = Child("kube-apiserver", commands.kube_apiserver(self._setup), log)
+        child = self._api_server = self._child("kube-apiserver", commands.kube_apiserver(self._setup))
         self._wait(child, self._setup.serving_certificate.exists, "kube-apiserver has its certificate")
         write_kubeconfig(self.kubeconfig, self.url, self._setup.serving_certificate.read_bytes(), self._token)
         api = self.api()
@@ -141,9 +144,8 @@ class ControlPlane:
     def start_controller_manager(self) -> None:
         """Start the controller manager and wait until it serves a new namespace."""
         began = time.monotonic()
-        log = self.folder / "kube-controller-manager.log"
         command = commands.kube_controller_manager(self._setup)
-        child = self._controller_manager = Child("kube-controller-manager", command, log)
+        child = self._controller_manager = self._child("kube-controller-manager", command)
         probe = f"probe-{secrets.token_hex(3)}"
         api = self.api(probe)
         namespace = {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": probe}}

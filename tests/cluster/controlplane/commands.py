@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.cluster.binaries import Binaries
+from tests.cluster.controlplane.site import LOOPBACK, Site
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,7 @@ class Setup:
     etcd_port: int
     etcd_peer_port: int
     api_port: int
+    site: Site = LOOPBACK
 
     @property
     def serving_certificate(self) -> Path:
@@ -42,7 +44,9 @@ class Setup:
 def write_tokens(setup: Setup, administrator: str) -> None:
     """Write the file of those whom the API server lets in."""
     setup.tokens.touch(mode=0o600)
-    setup.tokens.write_text(f'{administrator},administrator,administrator,"system:masters"\n')
+    lines = [f'{administrator},administrator,administrator,"system:masters"']
+    lines += [f'{token},{user},{user},"{group}"' for user, group, token in setup.site.users]
+    setup.tokens.write_text("".join(f"{line}\n" for line in lines))
 
 
 def etcd(setup: Setup) -> list[str]:
@@ -67,8 +71,8 @@ def kube_apiserver(setup: Setup) -> list[str]:
     return [
         str(setup.binaries.kube_apiserver),
         f"--etcd-servers=http://127.0.0.1:{setup.etcd_port}",
-        "--bind-address=127.0.0.1",
-        "--advertise-address=127.0.0.1",
+        f"--bind-address={setup.site.address}",
+        f"--advertise-address={setup.site.address}",
         f"--secure-port={setup.api_port}",
         f"--cert-dir={setup.serving_certificate.parent}",
         f"--token-auth-file={setup.tokens}",
@@ -77,7 +81,7 @@ def kube_apiserver(setup: Setup) -> list[str]:
         f"--service-account-signing-key-file={setup.serving_key}",
         f"--service-account-key-file={setup.serving_key}",
         "--service-cluster-ip-range=10.96.0.0/16",
-        "--endpoint-reconciler-type=none",  # a Service `kubernetes` with a loopback address would be refused anyway
+        *setup.site.api_server,
     ]
 
 
@@ -100,11 +104,12 @@ CONTROLLERS = (
 
 
 def kube_controller_manager(setup: Setup) -> list[str]:
-    """Return the command line of kube-controller-manager: the controllers that work without nodes."""
+    """Return the command line of kube-controller-manager: without nodes, the controllers that work so."""
+    controllers = "*" if setup.site.runs_pods else ",".join(CONTROLLERS)
     return [
         str(setup.binaries.kube_controller_manager),
         f"--kubeconfig={setup.kubeconfig}",
-        f"--controllers={','.join(CONTROLLERS)}",
+        f"--controllers={controllers}",
         f"--root-ca-file={setup.serving_certificate}",
         "--horizontal-pod-autoscaler-sync-period=1s",  # 15 s by default, which tests would wait for
         "--leader-elect=false",  # it is alone, and a lease would delay its restart

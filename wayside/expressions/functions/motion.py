@@ -30,8 +30,9 @@ def time_to_contact(dx: float, dy: float, vx: float, vy: float, radius: float) -
     speed = math.hypot(vx, vy)
     if speed == 0:
         return math.inf
-    ahead = -(dx * (vx / speed) + dy * (vy / speed))  # metres to go to the nearest point
-    aside = abs(dx * (vy / speed) - dy * (vx / speed))  # metres apart, there
+    ux, uy = _direction(vx, vy)
+    ahead = -(dx * ux + dy * uy)  # metres to go to the nearest point
+    aside = abs(dx * uy - dy * ux)  # metres apart, there
     if ahead <= 0 or aside > radius:
         return math.inf
     reach = math.sqrt((radius - aside) * (radius + aside))
@@ -46,11 +47,18 @@ def closing(dx: float, dy: float, vx: float, vy: float) -> float:
 
 def closest_approach(dx: float, dy: float, vx: float, vy: float) -> float:
     """Metres at which two on straight ways will be nearest to each other, from now on."""
-    speed = math.hypot(vx, vy)
-    apart = math.hypot(dx, dy)
-    if speed == 0 or dx * (vx / speed) + dy * (vy / speed) >= 0:
-        return apart
-    return abs(dx * (vy / speed) - dy * (vx / speed))
+    if vx == vy == 0:
+        return math.hypot(dx, dy)
+    ux, uy = _direction(vx, vy)
+    return math.hypot(dx, dy) if dx * ux + dy * uy >= 0 else abs(dx * uy - dy * ux)
+
+
+def _direction(vx: float, vy: float) -> tuple[float, float]:
+    """The velocity's direction, of length 1. Scaled before, since the length of a tiny one is a rounded number."""
+    largest = max(abs(vx), abs(vy))
+    ux, uy = vx / largest, vy / largest
+    length = math.hypot(ux, uy)
+    return ux / length, uy / length
 
 
 FUNCTIONS = (

@@ -1,0 +1,40 @@
+# Both programs in one image: `detector` and `application-manager`. It has no entrypoint: a pod says which one it runs.
+#
+#   docker build -t wayside --build-arg VERSION=$(git describe --always) .
+#
+# The base is pinned by its digest (Python 3.13 on Debian 13), what is installed by docker/requirements.txt, with hashes.
+# Files bear no times of the build, so the same source gives the same layers (BuildKit: also give
+# --build-arg SOURCE_DATE_EPOCH=0 and --output type=image,rewrite-timestamp=true).
+ARG BASE=docker.io/library/python:3.13-slim-trixie@sha256:9d2e5553305c7c7b0097999bb17187c69b921ccd6bc9d40e4bb5ebe652c00285
+
+FROM ${BASE} AS build
+ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PYTHONDONTWRITEBYTECODE=1
+RUN python3 -m venv /opt/wayside
+COPY docker/requirements.txt /source/docker/requirements.txt
+RUN /opt/wayside/bin/pip install --no-compile --only-binary=:all: --require-hashes -r /source/docker/requirements.txt
+COPY pyproject.toml README.md LICENSE /source/
+COPY wayside /source/wayside
+COPY detector /source/detector
+COPY application_manager /source/application_manager
+# The builder of the wheel (setuptools) is in the requirements, so nothing is fetched here.
+RUN /opt/wayside/bin/pip install --no-compile --no-deps --no-build-isolation /source \
+ && /opt/wayside/bin/pip uninstall --yes --quiet setuptools pip
+# Of pycrate's ASN.1 modules only those of ITS messages; all others, of mobile networks mostly, are 140 MB. The root of a
+# container cannot be written to, so all is compiled here, else each start would do so: bytecode that is not compared
+# with its source bears no times.
+RUN find /opt/wayside/lib -path '*/pycrate_asn1dir/*.py' ! -name '__init__.py' ! -name 'ITS*.py' -delete \
+ && python3 -m compileall -q --invalidation-mode=unchecked-hash /opt/wayside/lib
+
+FROM ${BASE}
+ARG VERSION=unknown
+LABEL org.opencontainers.image.title="wayside" \
+      org.opencontainers.image.description="Event detector and application manager for connected vehicles and roadside stations" \
+      org.opencontainers.image.licenses="Apache-2.0" \
+      org.opencontainers.image.version="${VERSION}"
+COPY --from=build /opt/wayside /opt/wayside
+RUN python3 -m compileall -q -x site-packages --invalidation-mode=unchecked-hash "$(python3 -c 'import os; print(os.path.dirname(os.__file__))')"
+# HOME can be written to where the root of a container cannot: mount a volume at /tmp.
+ENV PATH=/opt/wayside/bin:/usr/local/bin:/usr/bin:/bin HOME=/tmp PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
+USER 65532:65532
+WORKDIR /
+CMD ["detector", "--help"]

@@ -1,0 +1,1 @@
+"""The API server's questions about templates, rules and detectors, answered over HTTPS."""

@@ -1,0 +1,113 @@
+"""The webhook: AdmissionReviews over HTTPS, in the manager's own event loop.
+
+Whatever goes wrong here is an answer that the API server counts as none, and with failurePolicy Ignore it goes on: the
+object is stored, and its condition says later what we could not say now. So nothing waits in a queue: where too many
+come at once, those beyond are sent away.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from aiohttp import web
+
+from application_manager.admission.certificate import ServingCertificate
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.core.findings.reviews import ReviewError
+from application_manager.measures import Measures
+
+AT_ONCE = 32
+"""Questions of one kind that are answered at the same time; those beyond get 503 at once."""
+
+LARGEST = 8 * 1024 * 1024  # bytes of a question: etcd takes 1.5 MiB an object, and an update brings two
+
+PORT_OPTION = "--admission-port"
+FOLDER_OPTION = "--admission-certificates"
+
+Review = Callable[[Any], Awaitable[dict[str, Any]]]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """Where the webhook is served, and the folder with its certificate and key."""
+
+    port: int
+    certificates: Path
+
+
+class Desk:
+    """Takes the questions of one kind."""
+
+    def __init__(self, review: Review, ready: Callable[[], bool], measures: Measures) -> None:
+        """`ready`: whether enough is known to answer."""
+        self._review = review
+        self._ready = ready
+        self._measures = measures
+        self._asked = 0
+
+    async def answer(self, request: web.Request) -> web.Response:
+        """The answer to one question; an HTTP error where there is none."""
+        if not self._ready():
+            return self._none(503, "not everything is listed and watched yet")
+        if self._asked >= AT_ONCE:
+            return self._none(503, f"{AT_ONCE} questions are being answered")
+        self._asked += 1
+        try:
+            question = msgspec.json.decode(await request.read())
+            return web.json_response(body=msgspec.json.encode(await self._review(question)))
+        except (ReviewError, msgspec.DecodeError, UnicodeDecodeError) as error:
+            return self._none(400, str(error))
+        except web.HTTPException:
+            self._measures.reviewed("", "failed")
+            raise
+        except Exception as error:  # a defect of ours keeps nobody from anything
+            log.exception("a review failed")
+            return self._none(500, f"{type(error).__name__}: {error}")
+        finally:
+            self._asked -= 1
+
+    def _none(self, status: int, why: str) -> web.Response:
+        self._measures.reviewed("", "failed")
+        return web.Response(status=status, text=f"{why}\n")
+
+
+@asynccontextmanager
+async def webhook(serving: Serving | None, desks: Mapping[str, Desk]) -> AsyncIterator[None]:
+    """Serve the desks, by their paths, on all addresses while the block runs; nothing where `serving` is None.
+
+    Raises ConfigurationError where the port is taken, or there is no certificate.
+    """
+    if serving is None:
+        yield
+        return
+    certificate = ServingCertificate(serving.certificates, FOLDER_OPTION)
+    application = web.Application(client_max_size=LARGEST)
+    for path, desk in desks.items():
+        application.router.add_post(path, desk.answer)
+    # A question that the API server has given up is given up here too.
+    runner = web.AppRunner(
+        application, access_log=None, handle_signals=False, shutdown_timeout=1, handler_cancellation=True
+    )
+    await runner.setup()
+    following = asyncio.create_task(certificate.follow(), name="certificate")
+    try:
+        try:
+            await web.TCPSite(runner, port=serving.port, ssl_context=certificate.context).start()
+        except OSError as error:
+            reason = error.strerror or error
+            raise ConfigurationError(f"{PORT_OPTION} {serving.port}: {reason}: give another port") from error
+        log.info("answering AdmissionReviews on port %s", serving.port)
+        yield
+    finally:
+        following.cancel()
+        await asyncio.gather(following, return_exceptions=True)
+        await runner.cleanup()

@@ -1,0 +1,213 @@
+"""What is worked on: the queues, and the work behind each, wired together.
+
+News come in by the router, which asks queues for keys. The work of a queue writes, tells the world what it did, and
+asks others. What nobody asks for is not done.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+from application_manager.charts.chartcache import ChartCache
+from application_manager.charts.chartdesk import ChartDesk
+from application_manager.cluster.apply import Applier
+from application_manager.cluster.client import Client, Resource
+from application_manager.cluster.failedpods import FailedPodsLook
+from application_manager.cluster.nodes import NodeLook
+from application_manager.cluster.store import Name
+from application_manager.core.objects.policy import KindKey
+from application_manager.knowledge.detectorbook import DetectorBook
+from application_manager.knowledge.world import DETECTOR, INSTANCE, TASK, TEMPLATE, World
+from application_manager.measures import Measures
+from application_manager.observability.overview import Overview
+from application_manager.observability.tracing import LostSpans, TaskTraces
+from application_manager.options import Options
+from application_manager.watching.router import Router
+from application_manager.work.configurations import ConfigurationWork
+from application_manager.work.detectors import DetectorWork
+from application_manager.work.instances import InstanceWork
+from application_manager.work.instancestatus import InstanceStatusWork
+from application_manager.work.publishing import Publisher
+from application_manager.work.recorder import Recorder
+from application_manager.work.rulework import RuleKey, RuleWork
+from application_manager.work.sidecars import SidecarNews
+from application_manager.work.suspending import Suspending
+from application_manager.work.tasks import TaskWork
+from application_manager.work.templates import TemplateWork
+from application_manager.work.workqueue import Key, WorkQueue
+from wayside.tracing import Tracing
+
+_JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
+_INSTANCE_WORKERS = 16
+_CONFIGURATION_WORKERS = 4
+_STATUS_WORKERS = 2  # few: what runs goes before what is said of it
+
+
+class Assembly:
+    """All queues of a manager.
+
+    Attributes:
+        world: what is known.
+        book: what is known of Detectors that are run.
+        recorder: posts Events.
+        applier: applies manifests.
+        publisher: publishes configurations.
+        router: takes news.
+        charts: renders charts.
+        detectors: the queue of Detectors that are run.
+        queues: all of them.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        options: Options,
+        resources: dict[KindKey, Resource],
+        measures: Measures,
+        traced: Tracing | None,
+    ) -> None:
+        self.world = World(options.policy, options.max_instances)
+        self._traces = None if traced is None else TaskTraces(traced, self.world)
+        if traced is not None:
+            measures.registry.register(LostSpans(traced))
+        self.recorder = Recorder(client, measures)
+        applier = self.applier = Applier(client, self.world.store, resources)
+        self._instances: WorkQueue[Name] = WorkQueue(
+            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures
+        )
+        self.world.places.changed = self._instances.add
+        self._statuses: WorkQueue[Name] = WorkQueue(
+            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measures
+        )
+        self._tasks: WorkQueue[Name] = WorkQueue(
+            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measures
+        )
+        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances, measures)
+        self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances, measures)
+        self.book = DetectorBook(options.detectors)
+        detectors = DetectorWork(
+            self.world,
+            client,
+            self.book,
+            lambda name: self._rules.add((DETECTOR, name)),
+            SidecarNews(self.world, self.book, self.recorder),
+        )
+        self.detectors: WorkQueue[Name] = WorkQueue("detector", detectors.reconcile, 1, self._instances, measures)
+        queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
+        measures.registry.register(Overview(self.world, lambda: [(each.name, *each.depth) for each in queues]))
+        self.publisher = Publisher(options.zenoh)
+        self._configurations: WorkQueue[Name] = WorkQueue(
+            "configuration",
+            ConfigurationWork(self.world, client, applier, self.publisher).reconcile,
+            _CONFIGURATION_WORKERS,
+            measures=measures,
+        )
+        self.queues = (*queues, self._configurations)
+        self.router = Router(
+            self.world,
+            applier,
+            self._instances.add,
+            self._tasks.add,
+            _soon(self._templates),
+            self._judge,
+            self._configurations.add,
+        )
+        self._status_work = InstanceStatusWork(
+            world=self.world,
+            client=client,
+            applier=applier,
+            recorder=self.recorder,
+            instances=resources[INSTANCE],
+            task_changed=self._tasks.add,
+            observe=self.router.observe,
+            nodes=NodeLook(client),
+            failed_pods=FailedPodsLook(client),
+            again=self._statuses.add_at,
+        )
+        cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
+        self.charts = ChartDesk(options.helm, cache, self._instances.add_at)
+        self._instance_work = InstanceWork(
+            world=self.world,
+            client=client,
+            applier=applier,
+            recorder=self.recorder,
+            suspending=Suspending(client, applier, resources[INSTANCE], self.router.observe),
+            instances=resources[INSTANCE],
+            tasks=resources[TASK],
+            again=self._instances.add_at,
+            done=self._statuses.add,
+            absent=lambda name, decision: self._status_work.tell(name, decision, None),
+            not_made=self._status_work.tell_why_not_made,
+            observe=self.router.observe,
+            configured=self._configurations.add,
+            charts=self.charts.outcome,
+        )
+        self._task_work = TaskWork(
+            world=self.world,
+            client=client,
+            recorder=self.recorder,
+            tasks=resources[TASK],
+            templates=resources[TEMPLATE],
+            ttl=options.ttl_after_finished,
+            again=self._tasks.add_at,
+            observe=self.router.observe,
+            measures=measures,
+            traces=self._traces,
+        )
+        self._template_work = TemplateWork(
+            world=self.world,
+            client=client,
+            recorder=self.recorder,
+            templates=resources[TEMPLATE],
+            observe=self.router.observe,
+        )
+        self._rule_work = RuleWork(
+            world=self.world,
+            client=client,
+            recorder=self.recorder,
+            resources=resources,
+            observe=self.router.observe,
+            detectors=self.book,
+        )
+
+    def begin_anew(self, children: Iterable[Resource]) -> None:
+        """Forget what we did: others may have acted since. `children` are the kinds of what templates create."""
+        self.world.forget_work()
+        self.publisher.forget()
+        self.applier.begin(
+            entry.raw for each in children for _, entry in self.world.store.all((each.api_version, each.kind))
+        )
+
+    def publish_all(self) -> None:
+        """Ask for the configurations of all instances to be published."""
+        for name, _ in self.world.store.all(INSTANCE):
+            self._configurations.add(name)
+
+    async def _reconcile_instance(self, name: Name) -> None:
+        if self._traces is None:
+            await self._instance_work.reconcile(name)
+        else:
+            await self._traces.reconciling(name, self._instance_work.reconcile)
+
+    async def _say_instance(self, name: Name) -> None:
+        await self._status_work.reconcile(name)
+
+    async def _reconcile_task(self, name: Name) -> None:
+        await self._task_work.reconcile(name)
+
+    async def _reconcile_template(self, name: Name) -> None:
+        await self._template_work.reconcile(name)
+
+    async def _reconcile_rule(self, key: RuleKey) -> None:
+        await self._rule_work.reconcile(key)
+
+    def _judge(self, key: RuleKey) -> None:
+        """Ask for a rule or Detector to be judged, soon; a Detector's objects are looked after before."""
+        self._rules.add_at(key, time.time() + _JUDGING_PAUSE)
+        if key[0] == DETECTOR:
+            self.detectors.add(key[1])
+
+
+def _soon(queue: WorkQueue[Key]) -> Callable[[Key], None]:
+    return lambda key: queue.add_at(key, time.time() + _JUDGING_PAUSE)

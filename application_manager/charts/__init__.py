@@ -1,0 +1,1 @@
+"""Helm charts: fetched, kept and rendered in the background."""

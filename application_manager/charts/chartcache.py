@@ -1,0 +1,109 @@
+"""Charts on disk: each archive once, under the digest of its content; and which source has which.
+
+    <folder>/charts/<sha256>.tgz        an archive
+    <folder>/sources/<sha256>           a source, by its hash → the digest of its archive
+
+A version of a chart is taken not to change, so a source that is known is not fetched again, also not after a restart.
+An archive whose content is not as its name says is fetched anew. What was not used for longest goes first.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from application_manager.charts.helm import Helm, HelmError
+from application_manager.core.objects.charts import ChartSource
+
+KEPT = 64  # archives
+
+
+@dataclass(frozen=True, slots=True)
+class ChartCache:
+    """Gives charts as paths.
+
+    Attributes:
+        folder: of the cache; made where it is missing.
+        local: the folder with the charts of the image, in which all that templates name by a path must be.
+    """
+
+    helm: Helm
+    folder: Path
+    local: Path
+
+    async def path(self, source: ChartSource) -> Path:
+        """The chart, which is fetched where it is not here yet. Raises HelmError."""
+        if source.chart.startswith("/"):
+            return await asyncio.to_thread(self._local, source.chart)
+        try:
+            known = await asyncio.to_thread(self._known, source)
+            return known if known is not None else await self._fetched(source)
+        except OSError as error:
+            raise HelmError(
+                f"charts cannot be kept in {self.folder}: {error.strerror or error}; give the manager --chart-cache "
+                "with a folder that it can write to"
+            ) from None
+
+    def _local(self, chart: str) -> Path:
+        path = Path(chart).resolve()
+        if not path.is_relative_to(self.local.resolve()):
+            raise HelmError(
+                f"{chart} is not in {self.local}, where the administrator keeps charts: put it there, or start the "
+                "manager with --chart-folder"
+            )
+        if not path.exists():
+            raise HelmError(f"there is no {chart} in the manager's image: put the chart there, or correct the path")
+        return path
+
+    def _known(self, source: ChartSource) -> Path | None:
+        try:
+            digest = self._index(source).read_text()
+            archive = self._archive(digest)
+            if _digest(archive) != digest:
+                return None
+            os.utime(archive)
+        except FileNotFoundError:
+            return None
+        return archive
+
+    async def _fetched(self, source: ChartSource) -> Path:
+        await asyncio.to_thread(self._prepare)
+        with tempfile.TemporaryDirectory(prefix=".", dir=self.folder) as place:
+            archive = await self.helm.pull(source, Path(place))
+            return await asyncio.to_thread(self._keep, source, archive)
+
+    def _prepare(self) -> None:
+        for name in ("charts", "sources"):
+            (self.folder / name).mkdir(parents=True, exist_ok=True)
+
+    def _keep(self, source: ChartSource, archive: Path) -> Path:
+        digest = _digest(archive)
+        kept = self._archive(digest)
+        archive.replace(kept)
+        index = archive.parent / "index"
+        index.write_text(digest)
+        index.replace(self._index(source))
+        for old in sorted(kept.parent.iterdir(), key=lambda each: each.stat().st_mtime)[:-KEPT]:
+            old.unlink(missing_ok=True)
+        return kept
+
+    def _archive(self, digest: str) -> Path:
+        return self.folder / "charts" / f"{digest}.tgz"
+
+    def _index(self, source: ChartSource) -> Path:
+        named = "\0".join((source.chart, source.version or "", source.repository or ""))
+        return self.folder / "sources" / hashlib.sha256(named.encode()).hexdigest()
+
+
+def default_folder() -> Path:
+    """Where charts are kept unless the command line says otherwise."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wayside" / "charts"
+
+
+def _digest(archive: Path) -> str:
+    with archive.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()

@@ -1,0 +1,153 @@
+"""Renderings of charts: asked for at once, done in the background, kept while they are of use.
+
+An instance whose chart is not rendered yet is told so, and asked again once it is: no worker ever waits for Helm.
+Charts stand apart from each other: each source has few runs at a time, and one that cannot be had, or that takes too
+long, is left alone for a while that doubles. So a wrong chart costs its own template, and no other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from application_manager.charts.chartcache import ChartCache
+from application_manager.charts.helm import Helm, HelmError
+from application_manager.charts.rendering import failed, rendered, unavailable
+from application_manager.cluster.store import Name
+from application_manager.core.objects.charts import (
+    FAILED,
+    ChartFailure,
+    ChartObjects,
+    ChartOutcome,
+    ChartRequest,
+    ChartSource,
+)
+
+FIRST_PAUSE = 5.0  # s after a failure, doubled with each further one
+LONGEST_PAUSE = 300.0  # s
+KEPT = 2000  # renderings; those not asked for longest are forgotten, and done again when they are
+_RUNS = 6  # of helm, at a time
+_RUNS_OF_ONE = 2  # of these for one source
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Pause:
+    """How long something that failed is left alone; times by the monotonic clock."""
+
+    failures: int = 0
+    until: float = 0.0
+    failure: ChartFailure | None = None
+
+    def fail(self, failure: ChartFailure) -> None:
+        self.until = time.monotonic() + min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** min(self.failures, 10))
+        self.failures += 1
+        self.failure = failure
+
+    @property
+    def left(self) -> float:
+        return max(0.0, self.until - time.monotonic()) + 0.1
+
+    @property
+    def over(self) -> bool:
+        return time.monotonic() >= self.until
+
+
+@dataclass(slots=True)
+class _Source:
+    """One chart: whether it can be had, and its runs."""
+
+    pause: _Pause = field(default_factory=_Pause)
+    runs: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(_RUNS_OF_ONE))
+    fetching: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+
+@dataclass(slots=True)
+class _Rendering:
+    outcome: ChartOutcome | None = None
+    pause: _Pause = field(default_factory=_Pause)
+    work: asyncio.Task[None] | None = None
+
+
+class ChartDesk:
+    """Takes requests. Only the event loop's thread uses it."""
+
+    def __init__(self, helm: Helm, cache: ChartCache, again: Callable[[Name, float], None]) -> None:
+        """`again` asks for an instance at a time, in seconds since 1970."""
+        self._helm = helm
+        self._cache = cache
+        self._again = again
+        self._renderings: OrderedDict[ChartRequest, _Rendering] = OrderedDict()
+        self._sources: dict[ChartSource, _Source] = {}
+        self._runs = asyncio.Semaphore(_RUNS)
+
+    def outcome(self, request: ChartRequest) -> ChartOutcome | None:
+        """What came of the request; None at first, and then the instance is asked again. A failure stays until a new
+        attempt, after a pause, goes better.
+        """
+        known = self._renderings.setdefault(request, _Rendering())
+        self._renderings.move_to_end(request)
+        if known.work is None and not isinstance(known.outcome, ChartObjects) and known.pause.over:
+            known.work = asyncio.create_task(self._do(request, known), name=f"chart of {request.release}")
+        if isinstance(known.outcome, ChartFailure) and known.work is None:
+            self._again((request.namespace, request.release), time.time() + known.pause.left)
+        self._forget_some()
+        return known.outcome
+
+    async def close(self) -> None:
+        """End all runs."""
+        tasks = [each.work for each in self._renderings.values() if each.work is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _forget_some(self) -> None:
+        while len(self._renderings) > KEPT:
+            request, oldest = next(iter(self._renderings.items()))
+            if oldest.work is not None:
+                return
+            del self._renderings[request]
+            if all(each.source != request.source for each in self._renderings):
+                self._sources.pop(request.source, None)
+
+    async def _do(self, request: ChartRequest, known: _Rendering) -> None:
+        try:
+            outcome = await self._outcome(request)
+        except Exception as error:  # a defect must not leave the instance waiting for ever
+            log.exception("the chart of %s/%s failed", request.namespace, request.release)
+            outcome = ChartFailure(FAILED, f"spec.helm: chart {request.source}: {type(error).__name__}: {error}")
+        finally:
+            known.work = None
+        name = (request.namespace, request.release)
+        known.outcome = outcome
+        if isinstance(outcome, ChartFailure):
+            known.pause.fail(outcome)
+        self._again(name, time.time())
+
+    async def _outcome(self, request: ChartRequest) -> ChartOutcome:
+        source = self._sources.setdefault(request.source, _Source())
+        async with source.runs:
+            async with source.fetching:  # the first fetches, the others find it
+                if not source.pause.over and source.pause.failure is not None:
+                    return source.pause.failure
+                try:
+                    async with self._runs:
+                        path = await self._cache.path(request.source)
+                except HelmError as error:
+                    source.pause.fail(failure := unavailable(request.source, error))
+                    return failure
+            try:
+                async with self._runs:
+                    outcome = await rendered(self._helm, request, path)
+            except HelmError as error:
+                failure = failed(request.source, error)
+                if error.slow:
+                    source.pause.fail(failure)
+                return failure
+        source.pause = _Pause()
+        return outcome

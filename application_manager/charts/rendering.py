@@ -1,0 +1,58 @@
+"""One chart rendered once, and what to say where that fails."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from application_manager.charts.chartcache import ChartCache
+from application_manager.charts.helm import Helm, HelmError
+from application_manager.core.objects.charts import (
+    FAILED,
+    UNAVAILABLE,
+    ChartFailure,
+    ChartOutcome,
+    ChartRequest,
+    ChartSource,
+    parse,
+)
+
+
+async def rendered(helm: Helm, request: ChartRequest, path: Path) -> ChartOutcome:
+    """The objects of the chart at the path, or why they cannot be used.
+
+    It is rendered twice: what differs each time would be applied again and again.
+
+    Raises:
+        HelmError: Helm cannot render it.
+    """
+    text = await helm.template(request, path)
+    if text != await helm.template(request, path):
+        return ChartFailure(
+            FAILED,
+            f"spec.helm: chart {request.source} gives other objects each time (by randAlphaNum, genCA, now or the "
+            "like), so the application would restart for nothing: give these values in spec.helm.values",
+        )
+    return await asyncio.to_thread(parse, request.source, text)
+
+
+async def rendered_at_once(helm: Helm, cache: ChartCache, request: ChartRequest) -> ChartOutcome:
+    """The same from the beginning, for who can wait: the chart is fetched where it is not here yet."""
+    try:
+        path = await cache.path(request.source)
+    except HelmError as error:
+        return unavailable(request.source, error)
+    try:
+        return await rendered(helm, request, path)
+    except HelmError as error:
+        return failed(request.source, error)
+
+
+def unavailable(source: ChartSource, error: HelmError) -> ChartFailure:
+    """The chart cannot be had."""
+    return ChartFailure(UNAVAILABLE, f"spec.helm: chart {source} cannot be had: {error}")
+
+
+def failed(source: ChartSource, error: HelmError) -> ChartFailure:
+    """The chart cannot be rendered."""
+    return ChartFailure(FAILED, f"spec.helm: chart {source}: {error}")

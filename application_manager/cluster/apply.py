@@ -1,0 +1,315 @@
+"""Making an instance's objects as rendered, without ever touching what is not ours.
+
+Before an object is applied for the first time it is looked for: one that exists and whose controller is not this
+instance is left alone. Every later apply carries the uid, so an object that was replaced meanwhile is a conflict and
+not a victim. Objects that the rendering has no more are pruned, but only once everything else was applied, only with
+our controller reference and with their uid as a precondition.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import re
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from application_manager.cluster.client import FIELD_MANAGER, ApiError, Client, Object, Resource
+from application_manager.cluster.store import Store
+from application_manager.core.conditions import Aspect
+from application_manager.core.health.refusals import (
+    ADMISSION_REFUSED,
+    APPLY_REFUSED,
+    QUOTA_EXCEEDED,
+    reason_of,
+    with_remedy,
+)
+from application_manager.core.objects.policy import KindKey
+from application_manager.core.objects.rendering import Manifest, Rendering, object_key, owned
+from wayside.api import API_VERSION, ApplicationInstance
+from wayside.api.applicationinstance import ObjectReference
+
+ObjectKey = tuple[str, str, str]
+"""apiVersion, kind and name."""
+
+_WORST_FIRST = ("ObjectExists", APPLY_REFUSED, ADMISSION_REFUSED, QUOTA_EXCEEDED, "Waiting")
+_WORKLOADS = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod"})
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What was applied before.
+
+    Attributes:
+        digest: of the rendering that was last applied in full.
+        objects: the uids of what belongs to the instance; None where it may not have been applied.
+    """
+
+    digest: str | None = None
+    objects: Mapping[ObjectKey, str | None] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> Known:
+        """What references say, as `references` makes them."""
+        return cls(digest, {(each.api_version, each.kind, each.name): each.uid for each in references})
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What came of it.
+
+    Attributes:
+        aspect: the condition Applied.
+        objects: what belongs to the instance now.
+        complete: whether everything is as rendered.
+        took: when applying began and ended, in nanoseconds since the epoch; None where nothing was applied.
+    """
+
+    aspect: Aspect
+    objects: tuple[ObjectReference, ...]
+    complete: bool
+    took: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    reason: str
+    message: str
+
+
+class Applier:
+    """Applies, prunes and notices what others changed."""
+
+    def __init__(self, client: Client, store: Store, resources: Mapping[KindKey, Resource]) -> None:
+        self._client = client
+        self._store = store
+        self._resources = dict(resources)
+        self._fields: dict[str, str] = {}  # uid → the fields that are ours, as of our last apply
+        self._drifted: set[str] = set()
+        self._controlled: dict[str, dict[str, ObjectKey]] = {}  # uid of the controller → uid → object
+
+    def live(self, namespace: str, key: ObjectKey) -> Object | None:
+        """The object, where we watch it: it bears an instance's label."""
+        entry = self._store.get((key[0], key[1]), (namespace, key[2]))
+        return entry.raw if entry is not None else None
+
+    def note(self, raw: Object) -> None:
+        """Note an object seen by watching: somebody who takes a field from us makes it drift."""
+        uid, fields = raw["metadata"]["uid"], our_fields(raw)
+        if self._fields.setdefault(uid, fields) != fields:
+            self._drifted.add(uid)
+        self._controlled.setdefault(controller_uid(raw) or "", {})[uid] = object_key(raw)
+
+    def has_drifted(self, uid: str) -> bool:
+        """Whether somebody took a field of the object from us."""
+        return uid in self._drifted
+
+    def begin(self, objects: Iterable[Object]) -> None:
+        """Take the objects as they are for undisturbed: what changed up to now, another manager may have done."""
+        self._fields.clear()
+        self._drifted.clear()
+        for raw in objects:
+            self.note(raw)
+
+    def forget(self, raw: Object) -> None:
+        """Note that an object is gone."""
+        uid = raw["metadata"]["uid"]
+        self._fields.pop(uid, None)
+        self._drifted.discard(uid)
+        controller = controller_uid(raw) or ""
+        members = self._controlled.get(controller)
+        if members is not None:
+            members.pop(uid, None)
+            if not members:
+                del self._controlled[controller]
+
+    def pending(self, instance: ApplicationInstance, rendering: Rendering, known: Known) -> list[Manifest]:
+        """The manifests that need applying: all of a new rendering, else those that are missing or have drifted."""
+        if known.digest != rendering.digest:
+            return list(rendering.manifests)
+        return [
+            manifest
+            for manifest in rendering.manifests
+            if not self._is_as_recorded(instance.namespace, object_key(manifest), known.objects)
+        ]
+
+    def _is_as_recorded(self, namespace: str, key: ObjectKey, recorded: Mapping[ObjectKey, str | None]) -> bool:
+        live = self.live(namespace, key)
+        if live is None:
+            return False
+        uid = live["metadata"]["uid"]
+        return uid == recorded.get(key) and uid not in self._drifted
+
+    async def look(self, namespace: str, manifests: Iterable[Manifest]) -> dict[ObjectKey, Object | None]:
+        """The objects as they are in the cluster, where we do not watch them already."""
+        keys = [key for key in map(object_key, manifests) if self.live(namespace, key) is None]
+        found = await asyncio.gather(*(self._get(namespace, key) for key in keys))
+        return dict(zip(keys, found, strict=True))
+
+    async def apply(
+        self,
+        instance: ApplicationInstance,
+        rendering: Rendering,
+        manifests: Sequence[Manifest],
+        known: Known,
+        looked: Mapping[ObjectKey, Object | None],
+    ) -> Applied:
+        """Apply the manifests, which are all or some of the rendering, and prune what it has no more.
+
+        `looked` is from `look`, for the same manifests. Raises ApiError or Unreachable for what may pass, once all
+        else was tried.
+        """
+        began = time.time_ns()
+        wanted = rendering.keys()
+        recorded = dict(known.objects)
+        supporting = [each for each in manifests if each["kind"] not in _WORKLOADS]
+        workloads = [each for each in manifests if each["kind"] in _WORKLOADS]
+        results: list[Object | _Problem | BaseException] = []
+        for phase in (supporting, workloads):
+            results += await asyncio.gather(
+                *(self._apply_one(instance, each, recorded, looked) for each in phase), return_exceptions=True
+            )
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+        uids = dict(recorded)
+        for result in results:
+            if isinstance(result, dict):
+                uids[object_key(result)] = result["metadata"]["uid"]
+        problems = [result for result in results if isinstance(result, _Problem)]
+        if problems:
+            there = references({**dict.fromkeys(wanted), **uids})
+            return Applied(_refused(problems), there, complete=False, took=(began, time.time_ns()))
+        # What has the instance as controller is its own, recorded or not.
+        controlled = self._controlled.get(instance.metadata.uid, {})
+        for key in (recorded.keys() | set(controlled.values())) - wanted:
+            await self._prune(instance, key)
+            uids.pop(key, None)
+        done = Aspect("Applied", True, "Applied", _counted(len(wanted)))
+        return Applied(done, references(uids), complete=True, took=(began, time.time_ns()))
+
+    async def _apply_one(
+        self,
+        instance: ApplicationInstance,
+        manifest: Manifest,
+        recorded: Mapping[ObjectKey, str | None],
+        looked: Mapping[ObjectKey, Object | None],
+    ) -> Object | _Problem:
+        key = object_key(manifest)
+        what = f"{key[1]} {key[2]}"
+        live = self.live(instance.namespace, key) or looked.get(key)
+        body = owned(manifest, instance)
+        if live is not None:
+            problem = _foreign(live, instance, recorded.get(key), what)
+            if problem is not None:
+                return problem
+            body["metadata"]["uid"] = live["metadata"]["uid"]
+        try:
+            raw = await self._client.apply(await self.resource(key), body)
+        except ApiError as error:
+            if error.code == 409:  # vanished or replaced since we looked
+                return _Problem("Waiting", f"{what} changed hands while it was applied; looking again")
+            if not error.permanent or error.terminating:
+                raise
+            reason = reason_of(error.code, error.message)
+            return _Problem(reason, with_remedy(reason, f"{what}: {_readable(error.message)}"))
+        uid = raw["metadata"]["uid"]
+        self._fields[uid] = our_fields(raw)
+        self._drifted.discard(uid)
+        self.note(raw)
+        self._store.put(raw)
+        log.info("instance %s/%s: applied %s", instance.namespace, instance.name, what)
+        return raw
+
+    async def _prune(self, instance: ApplicationInstance, key: ObjectKey) -> None:
+        live = await self._get(instance.namespace, key)
+        if live is None or controller_uid(live) != instance.metadata.uid:
+            return
+        await self._client.delete(await self.resource(key), instance.namespace, key[2], live["metadata"]["uid"])
+        log.info("instance %s/%s: pruned %s %s", instance.namespace, instance.name, key[1], key[2])
+
+    async def _get(self, namespace: str, key: ObjectKey) -> Object | None:
+        return await self._client.get(await self.resource(key), namespace, key[2])
+
+    async def resource(self, key: ObjectKey) -> Resource:
+        """Where the object's kind lives. Raises ApiError where the cluster does not have it."""
+        kind = key[:2]
+        if kind not in self._resources:  # a kind that was allowed once, or was added to the cluster since we started
+            self._resources |= await self._client.discover(key[0])
+        if kind not in self._resources:
+            raise ApiError(404, f"the cluster has no kind {key[0]}/{key[1]}")
+        return self._resources[kind]
+
+
+def controller_uid(live: Mapping[str, Any]) -> str | None:
+    """The uid of the object's controller."""
+    controller = _controller(live)
+    return None if controller is None else str(controller["uid"])
+
+
+def _controller(live: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    owners: list[Mapping[str, Any]] = live["metadata"].get("ownerReferences") or []
+    return next((each for each in owners if each.get("controller")), None)
+
+
+def _foreign(live: Object, instance: ApplicationInstance, recorded: str | None, what: str) -> _Problem | None:
+    """Why the object may not be applied over, or None if it is the instance's own."""
+    if live["metadata"].get("deletionTimestamp"):
+        return _Problem("Waiting", f"{what} is being deleted; it is applied again once it is gone")
+    controller = _controller(live)
+    if controller is None:
+        if live["metadata"]["uid"] == recorded:
+            return None
+    elif controller["uid"] == instance.metadata.uid:
+        return None
+    elif (controller["apiVersion"], controller["kind"], controller["name"]) == (
+        API_VERSION,
+        instance.kind,
+        instance.name,
+    ):
+        return _Problem("Waiting", f"{what} of the previous instance of this name is still being removed")
+    owner = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
+    return _Problem(
+        "ObjectExists",
+        f"{what} exists already, {owner} and is left alone: delete or rename it, or give another name in the template",
+    )
+
+
+def _refused(problems: Sequence[_Problem]) -> Aspect:
+    worst = min(problems, key=lambda each: _WORST_FIRST.index(each.reason))
+    return Aspect("Applied", False, worst.reason, "; ".join(each.message for each in problems))
+
+
+def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:
+    """The objects as a status lists them, in one order."""
+    return tuple(
+        ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid) for key, uid in sorted(uids.items())
+    )
+
+
+def _readable(message: str) -> str:
+    """The API server's refusal without the Go around a wrong type."""
+    typed = re.fullmatch(r"failed to create typed patch object \([^)]*\): \.?(.*)", message, re.DOTALL)
+    if typed is None:
+        return message
+    plain = re.sub(r"&value\.valueUnstructured\{Value:(.*)\}", r"\1", typed[1], flags=re.DOTALL)
+    if "expected string, got" in plain:
+        plain += " (inside other text a value becomes text, and alone it keeps its type)"
+    return f"{plain}: correct the template"
+
+
+def _counted(count: int) -> str:
+    return "1 object is as the template says" if count == 1 else f"{count} objects are as the template says"
+
+
+def our_fields(raw: Mapping[str, Any]) -> str:
+    """The fields that are ours; an update by somebody else takes those that it changes."""
+    for each in raw["metadata"].get("managedFields") or []:
+        if each.get("manager") == FIELD_MANAGER and each.get("operation") == "Apply" and not each.get("subresource"):
+            return json.dumps(each.get("fieldsV1"), sort_keys=True)
+    return ""

@@ -1,0 +1,45 @@
+"""A look at the Events that say why a workload's pods cannot be made, where its own status does not tell it.
+
+They are not watched: a cluster has many Events, and these matter only while pods are missing.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from application_manager.cluster.client import EVENTS, ApiError, Client, Object, Unreachable
+from application_manager.core.health.refusals import FAILED_CREATE
+
+FORBIDDEN_FOR = 60.0  # s until it is asked again whether Events may be listed
+_NEWEST = 50  # Events of one workload that are read; their number is bounded by the API server keeping them for an hour
+
+log = logging.getLogger(__name__)
+
+
+class FailedPodsLook:
+    """The Events FailedCreate of workloads."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._forbidden_until = 0.0  # monotonic
+        self._told = False
+
+    async def events(self, namespace: str, uid: str) -> list[Object]:
+        """Those of the object with this uid; none where they may not be listed, or the API server does not tell."""
+        if time.monotonic() < self._forbidden_until:
+            return []
+        try:
+            found, _ = await self._client.list(
+                EVENTS, namespace, fields=f"regarding.uid={uid},reason={FAILED_CREATE}", limit=_NEWEST
+            )
+        except ApiError as error:
+            if error.code == 403:
+                self._forbidden_until = time.monotonic() + FORBIDDEN_FOR
+            if not self._told:
+                log.info("Events cannot be listed (%s): why a StatefulSet's pods cannot be made is not said", error)
+                self._told = True
+            return []
+        except Unreachable:
+            return []
+        return found

@@ -1,0 +1,203 @@
+"""Being the one active manager: the Lease is renewed, or looked at until it can be taken.
+
+It has a client of its own, so that no other request holds up a renewal. What may be done is told by a time, never by a
+flag: a process that stood still finds its time over before anything had a chance to tell it so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import secrets
+import socket
+import time
+from dataclasses import dataclass
+
+from application_manager.cluster.client import LEASES, ApiError, Client, Unreachable
+from application_manager.cluster.podaccount import FOLDER
+from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, Candidate
+from application_manager.measures import Measures
+from wayside.leases import holder_of
+
+LEASE_NAME = "application-manager"
+RENEWAL_TIMEOUT = 3.0
+"""Seconds for one request about the Lease, so that a renewal that hangs leaves time for another."""
+
+_NAMESPACE_FILE = FOLDER / "namespace"
+
+log = logging.getLogger(__name__)
+
+
+def steady() -> float:
+    """Seconds of a clock that no one sets, and that goes on while the machine sleeps, where there is such a clock."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseKey:
+    """Where the Lease is that the managers of the same namespaces share."""
+
+    namespace: str
+    name: str = LEASE_NAME
+
+    def __str__(self) -> str:
+        return f"{self.namespace}/{self.name}"
+
+
+def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
+    """The Lease of the option `--lease`, `NAME` or `NAMESPACE/NAME`.
+
+    The namespace is that of the pod, else the first that is looked after, else `default`. Raises ValueError where the
+    name is that of a holder's Lease, or none.
+    """
+    namespace, _, name = (given or LEASE_NAME).rpartition("/")
+    if not name or holder_of(name) is not None:
+        raise ValueError(
+            f"{given!r} cannot be the managers' Lease: write NAME or NAMESPACE/NAME; wayside-… are detectors'"
+        )
+    if not namespace:
+        own = os.environ.get("POD_NAMESPACE") or (_NAMESPACE_FILE.read_text() if _NAMESPACE_FILE.is_file() else "")
+        namespace = own.strip() or next(iter(sorted(namespaces)), "default")
+    return LeaseKey(namespace, name)
+
+
+def own_identity() -> str:
+    """Who this manager is: its pod, so that a container that starts again need not wait for itself; else random."""
+    pod, uid = os.environ.get("POD_NAME"), os.environ.get("POD_UID")
+    return f"{pod}_{uid}" if pod and uid else f"{socket.gethostname()}_{os.getpid()}_{secrets.token_hex(4)}"
+
+
+class Leadership:
+    """Seeks the Lease, holds it and gives it back."""
+
+    def __init__(self, client: Client, key: LeaseKey, measures: Measures, identity: str | None = None) -> None:
+        """`client`: for the Lease alone."""
+        self._client = client
+        self._key = key
+        self._measures = measures
+        self._candidate = Candidate(identity or own_identity())
+        self._changed = asyncio.Event()
+        self._said = ""
+        self._was_active = False
+        self._namespace_goes = False
+        self._released = False
+        self._looking = asyncio.Lock()  # so that no renewal is under way when the Lease is released
+
+    def remaining(self) -> float:
+        """For how many seconds this manager may act; none or less: it is not the active one."""
+        return self._candidate.remaining(steady())
+
+    @property
+    def active(self) -> bool:
+        """Whether this manager is the active one."""
+        return self.remaining() > 0
+
+    @property
+    def role(self) -> str:
+        """What this manager is, in words; empty for the active one."""
+        if self.active:
+            return ""
+        return f"standby: {self._candidate.holder or 'nobody'} is active"
+
+    async def look(self) -> None:
+        """Read the Lease and take or renew it if it is ours to have. Raises ApiError or Unreachable."""
+        async with self._looking:
+            if not self._released:
+                await self._look()
+
+    async def _look(self) -> None:
+        sent, candidate = steady(), self._candidate
+        if not self.active:
+            candidate.observe(await self._client.get(LEASES, self._key.namespace, self._key.name), steady())
+            sent = steady()
+            if not candidate.may_take(sent):
+                self._tell()
+                return
+        draft = candidate.draft(self._key.name, self._key.namespace, time.time())
+        try:
+            write = self._client.replace if "resourceVersion" in draft["metadata"] else self._client.create
+            candidate.took(await write(LEASES, draft), sent, steady())
+        except ApiError as error:
+            if error.terminating:
+                self._namespace_goes = True
+                self._say(logging.INFO, f"the namespace of the Lease {self._key} is not there, or going")
+                return
+            if error.code not in (404, 409):
+                raise
+            # Somebody else was first, or has removed it.
+            candidate.observe(await self._client.get(LEASES, self._key.namespace, self._key.name), steady())
+        self._tell()
+
+    async def run(self) -> None:
+        """Look until cancelled."""
+        while True:
+            try:
+                await self.look()
+            except (ApiError, Unreachable) as error:
+                left = self.remaining()
+                until = f"; acting for {left:.0f} s more" if left > 0 else ""
+                self._say(
+                    logging.WARNING, f"the Lease {self._key} cannot be looked after{until}: {error}", str(type(error))
+                )
+                pause = LOOK_EVERY
+            else:
+                pause = RENEW_EVERY if self.active else LOOK_EVERY
+            await asyncio.sleep(pause)
+
+    async def wait_active(self) -> None:
+        """Wait until this manager is the active one."""
+        while not self.active:
+            self._changed.clear()
+            await self._changed.wait()
+
+    async def wait_over(self) -> None:
+        """Wait until this manager is not the active one any more."""
+        while (left := self.remaining()) > 0:
+            self._changed.clear()
+            try:
+                await asyncio.wait_for(self._changed.wait(), left)
+            except TimeoutError:
+                continue
+        self._tell()
+
+    async def release(self) -> None:
+        """Give the Lease back, so that a standby takes it at once. Nothing may be written any more when this is called.
+
+        Where that fails the standby waits until it has seen the Lease unchanged for its duration.
+        """
+        self._released = True  # not to be taken again
+        try:
+            async with asyncio.timeout(RENEWAL_TIMEOUT), self._looking:
+                draft = self._candidate.released(time.time()) if self.active else None
+                self._candidate.until = 0.0
+                if draft is None:
+                    return
+                await self._client.replace(LEASES, draft)
+        except (ApiError, Unreachable, TimeoutError) as error:
+            gone = isinstance(error, ApiError) and error.code in (404, 409)
+            level = logging.INFO if gone else logging.WARNING  # gone with its namespace, or taken
+            why = str(error) or "the API server does not answer"
+            log.log(level, "the Lease %s is not released, a standby waits for its end: %s", self._key, why)
+        else:
+            log.info("released the Lease %s", self._key)
+
+    def _tell(self) -> None:
+        """Say what has become of us, once for each change."""
+        active, was_active = self.active, self._was_active
+        self._was_active = active
+        self._measures.active(active)
+        if active:
+            self._namespace_goes = False
+            self._say(logging.INFO, f"active: holds the Lease {self._key} as {self._candidate.identity}")
+        elif was_active:
+            why = f"the Lease {self._key} was not renewed within {DEADLINE:g} s, or another manager has taken it"
+            self._say(logging.INFO if self._namespace_goes else logging.WARNING, f"not active any more: {why}")
+        else:
+            self._say(logging.INFO, f"{self.role}, by the Lease {self._key}")
+        self._changed.set()
+
+    def _say(self, level: int, message: str, about: str = "") -> None:
+        if self._said != (about or message):
+            self._said = about or message
+            log.log(level, "%s", message)

@@ -1,0 +1,51 @@
+"""A look at the cluster's nodes, where the manager's account may list them: it tells what the scheduler does not.
+
+Nodes are not watched: they matter only while an application that is bound to some of them does not become ready.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+
+from application_manager.cluster.client import ApiError, Client, Resource, Unreachable
+from application_manager.core.health.placement import Nodes
+
+NODES = Resource("v1", "Node", "nodes", namespaced=False)
+FRESH = 2.0  # s for which an answer is used again
+FORBIDDEN_FOR = 60.0  # s until it is asked again whether nodes may be listed
+
+log = logging.getLogger(__name__)
+
+
+class NodeLook:
+    """The labels of all nodes, a few seconds old at most."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._known: Nodes | None = None
+        self._until = 0.0  # monotonic time until which what is known is used
+        self._told = False
+        self._asking = asyncio.Lock()
+
+    async def labels(self) -> Nodes | None:
+        """The labels of nodes by name; None where they may not be listed, or the API server does not tell."""
+        async with self._asking:
+            if time.monotonic() >= self._until:
+                self._known = await self._listed()
+            return self._known
+
+    async def _listed(self) -> Nodes | None:
+        try:
+            found, _ = await self._client.list(NODES, None)
+        except ApiError as error:
+            self._until = time.monotonic() + (FORBIDDEN_FOR if error.code == 403 else FRESH)
+            if not self._told:
+                log.info("nodes cannot be listed (%s): why a pod fits none is left to the scheduler to say", error)
+                self._told = True
+            return None
+        except Unreachable:
+            return None
+        self._until = time.monotonic() + FRESH
+        return {str(each["metadata"]["name"]): each["metadata"].get("labels") or {} for each in found}

@@ -1,0 +1,111 @@
+"""What the manager knows of the cluster: the newest version of each object that it has seen.
+
+Fed by watch events, by the answers to our own writes and by lists, in any order. An older version never replaces a
+newer one, and what was seen deleted does not come back from a list that is older than its deletion.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from application_manager.core.objects.policy import KindKey
+from wayside.api.base import Kind
+from wayside.api.documents import parse_object
+
+Object = dict[str, Any]
+
+Name = tuple[str, str]
+"""Namespace and name."""
+
+_TOMBSTONES = 10_000  # uids of deleted objects that are remembered; the oldest are forgotten
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An object as it was seen: raw, and for our own kinds as a model, or why it is none."""
+
+    raw: Object
+    model: Kind | None = None
+    problem: str = ""
+
+    @property
+    def uid(self) -> str:
+        """The object's uid."""
+        return str(self.raw["metadata"]["uid"])
+
+    @property
+    def version(self) -> int:
+        """The object's resourceVersion, which grows."""
+        return int(self.raw["metadata"]["resourceVersion"])
+
+
+class Store:
+    """Objects by kind, then by namespace and name."""
+
+    def __init__(self, modelled: Iterable[KindKey]) -> None:
+        """`modelled`: the kinds that are ours and have a model."""
+        self._modelled = frozenset(modelled)
+        self._objects: dict[KindKey, dict[Name, Entry]] = {}
+        self._deleted: OrderedDict[str, None] = OrderedDict()
+
+    def get(self, kind: KindKey, name: Name) -> Entry | None:
+        """The object, or None."""
+        return self._objects.get(kind, {}).get(name)
+
+    def all(self, kind: KindKey) -> Iterator[tuple[Name, Entry]]:
+        """All objects of the kind, as of now."""
+        yield from list(self._objects.get(kind, {}).items())
+
+    def put(self, raw: Object) -> Entry | None:
+        """Note an object; the new entry, or None where this version is not news."""
+        kind, name = kind_of(raw), name_of(raw)
+        uid = raw["metadata"]["uid"]
+        known = self.get(kind, name)
+        if uid in self._deleted:
+            return None
+        if known is not None and known.version >= int(raw["metadata"]["resourceVersion"]):
+            return None
+        entry = self._entry(kind, raw)
+        self._objects.setdefault(kind, {})[name] = entry
+        return entry
+
+    def remove(self, raw: Object) -> Entry | None:
+        """Note that an object is gone; what was known of it, or None where that is not news."""
+        uid = raw["metadata"]["uid"]
+        self._deleted[uid] = None
+        if len(self._deleted) > _TOMBSTONES:
+            self._deleted.popitem(last=False)
+        known = self.get(kind_of(raw), name_of(raw))
+        if known is None or known.uid != uid:
+            return None
+        return self._objects[kind_of(raw)].pop(name_of(raw))
+
+    def missing(self, kind: KindKey, listed: Iterable[Object], version: str, scope: str | None) -> list[Entry]:
+        """The entries that a list (of the namespace `scope`, None for all) shows to be gone, since it has them not."""
+        present = {name_of(raw) for raw in listed}
+        return [
+            entry
+            for name, entry in self.all(kind)
+            if name not in present and entry.version <= int(version) and (scope is None or name[0] == scope)
+        ]
+
+    def _entry(self, kind: KindKey, raw: Object) -> Entry:
+        if kind not in self._modelled:
+            return Entry(raw)
+        try:
+            return Entry(raw, parse_object(raw))
+        except ValueError as error:  # an object older than its CRD: it is said in the object's status
+            return Entry(raw, problem=str(error))
+
+
+def kind_of(raw: Object) -> KindKey:
+    """The kind of an object as it was read."""
+    return raw["apiVersion"], raw["kind"]
+
+
+def name_of(raw: Object) -> Name:
+    """The namespace and name of an object as it was read."""
+    return raw["metadata"]["namespace"], raw["metadata"]["name"]

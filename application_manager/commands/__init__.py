@@ -1,0 +1,1 @@
+"""Commands that look or print, and end by themselves."""

@@ -1,0 +1,201 @@
+"""`application-manager inject`: manifests with their detectors in them, as the webhook would make their pods."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import yaml
+
+from application_manager.cluster.client import ApiError, Client, Resource, Unreachable
+from application_manager.cluster.connection import ConfigurationError, load_configuration
+from application_manager.core.findings.injections import detector_of, injection
+from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.sidecars import added, has_sidecar
+from wayside import commandline
+from wayside.api import API_VERSION, Detector
+from wayside.api.documents import parse_object
+from wayside.manifests import to_yaml
+
+_DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)
+_TEMPLATES = {
+    "Pod": (),
+    "PodTemplate": ("template",),
+    **dict.fromkeys(
+        ("Deployment", "StatefulSet", "DaemonSet", "ReplicaSet", "ReplicationController", "Job"), ("spec", "template")
+    ),
+    "CronJob": ("spec", "jobTemplate", "spec", "template"),
+}
+"""Where the pod, or the template of pods, is in a manifest of the kind."""
+
+_NO_IMAGE = "Detector {} names no image: give --detector-image, or its spec.pod.image"
+
+Manifest = dict[str, Any]
+
+
+def inject(
+    files: Annotated[
+        list[str],
+        typer.Option("--file", "-f", metavar="FILE|-", help="A YAML file, or - for stdin; repeatable. Detectors too."),
+    ],
+    namespace: Annotated[
+        str, typer.Option("--namespace", "-n", help="Of manifests that name none, for Detectors of the cluster.")
+    ] = "default",
+    detector_image: Annotated[
+        str | None, typer.Option(help="As of `run`: the image of detectors that name none.")
+    ] = None,
+) -> None:
+    """Print the manifests with the detectors in them that their pods ask for by the label wayside.dev/detector.
+
+    Pods, and what makes pods, e.g. a Deployment. The Detectors come from the files, else from the cluster of the
+    current kubeconfig. What asks for none, or has it already, is printed as it is. Where a pod cannot have its detector
+    that is said, it is printed as it is, and the exit code is 1.
+    """
+    documents = [each for file in files for each in _read(file)]
+    known = _Known({each.name: each for each in map(_detector, documents) if each is not None}, namespace)
+    injector = _Injector(asyncio.run(_looked_up(documents, known)), namespace, detector_image)
+    sys.stdout.write(to_yaml([injector.manifest(each) for each in documents if not _is_detector(each)]))
+    for line in injector.refusals:
+        typer.echo(line, err=True)
+    if injector.refusals:
+        raise typer.Exit(1)
+
+
+@dataclass(slots=True)
+class _Known:
+    """Detectors: of the files by name, those of the cluster by namespace and name."""
+
+    given: dict[str, Detector]
+    namespace: str
+    found: dict[tuple[str, str], Detector] = field(default_factory=dict)
+
+    def get(self, namespace: str, name: str) -> Detector | None:
+        return self.given.get(name) or self.found.get((namespace, name))
+
+
+@dataclass(slots=True)
+class _Injector:
+    known: _Known
+    namespace: str
+    image: str | None
+    refusals: list[str] = field(default_factory=list)
+
+    def manifest(self, raw: Manifest) -> Manifest:
+        """The manifest with its detector, where it asks for one."""
+        if raw.get("kind") == "List":
+            return raw | {"items": [self.manifest(each) for each in raw.get("items") or ()]}
+        path = _TEMPLATES.get(str(raw.get("kind")))
+        return raw if path is None else _replaced(raw, path, lambda pod: self._pod(raw, pod))
+
+    def _pod(self, raw: Manifest, pod: Manifest) -> Manifest:
+        name = detector_of(pod.get("metadata"))
+        spec = pod.get("spec") or {}
+        if name is None or has_sidecar(spec):
+            return pod
+        namespace = _namespace(raw, self.namespace)
+        detector = self.known.get(namespace, name)
+        image = self.image
+        if detector is not None and image is None:
+            image = detector.spec.pod.image if detector.spec.pod is not None else None
+            if image is None:
+                raise ConfigurationError(_NO_IMAGE.format(name))
+        found = injection(pod["metadata"], spec, namespace, detector, PodDefaults(image or ""))
+        if found.why_not is not None:
+            self.refusals.append(f"{raw['kind']} {(raw.get('metadata') or {}).get('name', '')}: {found.why_not}")
+        return pod if found.addition is None else pod | {"spec": added(spec, found.addition)}
+
+
+def _replaced(raw: Manifest, path: tuple[str, ...], change: Any) -> Manifest:
+    """The manifest with what is at the path changed; as it is where nothing is there."""
+    if not path:
+        return dict(change(raw))
+    inner = raw.get(path[0])
+    return raw | {path[0]: _replaced(inner, path[1:], change)} if isinstance(inner, dict) else raw
+
+
+async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
+    """Look up in the cluster what the files do not have."""
+    wanted = {
+        each for raw in documents for each in _wanted(raw, known.namespace) if known.get(*each) is None
+    }  # fmt: skip
+    if not wanted:
+        return known
+    listed = ", ".join(sorted(name for _, name in wanted))
+    otherwise = "give its file by -f, or a kubeconfig of the cluster that has it"
+    try:
+        client = Client(await load_configuration())
+    except ConfigurationError as error:
+        raise ConfigurationError(f"Detector {listed} is in none of the files: {error}: {otherwise}") from error
+    try:
+        for namespace, name in sorted(wanted):
+            raw = await client.get(_DETECTORS, namespace, name)
+            if raw is not None and (found := _detector(raw)) is not None:
+                known.found[namespace, name] = found
+    except (ApiError, Unreachable) as error:
+        raise ConfigurationError(f"Detector {listed} cannot be looked up: {error}: {otherwise}") from error
+    finally:
+        await client.close()
+    return known
+
+
+def _wanted(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:
+    """The namespaces and names of the Detectors that the manifest asks for and does not have."""
+    if raw.get("kind") == "List":
+        for each in raw.get("items") or ():
+            yield from _wanted(each, default)
+        return
+    for pod in _pods(raw):
+        name = detector_of(pod.get("metadata"))
+        if name is not None and not has_sidecar(pod.get("spec") or {}):
+            yield _namespace(raw, default), name
+
+
+def _pods(raw: Manifest) -> Iterator[Manifest]:
+    """The pod, or the template of pods, of the manifest."""
+    path = _TEMPLATES.get(str(raw.get("kind")))
+    inner: Any = None if path is None else raw
+    for step in path or ():
+        inner = inner.get(step) if isinstance(inner, dict) else None
+    if isinstance(inner, dict):
+        yield inner
+
+
+def _namespace(raw: Mapping[str, Any], default: str) -> str:
+    return str((raw.get("metadata") or {}).get("namespace") or default)
+
+
+def _is_detector(raw: Mapping[str, Any]) -> bool:
+    return (raw.get("apiVersion"), raw.get("kind")) == (API_VERSION, "Detector")
+
+
+def _detector(raw: Manifest) -> Detector | None:
+    """The Detector; None for another kind. Raises ConfigurationError where it is none that can be read."""
+    if not _is_detector(raw):
+        return None
+    try:
+        found = parse_object(raw)
+    except ValueError as error:
+        name = (raw.get("metadata") or {}).get("name", "")
+        raise ConfigurationError(f"Detector {name}: {error}") from error
+    return found if isinstance(found, Detector) else None
+
+
+def _read(file: str) -> list[Manifest]:
+    """The documents of a file. Raises ConfigurationError."""
+    try:
+        text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
+        documents = [each for each in yaml.safe_load_all(text) if each is not None]
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "is no UTF-8"
+        raise ConfigurationError(f"-f {file}: {reason}: give a readable YAML file, or - for stdin") from error
+    except yaml.YAMLError as error:
+        raise ConfigurationError(f"-f {file}: is no YAML: {' '.join(str(error).split())}") from error
+    for each in documents:
+        if not isinstance(each, dict) or not isinstance(each.get("kind"), str):
+            commandline.refuse(f"-f {file}: holds a document that is no manifest: each needs apiVersion and kind")
+    return documents

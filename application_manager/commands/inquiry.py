@@ -1,0 +1,152 @@
+"""Asking the cluster what an explanation needs: `application-manager explain`. It only reads."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from kubernetes.aio.config import ConfigException, list_kube_config_contexts
+
+from application_manager.cluster.client import LEASES, ApiError, Client, Object, Resource, Unreachable
+from application_manager.cluster.connection import load_configuration
+from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.statuses.explaining import Found, explain, serving
+from application_manager.core.statuses.explanation import Explanation
+from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
+from wayside.api.documents import parse_object
+from wayside.leases import lease_name
+
+Model = TypeVar("Model", bound=Kind)
+
+_contexts: Any = list_kube_config_contexts  # the package says that it is typed, yet this function is not
+
+_TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
+_INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
+_TEMPLATES = Resource(API_VERSION, "ApplicationTemplate", "applicationtemplates")
+_PODS = Resource("v1", "Pod", "pods")
+
+_TASK_WORDS = frozenset({"task", "apptask", "applicationtask", "applicationtasks"})
+_INSTANCE_WORDS = frozenset({"instance", "appinst", "applicationinstance", "applicationinstances"})
+
+
+class InquiryError(Exception):
+    """What was asked about cannot be explained; the message is one line, with the remedy."""
+
+
+async def inquire(subject: str, namespace: str | None) -> Explanation:
+    """The explanation of a task or an instance.
+
+    Args:
+        subject: a name, or `task/<name>`, `instance/<name>` where there is one of each.
+        namespace: None for the kubeconfig's, else `default`.
+
+    Raises:
+        InquiryError: there is no such thing, or the API server refuses to tell.
+        ConfigurationError: there is no cluster.
+    """
+    client = Client(await load_configuration())
+    try:
+        return await _inquire(client, subject, namespace or _namespace_of_context())
+    except (ApiError, Unreachable) as error:
+        raise InquiryError(f"the API server does not tell: {error}") from error
+    finally:
+        await client.close()
+
+
+def _namespace_of_context() -> str:
+    try:
+        _, active = _contexts()
+    except (ConfigException, OSError):
+        return "default"  # in a pod
+    return str((active or {}).get("context", {}).get("namespace") or "default")
+
+
+async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
+    kind, _, name = subject.rpartition("/")
+    task = await _read(client, _TASKS, ApplicationTask, namespace, name, kind, _TASK_WORDS)
+    existing = await _read(client, _INSTANCES, ApplicationInstance, namespace, name, kind, _INSTANCE_WORDS)
+    if kind and kind.lower() not in _TASK_WORDS | _INSTANCE_WORDS:
+        raise InquiryError(f"{subject}: {kind} is neither task nor instance: write task/{name} or instance/{name}")
+    if task is None and existing is None:
+        what = kind or "ApplicationTask or ApplicationInstance"
+        raise InquiryError(
+            f"there is no {what} {name!r} in namespace {namespace}: `kubectl get apptask,appinst -n {namespace}` lists "
+            "those that there are, and -n says another namespace"
+        )
+    if task is not None and existing is not None:
+        raise InquiryError(f"{name} is a task and an instance: write task/{name} or instance/{name}")
+    found = Found(
+        await _templates(client, namespace),
+        await _list(client, _TASKS, ApplicationTask, namespace),
+        await _list(client, _INSTANCES, ApplicationInstance, namespace),
+    )
+    now = time.time()
+    instance = serving(found, task, now) if task is not None else name
+    existing = next((each for each in found.instances if each.name == instance), None)
+    listed = existing.status.objects if existing and existing.status else []
+    objects = {
+        (each.api_version, each.kind, each.name): await _live(client, each.api_version, each.kind, namespace, each.name)
+        for each in listed
+    }
+    pods, _ = await client.list(_PODS, namespace, labels=f"{INSTANCE_LABEL}={instance}") if instance else ([], "")
+    holders = {task.spec.requester.holder} if task is not None else set()
+    leases = {each: await client.get(LEASES, namespace, lease_name(each)) for each in holders if each}
+    there = {holder: lease for holder, lease in leases.items() if lease is not None}
+    whole = replace(found, objects=objects, pods=pods, leases=there)
+    return explain(whole, task=task.name if task else None, instance=instance, now=now)
+
+
+async def _read(
+    client: Client,
+    resource: Resource,
+    model: type[Model],
+    namespace: str,
+    name: str,
+    kind: str = "",
+    words: frozenset[str] = frozenset(),
+) -> Model | None:
+    """The object, or None where there is none or another kind was asked for."""
+    if kind and kind.lower() not in words:
+        return None
+    raw = await client.get(resource, namespace, name)
+    if raw is None:
+        return None
+    try:
+        parsed = parse_object(raw)
+    except ValueError as error:
+        raise InquiryError(f"{resource.kind} {name} cannot be read: {error}: correct it") from error
+    return parsed if isinstance(parsed, model) else None
+
+
+async def _list(client: Client, resource: Resource, model: type[Model], namespace: str) -> Sequence[Model]:
+    """All of the namespace: who has a place under a limit, and who stands in for whom, hangs on the others too."""
+    raws, _ = await client.list(resource, namespace)
+    parsed = [_parsed(each) for each in raws]
+    return [each for each in parsed if isinstance(each, model)]
+
+
+async def _templates(client: Client, namespace: str) -> list[ApplicationTemplate | InvalidTemplate]:
+    found: list[ApplicationTemplate | InvalidTemplate] = []
+    for raw in (await client.list(_TEMPLATES, namespace))[0]:
+        try:
+            parsed = parse_object(raw)
+        except ValueError as error:
+            found.append(InvalidTemplate(raw["metadata"]["name"], str(error)))
+        else:
+            found += [parsed] if isinstance(parsed, ApplicationTemplate) else []
+    return found
+
+
+async def _live(client: Client, api_version: str, kind: str, namespace: str, name: str) -> Object | None:
+    resource = (await client.discover(api_version)).get((api_version, kind))
+    return await client.get(resource, namespace, name) if resource is not None else None
+
+
+def _parsed(raw: Object) -> Kind | None:
+    try:
+        return parse_object(raw)
+    except ValueError:
+        return None  # older than its CRD: it claims nothing, as its status says

@@ -1,0 +1,114 @@
+"""What would run, from files alone: the same pure functions as in the cluster."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from application_manager.charts.chartcache import ChartCache, default_folder
+from application_manager.charts.helm import Helm
+from application_manager.charts.rendering import rendered_at_once
+from application_manager.core.claims.operations import Standing
+from application_manager.core.demand import drafting
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.demand.demand import demand
+from application_manager.core.objects.charts import Charts, no_charts
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, RenderError
+from wayside.api import ApplicationTask, ApplicationTemplate, Kind
+from wayside.api.documents import load_documents
+from wayside.manifests import to_yaml
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """What would run.
+
+    Attributes:
+        objects: the instances, each followed by its manifests.
+        refusals: what cannot be, one line each.
+        notes: what else is worth knowing: tasks that wait, sums that are held at a bound.
+    """
+
+    objects: list[dict[str, Any]] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """The objects as YAML documents."""
+        return to_yaml(self.objects)
+
+
+def render_files(
+    paths: Iterable[Path], policy: Policy, limit: int | None = None, charts: Charts = no_charts
+) -> Rendered:
+    """What the templates and tasks in the files make run; other kinds are passed over.
+
+    Args:
+        paths: files or folders.
+        policy: what templates may create.
+        limit: how many instances a namespace may have; None: any number.
+        charts: renders charts.
+
+    Raises DocumentError for files that cannot be read as our kinds.
+    """
+    return render_objects([document.object for document in load_documents(paths)], policy, time.time(), limit, charts)
+
+
+def charts_at_once(helm: Helm, cache: Path | None, folder: Path) -> Charts:
+    """Renders charts while the caller waits.
+
+    Args:
+        helm: the program.
+        cache: the folder in which fetched charts are kept; None: the default one.
+        folder: in which all charts are that templates name by a path.
+    """
+    kept = ChartCache(helm, cache or default_folder(), folder)
+    return lambda request: asyncio.run(rendered_at_once(helm, kept, request))
+
+
+def render_objects(
+    objects: Sequence[Kind], policy: Policy, now: float, limit: int | None = None, charts: Charts = no_charts
+) -> Rendered:
+    """What the templates and tasks make run, namespace by namespace.
+
+    Args:
+        objects: those of other kinds are passed over.
+        policy: what templates may create.
+        now: seconds since 1970.
+        limit: how many instances a namespace may have; None: any number.
+        charts: renders charts.
+    """
+    result = Rendered()
+    for namespace in sorted({each.namespace for each in objects}):
+        here = [each for each in objects if each.namespace == namespace]
+        templates = {each.name: each for each in here if isinstance(each, ApplicationTemplate)}
+        tasks = [each for each in here if isinstance(each, ApplicationTask)]
+        outcome = demand(templates.values(), tasks, [], {}, now, limit)
+        for name, verdict in sorted(outcome.verdicts.items()):
+            line = f"ApplicationTask {namespace}/{name}: {verdict.reason}: {verdict.message}"
+            if verdict.standing is Standing.REFUSED:
+                result.refusals.append(line)
+            elif verdict.standing is Standing.WAITING:
+                result.notes.append(line)
+        for decision in outcome.instances.values():
+            _render(decision, templates[decision.template], policy, charts, result)
+    return result
+
+
+def _render(
+    decision: Decision, template: ApplicationTemplate, policy: Policy, charts: Charts, result: Rendered
+) -> None:
+    instance = drafting.draft((template.namespace, decision.name), decision, None)
+    result.objects.append(drafting.created(instance, template))
+    result.notes.extend(f"ApplicationInstance {template.namespace}/{decision.name}: {each}" for each in decision.capped)
+    try:
+        result.objects.extend(Renderer(template, policy).render(instance, charts).manifests)
+    except RenderError as error:
+        what = f"ApplicationTemplate {template.namespace}/{template.name}"
+        result.refusals.extend(f"{what}: {problem}" for problem in error.problems)

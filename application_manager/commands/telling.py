@@ -1,0 +1,108 @@
+"""An explanation as text for people, in the order of the chain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from application_manager.core.claims import values
+from application_manager.core.statuses.explanation import ExplainedInstance, ExplainedTask, Explanation
+
+_TASKS_SHOWN = 20
+_PODS_SHOWN = 20
+
+
+def text(explanation: Explanation) -> str:
+    """The explanation as lines, the last one ended too."""
+    return "".join(f"{line}\n" for line in _lines(explanation))
+
+
+def _lines(explanation: Explanation) -> Iterator[str]:
+    if explanation.task is not None:
+        yield from _task(explanation.task)
+    template, instance = explanation.template, explanation.instance
+    yield f"template {template.name}" + (f": {template.problem}" if template.problem else "")
+    if instance is None:
+        task = explanation.task
+        of_all = task is not None and task.operation != "Deploy" and task.standing in ("Counts", "Waiting")
+        yield "instances: it is for all of the template" if of_all else "instance: none"
+        return
+    yield from _instance(instance, template.name)
+    yield from _tasks(explanation, instance)
+    about = {each.name: f" ({each.subject})" for each in explanation.tasks if each.subject}
+    if explanation.parameters:
+        yield "parameters"
+    for each in explanation.parameters:
+        origin = {"default": ", the default", "earlier": ", kept from before", "none": ""}.get(each.source, "")
+        shown = "absent" if each.value is None else values.shown(each.value)
+        yield f"  {each.name} = {shown} (merge {each.merge}{origin})" + (f": {each.note}" if each.note else "")
+        for said in each.said:
+            why = f": {said.why}" if said.why else ""
+            effect = {"decides": "is it", "part": "is part of it", "outbid": "is outbid", "none": "is nothing"}[
+                said.effect
+            ]
+            yield f"    {values.shown(said.value)} of {said.task}{about.get(said.task, '')} {effect}{why}"
+    if explanation.objects:
+        yield "objects"
+    for thing in explanation.objects:
+        yield f"  {thing.kind} {thing.name} {thing.problem or 'is ready'}"
+    if explanation.pods:
+        yield "pods"
+    for pod in explanation.pods[:_PODS_SHOWN]:
+        where = f" on {pod.node}" if pod.node else ""
+        yield f"  {pod.name} {pod.phase}{where}: {pod.problem or ('ready' if pod.ready else 'not ready yet')}"
+    yield from _more(len(explanation.pods) - _PODS_SHOWN)
+
+
+def _task(task: ExplainedTask) -> Iterator[str]:
+    yield f"task {task.name} ({task.phase or 'no phase yet'})"
+    if task.event is not None:
+        onset, start = task.event["onsetTime"], task.event["startTime"]
+        times = f"started {start}" if onset == start else f"began {onset}, started {start}"
+        yield f"  event: {task.rule} of {task.subject}, {times}"
+        for name, value in sorted(task.event.get("values", {}).items()):
+            yield f"    {name} = {values.shown(value)}"
+    if task.detector or task.holder:
+        age = "" if task.lease_age_seconds is None else f", its Lease was renewed {task.lease_age_seconds:g} s ago"
+        lost = ", counted as lost" if task.holder_is_lost else ""
+        yield f"  asked for by detector {task.detector or '(unnamed)'}, holder {task.holder or 'none'}{age}{lost}"
+    else:
+        yield "  asked for by a person: it never lapses"
+    yield f"  {task.operation}, priority {task.priority}, created {task.created or 'just now'}"
+    yield f"  {task.standing}, {task.reason}: {task.message}"
+    said = ("Accepted", "Finished") if task.standing == "Finished" else ("Accepted",)  # by the line above
+    yield from _conditions(task.conditions, but=said)
+    if task.not_looked_at:
+        yield "  the manager has not looked at it as it is now: does `application-manager run` run for this namespace?"
+
+
+def _instance(instance: ExplainedInstance, template: str) -> Iterator[str]:
+    is_json = instance.key is not None and instance.key.startswith(("[", "{"))
+    key = "" if instance.key is None else f", key {instance.key if is_json else values.shown(instance.key)}"
+    state = (instance.phase or "no phase yet") if instance.exists else "not made yet"
+    by = "" if instance.managed else ", made by a person"
+    of = f" of template {instance.template}" if instance.template not in (None, template) else ""
+    yield f"instance {instance.name}{of} ({state}{key}{by})"
+    if instance.release_time is not None:
+        yield f"  it is released at {instance.release_time} unless a demand comes"
+    yield from _conditions(instance.conditions)
+
+
+def _conditions(conditions: list[dict[str, object]], but: tuple[str, ...] = ()) -> Iterator[str]:
+    for each in conditions:
+        if each["type"] not in but:
+            yield f"  {each['type']}={each['status']}, {each['reason']}: {each.get('message', '')}"
+
+
+def _tasks(explanation: Explanation, instance: ExplainedInstance) -> Iterator[str]:
+    yield f"tasks of instance {instance.name}" + ("" if explanation.tasks else ": none")
+    # What is over stays for an hour, and must not push what counts out of sight.
+    for task in sorted(explanation.tasks, key=lambda each: each.standing == "Finished")[:_TASKS_SHOWN]:
+        about = f"{task.rule} of {task.subject}" if task.rule else "by a person" if not task.holder else task.holder
+        why = "" if task.standing == "Counts" else f", {task.reason}: {task.message}"
+        yield f"  {task.name} ({about}, {task.operation}, priority {task.priority}) {task.standing}{why}"
+    yield from _more(len(explanation.tasks) - _TASKS_SHOWN)
+
+
+def _more(count: int) -> Iterator[str]:
+    if count > 0:
+        yield f"  and {count} more: -o json lists all"

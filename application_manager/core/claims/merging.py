@@ -1,0 +1,154 @@
+"""Several demands made one: the values of tasks, merged parameter by parameter as the template says.
+
+Pure. The contributions come in their order of precedence, and nothing else about them matters: which of them arrived
+first, or how often, has no influence. A default counts only where nobody gives the parameter, so it is not added here.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from application_manager.core.claims import values
+from wayside.api.parameter import Merge, Parameter
+
+BASELINE = "the template's baseline"
+
+
+@dataclass(frozen=True, slots=True)
+class Contribution:
+    """The values of one task."""
+
+    task: str
+    parameters: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Conflict:
+    """A task that differs from an earlier one, or from the baseline, in a parameter on which all must agree."""
+
+    parameter: str
+    value: Any
+    other: Any
+    other_task: str | None
+
+    def message(self) -> str:
+        """The refusal, with field, value and remedy."""
+        whose, until = (f"task {self.other_task}", "wait until that task ends, ") if self.other_task else (BASELINE, "")
+        return (
+            f"spec.parameters.{self.parameter}: {values.shown(self.value)} differs from {values.shown(self.other)} of "
+            f"{whose}, and its merge strategy is Same: give the same value, {until}"
+            "or let the template's key tell the two apart"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """One value for each parameter that somebody gives, and what became of the tasks.
+
+    Attributes:
+        parameters: without defaults.
+        conflicts: the tasks that could not take part, by name.
+        capped: a word about each sum that went beyond its parameter's bounds.
+    """
+
+    parameters: dict[str, Any]
+    conflicts: dict[str, Conflict]
+    capped: tuple[str, ...] = ()
+
+
+def merge(
+    declared: Mapping[str, Parameter],
+    contributions: Sequence[Contribution],
+    baseline: Mapping[str, Any] | None = None,
+) -> Merged:
+    """Merge the tasks' values, which fit the template, in the order given: the first of them has precedence.
+
+    What the baseline says, all must agree with where the strategy is Same; elsewhere it has the lowest priority.
+    """
+    taken, conflicts = _agreeing(declared, contributions, baseline or {})
+    said = [each.parameters for each in taken] + ([baseline] if baseline is not None else [])
+    result: dict[str, Any] = {}
+    capped: list[str] = []
+    for name, parameter in declared.items():
+        given = [each[name] for each in said if name in each]
+        if not given:
+            continue
+        value = _merged(parameter.merge, given)
+        if parameter.merge is Merge.SUM:
+            total, value = value, _within(parameter, value)
+            if total != value:
+                limit = "maximum" if total > value else "minimum"
+                capped.append(
+                    f"{name}: the sum of {len(given)} values, {_shown(total)}, is held at the {limit} of {value:g}"
+                )
+        result[name] = values.normal(value)
+    return Merged(result, conflicts, tuple(capped))
+
+
+def _agreeing(
+    declared: Mapping[str, Parameter], contributions: Sequence[Contribution], baseline: Mapping[str, Any]
+) -> tuple[list[Contribution], dict[str, Conflict]]:
+    """Those that take part: greedily in their order, each that agrees with all before it where all must agree."""
+    same = {name for name, each in declared.items() if each.merge is Merge.SAME}
+    agreed: dict[str, tuple[Any, str | None]] = {name: (baseline[name], None) for name in same & baseline.keys()}
+    taken: list[Contribution] = []
+    conflicts: dict[str, Conflict] = {}
+    for each in contributions:
+        for name in sorted(same & each.parameters.keys() & agreed.keys()):
+            other, task = agreed[name]
+            if values.canonical(each.parameters[name]) != values.canonical(other):
+                conflicts[each.task] = Conflict(name, each.parameters[name], other, task)
+                break
+        else:
+            taken.append(each)
+            for name in same & each.parameters.keys() - agreed.keys():
+                agreed[name] = (each.parameters[name], each.task)
+    return taken, conflicts
+
+
+def _merged(strategy: Merge, given: Sequence[Any]) -> Any:
+    match strategy:
+        case Merge.SAME | Merge.HIGHEST_PRIORITY:
+            return given[0]
+        case Merge.MAX:
+            return max(given)
+        case Merge.MIN:
+            return min(given)
+        case Merge.SUM:
+            return sum(map(Fraction, given))  # exact, so that the order of the tasks does not show in the last digit
+        case Merge.ALL:
+            return all(given)
+        case Merge.ANY:
+            return any(given)
+        case Merge.UNION | Merge.INTERSECTION:
+            return _items(strategy, given)
+
+
+def _items(strategy: Merge, given: Sequence[Sequence[Any]]) -> list[Any]:
+    lists = [{values.canonical(item): item for item in each} for each in given]
+    items = {text: item for each in lists for text, item in each.items()}
+    kept = items if strategy is Merge.UNION else {t: i for t, i in items.items() if all(t in each for each in lists)}
+    return sorted(kept.values(), key=values.sort_key)
+
+
+def _shown(total: Fraction) -> str:
+    try:
+        return f"{float(total):g}"
+    except OverflowError:
+        return "more than any number can say"
+
+
+def _within(parameter: Parameter, total: Fraction) -> int | float:
+    """The sum as a number within the parameter's bounds."""
+    largest = sys.float_info.max
+    low = -largest if parameter.minimum is None else parameter.minimum
+    high = largest if parameter.maximum is None else parameter.maximum
+    if total > high:
+        return high
+    if total < low:
+        return low
+    return int(total) if total.denominator == 1 else float(total)

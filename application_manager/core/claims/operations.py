@@ -1,0 +1,192 @@
+"""What the live tasks of one instance come to: Deploy merges, Reconfigure lies over it, Suspend stops it.
+
+Pure. `settle` looks at one instance; a task that means all instances of a template gets a verdict from each, and
+`gathered` makes one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from application_manager.core.claims.claims import Claim, Refused, template_of_all
+from application_manager.core.claims.merging import Contribution, Merged, merge
+from application_manager.core.claims.parameters import baseline, with_defaults
+from wayside.api import ApplicationTemplate
+from wayside.api.operation import Operation
+
+ACCEPTED = "Accepted"
+"""Reason of the condition Accepted of a task that counts, and of whom there is nothing more to say."""
+
+NOTHING_RUNS = "NothingRuns"
+"""Reason of the condition Accepted of a task that waits for something that it could change or stop."""
+
+_SHOWN = 5  # names of instances in a message
+
+
+class Standing(StrEnum):
+    """What a task is to the demand."""
+
+    COUNTS = "Counts"
+    WAITING = "Waiting"
+    REFUSED = "Refused"
+    LAPSED = "Lapsed"
+    FINISHED = "Finished"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of one task; reason and message are those of its condition Accepted, or Finished.
+
+    Attributes:
+        instance: the one that serves it.
+        acts: whether it acts on what runs, and does not deploy it.
+    """
+
+    standing: Standing
+    reason: str
+    message: str
+    instance: str | None = None
+    acts: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """What the tasks of one instance come to.
+
+    Attributes:
+        tasks: the names of those that deploy it and contribute, in their order.
+        baseline: whether the template demands it by itself.
+        parameters: the merged values with the defaults; None where nobody demands the instance.
+        suspender: the first task that suspends it and is not outbid.
+        verdicts: of all tasks, by name.
+        capped: a word about each sum that is held at a bound.
+    """
+
+    tasks: tuple[str, ...]
+    baseline: bool
+    parameters: dict[str, Any] | None
+    suspender: str | None
+    verdicts: dict[str, Verdict]
+    capped: tuple[str, ...]
+
+
+def settle(name: str, template: ApplicationTemplate | None, claims: Sequence[Claim], exists: bool) -> Settled:
+    """What the live claims, in their order of precedence, come to; `exists`: whether there is the instance already."""
+    declared = template.spec.parameters if template else {}
+    always = baseline(template) if template else None
+    deploying, changing, stopping = (
+        [each for each in claims if each.operation is operation]
+        for operation in (Operation.DEPLOY, Operation.RECONFIGURE, Operation.SUSPEND)
+    )
+    base = merge(declared, _contributions(deploying), always)
+    layer = merge(declared, _contributions(changing))
+    served = [each for each in deploying if each.task.name not in base.conflicts]
+    demanded = bool(served) or always is not None
+    suspended = [each for each in stopping if not _outbids(served, each)] if demanded or exists else []
+    suspender = suspended[0].task.name if suspended else None
+
+    verdicts: dict[str, Verdict] = {}
+    for each in claims:
+        verdicts[each.task.name] = (
+            _deploy_verdict(name, each, base, suspender)
+            if each.operation is Operation.DEPLOY
+            else _change_verdict(name, each, layer, demanded)
+            if each.operation is Operation.RECONFIGURE
+            else _stop_verdict(name, each, served, demanded or exists)
+        )
+    return Settled(
+        tasks=tuple(each.task.name for each in served),
+        baseline=always is not None,
+        parameters=with_defaults(declared, base.parameters | layer.parameters) if demanded else None,
+        suspender=suspender,
+        verdicts=verdicts,
+        capped=_capped(base, layer) if demanded else (),
+    )
+
+
+def _contributions(claims: Sequence[Claim]) -> list[Contribution]:
+    return [Contribution(each.task.name, each.parameters) for each in claims]
+
+
+def _capped(base: Merged, layer: Merged) -> tuple[str, ...]:
+    """Of the layer all, of what is below it only what shows."""
+    return layer.capped + tuple(each for each in base.capped if each.partition(":")[0] not in layer.parameters)
+
+
+def _outbids(served: Sequence[Claim], suspend: Claim) -> Claim | None:
+    """The task that deploys the instance with a higher priority; the baseline never does."""
+    first = served[0] if served else None
+    return first if first is not None and first.task.spec.priority > suspend.task.spec.priority else None
+
+
+def _deploy_verdict(name: str, each: Claim, base: Merged, suspender: str | None) -> Verdict:
+    conflict = base.conflicts.get(each.task.name)
+    if conflict is not None:
+        return Verdict(Standing.REFUSED, Refused.CONFLICT, conflict.message())
+    stopped = f", which task {suspender} suspends" if suspender else ""
+    return Verdict(Standing.COUNTS, ACCEPTED, f"counts for instance {name}{stopped}", name)
+
+
+def _change_verdict(name: str, each: Claim, layer: Merged, demanded: bool) -> Verdict:
+    conflict = layer.conflicts.get(each.task.name)
+    if conflict is not None:
+        return Verdict(Standing.REFUSED, Refused.CONFLICT, conflict.message())
+    if not demanded:
+        return _waiting(name, each)
+    return Verdict(Standing.COUNTS, ACCEPTED, f"reconfigures instance {name}", name, acts=True)
+
+
+def _stop_verdict(name: str, each: Claim, served: Sequence[Claim], runs: bool) -> Verdict:
+    if not runs:
+        return _waiting(name, each)
+    higher = _outbids(served, each)
+    if higher is not None:
+        message = (
+            f"spec.priority: {each.task.spec.priority} is below {higher.task.spec.priority} of task "
+            f"{higher.task.name}, which deploys instance {name}: give at least that priority, or wait until that task "
+            "ends"
+        )
+        return Verdict(Standing.REFUSED, Refused.OUTBID, message)
+    return Verdict(Standing.COUNTS, ACCEPTED, f"suspends instance {name}", name, acts=True)
+
+
+def _waiting(name: str, each: Claim) -> Verdict:
+    message = (
+        f"no task deploys instance {name}, and a {each.operation} task starts nothing: it takes effect as soon as one "
+        "does"
+    )
+    return Verdict(Standing.WAITING, NOTHING_RUNS, message)
+
+
+def waiting_for_any(claim: Claim) -> Verdict:
+    """The verdict of a task that means all instances of a template that has none."""
+    message = (
+        f"no task deploys any instance of template {template_of_all(claim.instance)}, and a {claim.operation} task "
+        "starts nothing: it takes effect as soon as one does"
+    )
+    return Verdict(Standing.WAITING, NOTHING_RUNS, message)
+
+
+def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> Verdict:
+    """The one verdict of a task that means all instances of a template.
+
+    Args:
+        claim: of the task.
+        parts: its verdicts, by instance.
+        otherwise: what holds where there is no instance that it could be about.
+    """
+    if otherwise.standing is not Standing.WAITING:  # its holder is lost: that is so for all of them
+        return otherwise
+    counting = sorted(name for name, each in parts.items() if each.standing is Standing.COUNTS)
+    others = [each for _, each in sorted(parts.items()) if each.standing not in (Standing.COUNTS, Standing.WAITING)]
+    if not counting:
+        return others[0] if others else otherwise
+    verb = "reconfigures" if claim.operation is Operation.RECONFIGURE else "suspends"
+    names = ", ".join(counting[:_SHOWN]) + (f" and {len(counting) - _SHOWN} more" if len(counting) > _SHOWN else "")
+    message = f"{verb} instance{'s' if len(counting) > 1 else ''} {names}"
+    if others:
+        message += f"; but not {len(others)}, the first since {others[0].message}"
+    return Verdict(Standing.COUNTS, ACCEPTED, message, counting[0] if len(counting) == 1 else None)

@@ -1,0 +1,1 @@
+"""What should run, and where not all can, who does."""

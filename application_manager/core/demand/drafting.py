@@ -1,0 +1,98 @@
+"""An instance as a decision wants it, before the cluster has it: its spec, its manifest and its objects. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.conditions import Aspect
+from application_manager.core.demand.decisions import Decision, is_managed
+from application_manager.core.demand.lingering import LINGER_ANNOTATION, linger_of
+from application_manager.core.objects.charts import Charts, no_charts
+from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
+from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
+from wayside.api.applicationinstance import ApplicationInstanceSpec
+from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
+
+Name = tuple[str, str]
+"""Namespace and name."""
+
+TemplateState = ApplicationTemplate | InvalidTemplate | None
+
+RendererOf = Callable[[ApplicationTemplate], Renderer]
+"""Compiles a template, or raises RenderError."""
+
+
+def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) -> ApplicationInstance:
+    """The instance as it should be; without a uid where it does not exist yet."""
+    suspended = bool(existing and existing.spec.suspended) if decision.suspended is None else decision.suspended
+    if existing is not None and decision.parameters is None:
+        if suspended == existing.spec.suspended:
+            return existing
+        return existing.model_copy(update={"spec": existing.spec.model_copy(update={"suspended": suspended})})
+    spec = ApplicationInstanceSpec(
+        template=decision.template,
+        key=decision.key,
+        parameters=dict(decision.parameters or {}),
+        suspended=suspended,
+    )
+    if existing is not None:
+        return existing.model_copy(update={"spec": spec})
+    labels = {MANAGED_BY_LABEL: MANAGED_BY}
+    return ApplicationInstance(metadata=Metadata(name=name[1], namespace=name[0], labels=labels), spec=spec)
+
+
+def manifest(
+    wanted: ApplicationInstance, existing: ApplicationInstance | None, template: TemplateState
+) -> dict[str, Any] | None:
+    """What to apply so that the instance becomes as wanted; None if it is so already, or is a person's."""
+    usable = template if isinstance(template, ApplicationTemplate) else None
+    if existing is None:
+        return created(wanted, usable)
+    linger = str(linger_of(wanted, usable))
+    noted = existing.metadata.annotations.get(LINGER_ANNOTATION)
+    if not is_managed(existing) or (existing.spec == wanted.spec and (usable is None or noted == linger)):
+        return None
+    whole = created(wanted, usable)
+    return {**whole, "metadata": {**whole["metadata"], "uid": existing.metadata.uid}}
+
+
+def created(wanted: ApplicationInstance, template: ApplicationTemplate | None) -> dict[str, Any]:
+    """The manifest by which the instance comes to be."""
+    return {
+        "apiVersion": API_VERSION,
+        "kind": wanted.kind,
+        "metadata": {
+            "name": wanted.name,
+            "namespace": wanted.namespace,
+            "labels": {MANAGED_BY_LABEL: MANAGED_BY},
+            "annotations": {LINGER_ANNOTATION: str(linger_of(wanted, template))},
+        },
+        "spec": wanted.spec.to_json(),
+    }
+
+
+CHART_PENDING = "ChartPending"
+"""The reason of the condition Applied while a chart is being rendered."""
+
+
+def objects(
+    wanted: ApplicationInstance, template: TemplateState, renderer: RendererOf, charts: Charts = no_charts
+) -> Rendering | Aspect:
+    """The instance's objects, or why it has none, as the condition Applied says it."""
+    of = wanted.spec.template
+    if template is None:
+        message = (
+            f"spec.template: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create it; "
+            "until then what runs stays as it is"
+        )
+        return Aspect("Applied", False, "TemplateNotFound", message)
+    if isinstance(template, InvalidTemplate):
+        return Aspect("Applied", False, "TemplateInvalid", f"ApplicationTemplate {of}: {template.problem}")
+    try:
+        return renderer(template).render(wanted, charts)
+    except ChartPending as pending:
+        return Aspect("Applied", False, CHART_PENDING, f"ApplicationTemplate {of}: {pending}")
+    except RenderError as error:
+        return Aspect("Applied", False, error.reason, f"ApplicationTemplate {of}: {error}")

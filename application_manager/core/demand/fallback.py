@@ -1,0 +1,180 @@
+"""What a demand turns to when its application does not become ready: `lifecycle.readyTimeout` and `fallback`. Pure.
+
+An instance is overdue once it has not been ready for `readyTimeout` in one go, and no longer so once it has been ready
+for as long in one go: both are told by conditions of its status with their times of transition, so a restart of the
+manager changes nothing, and what is ready for a moment now and then does not flap. While it is overdue, its tasks also
+claim an instance of the fallback template, with those of their parameters that it knows; the overdue one stays, and
+tries on. A fallback has no fallback of its own for what it took over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, claim
+from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.conditions import Aspect, find, holds
+from wayside.api import ApplicationInstance, ApplicationTemplate
+from wayside.api.base import Condition
+from wayside.api.operation import Operation
+from wayside.times import parse_seconds
+
+TIMED_OUT = "TimedOut"
+"""The condition of an instance that is overdue."""
+
+READY_TIMEOUT = "ReadyTimeout"
+"""Reason of the conditions Ready and TimedOut of such an instance."""
+
+FALLEN_BACK = "FallenBack"
+"""Reason of the condition Accepted of a task that the fallback serves."""
+
+FALLBACK_FAILED = "FallbackFailed"
+"""The same where the fallback cannot, as the message says."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fallback:
+    """What the tasks of an overdue instance claim besides.
+
+    Attributes:
+        template: the fallback's.
+        claims: one for each task that it can take over.
+        refused: by task, why it cannot.
+    """
+
+    template: str
+    claims: tuple[Claim, ...]
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+    def instance_of(self, task: str) -> str | None:
+        """The instance that is to serve the task instead; None where none can."""
+        return next((each.instance for each in self.claims if each.task.name == task), None)
+
+    @property
+    def instances(self) -> set[str]:
+        """The instances that are to serve instead."""
+        return {each.instance for each in self.claims}
+
+
+def fallback_of(template: ApplicationTemplate | InvalidTemplate | None) -> str | None:
+    """The template that this one falls back to, if it does."""
+    if not isinstance(template, ApplicationTemplate) or template.spec.lifecycle.fallback is None:
+        return None
+    return template.spec.lifecycle.fallback.template
+
+
+def overdue(
+    instance: ApplicationInstance, template: ApplicationTemplate | InvalidTemplate | None, now: float
+) -> tuple[str, float | None]:
+    """The readyTimeout that the instance is beyond, empty where it is not; and when that changes by itself."""
+    if not isinstance(template, ApplicationTemplate) or template.spec.lifecycle.ready_timeout is None:
+        return "", None
+    timeout = template.spec.lifecycle.ready_timeout
+    conditions = instance.status.conditions if instance.status else []
+    was, ready = holds(conditions, TIMED_OUT), find(conditions, "Ready")
+    is_ready = ready is not None and ready.status == "True"
+    since = ready.last_transition_time if ready is not None else instance.metadata.creation_timestamp
+    if instance.spec.suspended or is_ready != was or not since:
+        return str(timeout) if was else "", None
+    start = parse_seconds(since)
+    if not is_ready and (resumed := find(conditions, "Suspended")) is not None:
+        start = max(start, parse_seconds(resumed.last_transition_time))
+    ends = start + timeout.seconds
+    if now < ends:
+        return str(timeout) if was else "", ends
+    return "" if was else str(timeout), None
+
+
+def fallback(
+    instance: str,
+    template: ApplicationTemplate | InvalidTemplate | None,
+    other: ApplicationTemplate | InvalidTemplate | None,
+    claims: Iterable[Claim],
+) -> Fallback | None:
+    """What the claims on an overdue instance become; None where its template has no fallback.
+
+    Args:
+        instance: its name.
+        template: its own.
+        other: the fallback template; None where there is none of that name.
+        claims: those that deploy it and count.
+    """
+    name = fallback_of(template)
+    if name is None:
+        return None
+    taken: list[Claim] = []
+    refused: dict[str, str] = {}
+    for each in claims:
+        if each.operation is not Operation.DEPLOY or each.instead_of:
+            continue
+        if other is None:
+            refused[each.task.name] = f"there is no ApplicationTemplate {name!r}: create it, or correct the fallback"
+            continue
+        result = _claim(other, each)
+        if isinstance(result, Refusal):
+            refused[each.task.name] = result.message
+        else:
+            taken.append(replace(result, task=each.task, instead_of=instance, fallback=name))
+    return Fallback(name, tuple(taken), refused)
+
+
+def _claim(other: ApplicationTemplate | InvalidTemplate, each: Claim) -> Claim | Refusal:
+    if isinstance(other, InvalidTemplate):
+        return claim(other, each.task)
+    known = {name: value for name, value in each.task.spec.parameters.items() if name in other.spec.parameters}
+    spec = each.task.spec.model_copy(update={"parameters": known})
+    return claim(other, each.task.model_copy(update={"spec": spec}))
+
+
+def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str, Verdict]) -> Verdict:
+    """The task's verdict, with what became of it at the fallback.
+
+    Args:
+        verdict: that of its own instance.
+        task: its name.
+        to: what it turns to, if it does.
+        others: the verdicts of the fallback's instance; empty where that was not looked at yet.
+    """
+    if to is None or verdict.standing is not Standing.COUNTS or verdict.acts:
+        return verdict
+    refusal = to.refused.get(task)
+    found = others.get(task)
+    if refusal is None and found is not None and found.standing is Standing.COUNTS:
+        message = (
+            f"instance {verdict.instance} is not ready: instance {found.instance} of template {to.template} serves"
+        )
+        return replace(found, reason=FALLEN_BACK, message=f"{message} instead, until it is")
+    if refusal is None and found is None:
+        return verdict
+    why = refusal or (found.message if found else "")
+    message = f"instance {verdict.instance} is not ready, and template {to.template} cannot serve instead: {why}"
+    return replace(verdict, reason=FALLBACK_FAILED, message=message)
+
+
+def aspects(
+    known: Iterable[Condition], late: str, turns: Fallback | None, stands_in_for: Iterable[str]
+) -> Iterator[Aspect]:
+    """The conditions TimedOut and StandsIn of an instance, each from when it was True for the first time.
+
+    Args:
+        known: the instance's conditions.
+        late: the readyTimeout that it is beyond; empty where it is not.
+        turns: what its tasks turn to meanwhile.
+        stands_in_for: the instances whose tasks it serves.
+    """
+    conditions, others = list(known), ", ".join(stands_in_for)
+    if late:
+        message = f"it was not ready for {late}"
+        if turns is not None and turns.instances:
+            names = ", ".join(sorted(turns.instances))
+            message += f": its tasks are served by {names} of template {turns.template}, until it was ready for {late}"
+        elif turns is not None and turns.refused:
+            message += f", and template {turns.template} cannot serve instead: {next(iter(turns.refused.values()))}"
+        yield Aspect(TIMED_OUT, True, READY_TIMEOUT, message)
+    elif find(conditions, TIMED_OUT) is not None:
+        yield Aspect(TIMED_OUT, False, "InTime", "it is ready, or has time to become so")
+    if others:
+        yield Aspect("StandsIn", True, "Fallback", f"it serves tasks in place of {others}, which is not ready")
+    elif find(conditions, "StandsIn") is not None:
+        yield Aspect("StandsIn", False, "NoFallback", "it serves its own tasks only")

@@ -1,0 +1,243 @@
+"""Who runs where there is a limit: of all instances that are demanded or there, those that have a place. Pure.
+
+Two limits may hold at once: a template's `maxInstances`, and one for the namespace. The order is: what may not be
+stopped (held or paused by a person, or younger than its `minimumUptime`); then what is demanded, by the priority of its
+first task, of equal priority what runs already, then the older demand; last what lingers, the latest deadline first. So
+a higher priority preempts, an equal one never does, and what lingers yields first.
+
+An instance is counted until it is gone. So what gets the place of another waits for that, and no limit is exceeded.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+Rank = tuple[int, str, str]
+"""Of a demand's first task: its priority negated, its creation, its name."""
+
+BASELINE_RANK: Rank = (1_000_001, "", "")
+"""A template's own demand, below all tasks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """An instance that is demanded, or there.
+
+    Attributes:
+        rank: of its demand; None where nobody demands it.
+        exists: whether it is there, or being made.
+        leaving: whether it is being deleted: it is there, and is no reason to keep it.
+        kept: whether it stays whatever the limit: a person holds or pauses it, or it waits for its template.
+        protected_until: the end of its minimumUptime, in seconds since 1970.
+        deadline: the end of its linger, in seconds since 1970.
+        ran: whether it served its demand before.
+    """
+
+    name: str
+    template: str
+    rank: Rank | None
+    exists: bool = False
+    leaving: bool = False
+    kept: bool = False
+    protected_until: float = 0.0
+    deadline: float | None = None
+    ran: bool = False
+
+    @property
+    def priority(self) -> int:
+        """That of its first task; where nobody demands it, below all others."""
+        return -(self.rank or BASELINE_RANK)[0]
+
+    @property
+    def text(self) -> str:
+        """The instance and its first task, for messages."""
+        task = f" (task {self.rank[2]}, priority {self.priority})" if self.rank and self.rank[2] else ""
+        return f"instance {self.name}{task}"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How many instances there may be: of each template that says so, and in the namespace."""
+
+    templates: Mapping[str, int] = field(default_factory=dict)
+    namespace: int | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self.templates) or self.namespace is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What an instance gets.
+
+    Attributes:
+        given: whether it runs, or stays; otherwise it does not start, and goes if it is there.
+        preempts: the one whose place it has, in words; empty where there is none.
+        awaits: of one that is to run: whom it waits for to be gone, in words; empty where it may start.
+        limit: of one that is not to run: the limit that it is beyond, in words.
+        yields_to: of one that is not to run and did before: who has its place, in words.
+        outbid_from: of one that is not to run: the priority that would have a place; None where none would.
+        next_change: when this changes by itself, in seconds since 1970.
+    """
+
+    given: bool = True
+    preempts: str = ""
+    awaits: str = ""
+    limit: str = ""
+    yields_to: str = ""
+    outbid_from: int | None = None
+    next_change: float | None = None
+
+    @property
+    def starts(self) -> bool:
+        """Whether it may run now."""
+        return self.given and not self.awaits
+
+
+def places(candidates: Iterable[Candidate], limits: Limits, now: float) -> dict[str, Place]:
+    """What each candidate of one namespace gets, by name; `now` in seconds since 1970."""
+    everybody = sorted(candidates, key=lambda each: each.name)
+    fixed = [each for each in everybody if _is_fixed(each, now)]
+    free = sorted((each for each in everybody if not _is_fixed(each, now)), key=_order)
+    room = _Room(limits)
+    beyond: dict[str, str] = {}
+    for each in fixed:
+        room.take(each)
+    for each in free:
+        if each.leaving and each.rank is None:
+            beyond[each.name] = "is being deleted"
+        elif limit := room.lacks(each):
+            beyond[each.name] = limit
+        else:
+            room.take(each)
+    chosen = [each for each in [*fixed, *free] if each.name not in beyond]
+    losers = [each for each in free if each.name in beyond and each.rank is not None]
+    by = _preemptions(chosen, losers, limits)
+    victims = {winner.name: loser for loser, winner in by.values()}
+    result = {each.name: Place(given=False, limit=beyond[each.name]) for each in free if each.name in beyond}
+    result |= {each.name: Place(preempts=victims[each.name].text if each.name in victims else "") for each in chosen}
+    bars, none = _bars(chosen, limits, now), _Bar(None, None)
+    for each in losers:
+        bar = bars.get("" if limits.namespace is not None else each.template, none)
+        result[each.name] = Place(
+            given=False,
+            limit=beyond[each.name],
+            yields_to=by[each.name][1].text if each.name in by else "",
+            outbid_from=bar.outbid_from,
+            next_change=bar.next_change,
+        )
+    result |= _waiting(everybody, chosen, result, limits)
+    return result
+
+
+def _is_fixed(each: Candidate, now: float) -> bool:
+    return each.exists and not each.leaving and (each.kept or now < each.protected_until)
+
+
+def _order(each: Candidate) -> tuple[object, ...]:
+    if each.rank is None:
+        return (1, -(each.deadline or 0.0), False, "", "", each.name)
+    negated, created, task = each.rank
+    return (0, negated, not each.exists or each.leaving, created, task, each.name)
+
+
+class _Room:
+    """How much of the limits is taken."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._taken: Counter[str] = Counter()
+        self._total = 0
+
+    def take(self, each: Candidate) -> None:
+        self._taken[each.template] += 1
+        self._total += 1
+
+    def lacks(self, each: Candidate) -> str:
+        """The limit that leaves no room for it, in words; empty where there is room."""
+        own, all_ = self._limits.templates.get(each.template), self._limits.namespace
+        if own is not None and self._taken[each.template] >= own:
+            return f"template {each.template} is at its limit of {_instances(own)} (spec.maxInstances)"
+        if all_ is not None and self._total >= all_:
+            return f"the namespace is at its limit of {_instances(all_)} (--max-instances of the manager)"
+        return ""
+
+
+def _instances(count: int) -> str:
+    return "1 instance" if count == 1 else f"{count} instances"
+
+
+def _rivals(each: Candidate, others: Iterable[Candidate], limits: Limits) -> Iterator[Candidate]:
+    """Those that take places from the same limit."""
+    for other in others:
+        if other.name != each.name and (limits.namespace is not None or other.template == each.template):
+            yield other
+
+
+def _preemptions(
+    chosen: list[Candidate], losers: list[Candidate], limits: Limits
+) -> dict[str, tuple[Candidate, Candidate]]:
+    """By the name of each that ran and has no place any more, itself and who has its place.
+
+    The last in order gives way to the first of those that came after it with a higher priority.
+    """
+    found: dict[str, tuple[Candidate, Candidate]] = {}
+    left = sorted((each for each in chosen if each.rank is not None), key=_order)
+    for loser in reversed(losers):
+        if not loser.ran or loser.rank is None:
+            continue
+        higher = [each for each in _rivals(loser, left, limits) if each.priority > loser.priority]
+        later = [each for each in higher if each.rank is not None and each.rank[1] >= loser.rank[1]]
+        if winner := next(iter(later or higher), None):
+            found[loser.name] = (loser, winner)
+            left.remove(winner)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Bar:
+    """What it takes to get a place among those that have one.
+
+    Attributes:
+        outbid_from: the lowest priority that would have one; None where none would.
+        next_change: when the first of them may be stopped, in seconds since 1970.
+    """
+
+    outbid_from: int | None
+    next_change: float | None
+
+
+def _bars(chosen: Iterable[Candidate], limits: Limits, now: float) -> dict[str, _Bar]:
+    """By template; by an empty name that of all together, where the namespace has a limit."""
+    groups: dict[str, list[Candidate]] = {}
+    for each in chosen:
+        groups.setdefault("" if limits.namespace is not None else each.template, []).append(each)
+    found = {}
+    for name, members in groups.items():
+        movable = [each for each in members if not each.kept]
+        lowest = min((each.priority for each in movable), default=None)
+        ends = [each.protected_until for each in movable if now < each.protected_until]
+        outbid_from = None if lowest is None else max(lowest, -BASELINE_RANK[0]) + 1
+        found[name] = _Bar(outbid_from, min(ends, default=None))
+    return found
+
+
+def _waiting(
+    everybody: list[Candidate], chosen: list[Candidate], so_far: Mapping[str, Place], limits: Limits
+) -> dict[str, Place]:
+    """The places of those that are to run, and wait until others are gone."""
+    room = _Room(limits)
+    for each in everybody:
+        if each.exists:
+            room.take(each)
+    going = [each for each in everybody if each.exists and (each.leaving or not so_far[each.name].given)]
+    found = {}
+    for each in sorted((each for each in chosen if not each.exists), key=_order):
+        if room.lacks(each):
+            names = ", ".join(other.name for other in _rivals(each, going, limits))
+            found[each.name] = Place(preempts=so_far[each.name].preempts, awaits=names or "another")
+        else:
+            room.take(each)
+    return found

@@ -1,0 +1,124 @@
+"""Bringing limits to bear: what a decision by itself asks for, and what becomes of it once places are given. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.claims.operations import NOTHING_RUNS, Standing, Verdict
+from application_manager.core.demand import byhand
+from application_manager.core.demand.decisions import Decision, is_managed
+from application_manager.core.demand.lingering import protected_until
+from application_manager.core.demand.places import Candidate, Limits, Place
+from wayside.api import ApplicationInstance, ApplicationTemplate
+from wayside.times import format_seconds
+
+LIMIT_REACHED = "LimitReached"
+"""Reason of the condition Accepted of a task whose instance waits for a place."""
+
+PREEMPTED = "Preempted"
+"""The same, where the instance ran and one of higher priority has its place."""
+
+
+def limits(templates: Iterable[ApplicationTemplate | InvalidTemplate], namespace: int | None) -> Limits:
+    """The limits of one namespace; `namespace` is that of all its instances."""
+    own = {
+        each.name: each.spec.max_instances
+        for each in templates
+        if isinstance(each, ApplicationTemplate) and each.spec.max_instances is not None
+    }
+    return Limits(own, namespace)
+
+
+def candidate(
+    decision: Decision,
+    instance: ApplicationInstance | None,
+    template: ApplicationTemplate | InvalidTemplate | None,
+    *,
+    being_made: bool = False,
+) -> Candidate | None:
+    """What the decision asks for; None where that is nothing, or the instance is a person's, beyond all limits."""
+    if instance is not None and not is_managed(instance):
+        return None
+    if instance is None and decision.rank is None:
+        return None
+    kept = instance is not None and (
+        decision.paused or byhand.is_held(instance) or (not decision.wanted and decision.release_time is None)
+    )
+    return Candidate(
+        name=decision.name,
+        template=decision.template,
+        rank=decision.rank,
+        exists=instance is not None or being_made,
+        leaving=instance is not None and instance.metadata.deletion_timestamp is not None,
+        kept=kept,
+        protected_until=protected_until(instance, template) if instance is not None else 0.0,
+        deadline=decision.release_time,
+        ran=instance is not None or decision.ran,
+    )
+
+
+def placed(decision: Decision, place: Place | None, *, exists: bool, now: float) -> Decision:
+    """What becomes of the decision with the place that its instance got; None: no limit concerns it."""
+    if place is None:
+        return decision
+    if place.starts:
+        return _marked(decision, f", in place of {place.preempts}, which it preempts") if place.preempts else decision
+    if exists and place.given:
+        return decision
+    reason, message = _why(decision, place)
+    verdicts = {
+        name: _waiting(decision, each, reason, message) if each.standing is Standing.COUNTS else each
+        for name, each in decision.verdicts.items()
+    }
+    changes = [each for each in (decision.next_change, place.next_change) if each is not None and each > now]
+    return replace(
+        decision,
+        parameters=None,
+        tasks=(),
+        baseline=False,
+        suspended=None,
+        suspender=None,
+        capped=(),
+        fallback=None,
+        stands_in_for=(),
+        verdicts=verdicts,
+        release_time=now if exists else None,
+        next_change=min(changes, default=None),
+        yields=message if exists else "",
+    )
+
+
+def _why(decision: Decision, place: Place) -> tuple[str, str]:
+    if place.given:
+        instead = f" in place of {place.preempts}, which it preempts," if place.preempts else ""
+        return LIMIT_REACHED, f"instance {decision.name} starts{instead} as soon as {place.awaits} is gone"
+    if decision.rank is None:
+        return LIMIT_REACHED, f"{place.limit}, and nobody demands instance {decision.name}"
+    remedy = "raise the limit, or wait until another ends"
+    if place.yields_to:
+        message = f"instance {decision.name} gave way to {place.yields_to}, since {place.limit}: {remedy}"
+        return PREEMPTED, message
+    if place.outbid_from is not None and place.outbid_from <= -decision.rank[0] and place.next_change is not None:
+        remedy = f"it gets one after {format_seconds(place.next_change)}, until when another has its minimumUptime"
+    elif place.outbid_from is not None:
+        remedy = f"{remedy}, or give a priority of {place.outbid_from} or more"
+    return LIMIT_REACHED, f"instance {decision.name} waits for a place, since {place.limit}: {remedy}"
+
+
+def _waiting(decision: Decision, each: Verdict, reason: str, message: str) -> Verdict:
+    if each.acts:
+        what = f"instance {decision.name} has no place to run ({reason}): this takes effect as soon as it has"
+        return Verdict(Standing.WAITING, NOTHING_RUNS, what)
+    return Verdict(Standing.WAITING, reason, message)
+
+
+def _marked(decision: Decision, words: str) -> Decision:
+    verdicts = {
+        name: replace(each, message=each.message + words)
+        if each.standing is Standing.COUNTS and not each.acts
+        else each
+        for name, each in decision.verdicts.items()
+    }
+    return replace(decision, verdicts=verdicts)

@@ -1,0 +1,53 @@
+"""What a rule's deploy actions ask of templates, looked at before any task is emitted. Pure.
+
+The rule is in order all the same, and a template may yet come or change: so these are remarks, and nothing is refused.
+What `${…}` will be nobody knows before the episode, so of these parameters only the names are looked at.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Iterator
+
+from application_manager.core.claims import parameters
+from wayside.api import ApplicationTemplate, EventRule
+from wayside.api.actions.deploy import Deploy
+from wayside.api.operation import Operation
+
+
+def deploy_remarks(rule: EventRule, templates: Iterable[ApplicationTemplate], invalid: Iterable[str] = ()) -> list[str]:
+    """What the tasks of the rule would be refused for.
+
+    Args:
+        rule: the rule.
+        templates: those of its namespace that are valid.
+        invalid: the names of its namespace's other templates.
+    """
+    known, others = {each.name: each for each in templates}, set(invalid)
+    found: list[str] = []
+    for index, action in enumerate(rule.spec.actions):
+        if action.deploy is None or action.deploy.template in others:
+            continue
+        where = f"spec.actions[{index}].deploy"
+        template = known.get(action.deploy.template)
+        if template is None:
+            close = difflib.get_close_matches(action.deploy.template, [*known, *others], n=1)
+            remedy = f"did you mean {close[0]}?" if close else "create it, or tasks of this rule are refused"
+            found.append(
+                f"{where}.template: there is no ApplicationTemplate {action.deploy.template} in namespace "
+                f"{rule.namespace}: {remedy}"
+            )
+        else:
+            found += _of_parameters(action.deploy, template, f"{where}.parameters")
+    return found
+
+
+def _of_parameters(deploy: Deploy, template: ApplicationTemplate, where: str) -> Iterator[str]:
+    declared, given = template.spec.parameters, deploy.parameters
+    told = {name: each for name, each in given.items() if name not in declared or "${" not in json.dumps(each)}
+    yield from parameters.problems(declared, told, template.name, where, whole=False)
+    if deploy.operation is Operation.DEPLOY:
+        for name, parameter in declared.items():
+            if parameter.required and given.get(name) is None:
+                yield f"{where}.{name}: is missing, and template {template.name} requires it: give a {parameter.type}"

@@ -1,0 +1,49 @@
+"""What a look at a template, a rule or a detector finds: what must be corrected, what may come right, what is odd.
+
+The same findings make the condition Accepted, the answer of admission, and what `application-manager check` prints.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+_FIELD = re.compile(r"^((?:spec|metadata)\b.*?)(?:, line \d+, column \d+)?: ")
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """Texts that each name the field, the value and the remedy.
+
+    Attributes:
+        problems: what is wrong with the object itself, given what is there.
+        doubts: why it cannot be used as it is, though another object may put it right: no Detector selects the rule
+            yet, or a rule that a signal names is still to come.
+        remarks: what may go wrong with an object that is in order: with certain values of tasks, or since a template
+            that a rule names is not there.
+    """
+
+    problems: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """All that keeps the object from being used, each once."""
+        return tuple(dict.fromkeys((*self.problems, *self.doubts)))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All that is no reason to refuse it, each once."""
+        return tuple(dict.fromkeys((*self.doubts, *self.remarks)))
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Everything, each once."""
+        return tuple(dict.fromkeys((*self.problems, *self.doubts, *self.remarks)))
+
+
+def field_of(finding: str) -> str:
+    """The field that a finding names first, e.g. spec.when; empty where it names none."""
+    found = _FIELD.match(finding)
+    return found[1] if found else ""

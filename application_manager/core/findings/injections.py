@@ -1,0 +1,142 @@
+"""Whether a pod gets the detector that its label names, and the answer to the API server, which asks on its way. Pure.
+
+A pod is never refused. Where it cannot have its detector it is made without, a warning says why to who made it, and
+later an Event of the pod says it to everybody.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from application_manager.core.findings.reviews import REVIEW_VERSION, Json, ReviewError, told
+from application_manager.core.findings.rulefindings import detector_findings
+from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.sidecars import SIDECAR_LABEL, Addition, UnfitError, addition, patch
+from wayside.api import Detector
+from wayside.api.pod import DetectorMode
+
+_MIRROR = "kubernetes.io/config.mirror"
+_NO_IMAGE = (
+    "the manager runs no detectors: start it with --detector-image and with the rights that `application-manager rbac "
+    "--detectors` prints"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PodRequest:
+    """A question about a pod that is to be made.
+
+    Attributes:
+        uid: of the question.
+        namespace: the pod's.
+        pod: as it would be stored; empty where nothing is to be done.
+    """
+
+    uid: str
+    namespace: str
+    pod: Json
+
+
+@dataclass(frozen=True, slots=True)
+class Injection:
+    """What becomes of a pod.
+
+    Attributes:
+        addition: what it gets; None: nothing.
+        why_not: why it gets nothing; None also where it has its detector already, or asks for none.
+    """
+
+    addition: Addition | None = None
+    why_not: str | None = None
+
+
+def detector_of(metadata: Mapping[str, Any] | None) -> str | None:
+    """The Detector that a pod, or the template of pods, with this metadata asks for; None: none."""
+    name = ((metadata or {}).get("labels") or {}).get(SIDECAR_LABEL)
+    return None if name is None else str(name)
+
+
+def injection(
+    metadata: Mapping[str, Any],
+    spec: Mapping[str, Any],
+    namespace: str,
+    detector: Detector | None,
+    defaults: PodDefaults | None,
+) -> Injection:
+    """What becomes of a pod with this metadata and spec.
+
+    Args:
+        metadata: of the pod, or of the template that it is made from.
+        spec: likewise.
+        namespace: the pod's, for messages.
+        detector: the one of that namespace that it asks for; None where there is none that can be read.
+        defaults: what holds for all detectors; None where the manager runs none.
+    """
+    name = detector_of(metadata)
+    if name is None:
+        return Injection()
+    why_not = _why_not(name, metadata, spec, namespace, detector, defaults)
+    if why_not is None:
+        assert detector is not None and defaults is not None  # noqa: S101, PT018  said otherwise
+        try:
+            return Injection(addition(spec, detector, defaults))
+        except UnfitError as error:
+            why_not = str(error)
+    return Injection(why_not=why_not)
+
+
+def _why_not(
+    name: str,
+    metadata: Mapping[str, Any],
+    spec: Mapping[str, Any],
+    namespace: str,
+    detector: Detector | None,
+    defaults: PodDefaults | None,
+) -> str | None:
+    if defaults is None:
+        return _NO_IMAGE
+    if detector is None:
+        return f"label {SIDECAR_LABEL}: namespace {namespace} has no Detector {name!r} that can be read: create it"
+    if detector.spec.mode is not DetectorMode.SIDECAR:
+        mode = f"of mode {detector.spec.mode}" if detector.spec.mode else "without a mode"
+        return f"Detector {name} is {mode}: give it mode Sidecar, or remove the label {SIDECAR_LABEL}"
+    account = str(spec.get("serviceAccountName") or spec.get("serviceAccount") or "default")
+    names = detector.spec.service_account_names or []
+    if account not in names:
+        listed = f"only {', '.join(names)}" if names else "none"
+        return f"spec.serviceAccountName: serviceAccountNames of Detector {name} has {listed}, not {account}: add it"
+    if detector_findings(detector).problems:
+        return f"Detector {name} is not accepted: its condition Accepted says why"
+    if _MIRROR in (metadata.get("annotations") or {}):
+        return "a static pod has no account: make it by the API server"
+    return None
+
+
+def read_pod(review: Any) -> PodRequest:
+    """The question in an AdmissionReview about a pod. Raises ReviewError."""
+    if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
+        raise ReviewError(f"is no AdmissionReview of {REVIEW_VERSION}: only the API server has business here")
+    asked = review.get("request")
+    if not isinstance(asked, dict) or not isinstance(asked.get("uid"), str):
+        raise ReviewError("request.uid: is missing: only the API server has business here")
+    pod, kind = asked.get("object"), asked.get("kind")
+    made = asked.get("operation") == "CREATE" and not asked.get("subResource")
+    ours = isinstance(kind, dict) and (kind.get("group"), kind.get("kind")) == ("", "Pod")
+    if not (made and ours and isinstance(pod, dict) and isinstance(pod.get("spec"), dict)):
+        pod = {}
+    return PodRequest(asked["uid"], str(asked.get("namespace") or ""), pod)
+
+
+def answer_pod(request: PodRequest, found: Injection) -> Json:
+    """The AdmissionReview that goes back: always allowed."""
+    response: Json = {"uid": request.uid, "allowed": True}
+    if found.addition is not None:
+        operations = json.dumps(patch(request.pod["spec"], found.addition)).encode()
+        response |= {"patchType": "JSONPatch", "patch": base64.b64encode(operations).decode()}
+    if found.why_not is not None:
+        response["warnings"] = told((f"it is made without a detector: {found.why_not}",))
+    return {"apiVersion": REVIEW_VERSION, "kind": "AdmissionReview", "response": response}

@@ -1,0 +1,139 @@
+"""AdmissionReviews: what the API server asks before it stores an object of ours, and what it is answered. Pure.
+
+Only a new spec can be refused. Whatever leaves the spec as it is passes, also of an object that was wrong all along:
+else nobody could label it, and a finalizer could never be removed. Deleting passes, and so does what is going anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from application_manager.core.findings.findings import Findings, field_of
+from wayside.api.base import API_VERSION, GROUP
+
+REVIEW_VERSION = "admission.k8s.io/v1"
+REVIEWED = {"ApplicationTemplate": "applicationtemplates", "Detector": "detectors", "EventRule": "eventrules"}
+"""The kinds that are looked at, and their resources. Never tasks and instances: an outage of ours, or a fault, must not
+keep a demand from ending."""
+
+MOST_TOLD = 16  # problems, and warnings, of one answer; an HTTP header holds each warning
+LONGEST = 1024  # characters of each
+
+Json = dict[str, Any]
+
+
+class ReviewError(ValueError):
+    """What came is no AdmissionReview."""
+
+
+class Weight(Enum):
+    """What findings come to."""
+
+    NONE = "not looked at"
+    WARNED = "warned of"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A question of the API server.
+
+    Attributes:
+        uid: of the question.
+        kind: of the object; empty where it is none of those that are looked at.
+        object: as it would be stored; empty where it goes.
+        old: as it is stored; None for a new one.
+        weight: what problems come to.
+    """
+
+    uid: str
+    kind: str
+    namespace: str
+    object: Json
+    old: Json | None
+    weight: Weight
+
+
+def read(review: Any) -> Request:
+    """The question in an AdmissionReview. Raises ReviewError."""
+    if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
+        raise ReviewError(f"is no AdmissionReview of {REVIEW_VERSION}: only the API server has business here")
+    asked = review.get("request")
+    if not isinstance(asked, dict) or not isinstance(asked.get("uid"), str):
+        raise ReviewError("request.uid: is missing: only the API server has business here")
+    kind, new, old = (asked.get(name) for name in ("kind", "object", "oldObject"))
+    kind = kind if isinstance(kind, dict) else {}
+    new = dict(new) if isinstance(new, dict) else {}
+    old = old if isinstance(old, dict) else None
+    ours = kind.get("group") == GROUP and kind.get("kind") in REVIEWED
+    name, namespace = str(kind["kind"]) if ours else "", _line(str(asked.get("namespace") or ""))
+    if ours and new:
+        new |= {"apiVersion": API_VERSION, "kind": name}
+        named = {"name": asked.get("name") or "unnamed", **_metadata(new), "namespace": namespace}
+        new["metadata"] = named
+    weight = _weight(asked, new, old) if ours else Weight.NONE
+    return Request(asked["uid"], name, namespace, new, old, weight)
+
+
+def _weight(asked: Mapping[str, Any], new: Json, old: Json | None) -> Weight:
+    operation = asked.get("operation")
+    if operation not in ("CREATE", "UPDATE") or asked.get("subResource") or not new:
+        return Weight.NONE
+    if _metadata(new).get("deletionTimestamp"):
+        return Weight.NONE
+    if operation == "CREATE" or old is None or new.get("spec") != old.get("spec"):
+        return Weight.REFUSED
+    # Labels say which Detectors select a rule.
+    return Weight.WARNED if _metadata(new).get("labels") != _metadata(old).get("labels") else Weight.NONE
+
+
+def answer(request: Request, findings: Findings) -> Json:
+    """The AdmissionReview that goes back."""
+    if request.weight is Weight.NONE:
+        findings = Findings()
+    refused = request.weight is Weight.REFUSED and bool(findings.problems)
+    response: Json = {"uid": request.uid, "allowed": not refused}
+    warnings = findings.warnings if refused else findings.all
+    if warnings:
+        response["warnings"] = told(warnings)
+    if refused:
+        problems = told(findings.problems)
+        response["status"] = {
+            "status": "Failure",
+            "code": 422,
+            "reason": "Invalid",
+            "message": "; ".join(problems),
+            "details": {
+                "group": GROUP,
+                "kind": request.kind,
+                "name": _line(str(_metadata(request.object).get("name", ""))),
+                "causes": [_cause(each) for each in problems],
+            },
+        }
+    return {"apiVersion": REVIEW_VERSION, "kind": "AdmissionReview", "response": response}
+
+
+def _cause(problem: str) -> Json:
+    field = field_of(problem)
+    message = problem.removeprefix(field).lstrip(":, ")
+    return {"reason": "FieldValueInvalid", "field": field or "spec", "message": message}
+
+
+def told(texts: tuple[str, ...]) -> list[str]:
+    """The texts as headers can hold them, the first of them where there are many."""
+    lines = [_line(each) for each in texts[:MOST_TOLD]]
+    left = len(texts) - len(lines)
+    return [*lines, f"and {left} more: correct these first"] if left else lines
+
+
+def _line(text: str) -> str:
+    line = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 1]}…"
+
+
+def _metadata(raw: Mapping[str, Any]) -> Json:
+    metadata = raw.get("metadata")
+    return metadata if isinstance(metadata, dict) else {}

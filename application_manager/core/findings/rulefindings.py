@@ -1,0 +1,119 @@
+"""What is wrong with EventRules and Detectors, as far as can be told without the message types. Pure.
+
+The same compiler that the detector runs judges here. A rule is judged with all Detectors that select it. What the rule
+alone has, or has with every one of them, is its own fault; what only some have, what stands in a field of theirs, and
+what is merely not there yet is a doubt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from application_manager.core.findings.findings import Findings
+from wayside.api import Detector, EventRule
+from wayside.rules import (
+    RuleError,
+    RuleProblem,
+    compile_rule,
+    dependency_problems,
+    own_problems,
+    source_problems,
+    stream_problems,
+)
+
+
+def selects(detector: Detector, rule: EventRule) -> bool:
+    """Whether the detector evaluates the rule, which is in its namespace."""
+    return detector.spec.rules.matches(rule.metadata.labels)
+
+
+def selecting(rule: EventRule, detectors: Sequence[Detector]) -> list[Detector]:
+    """Those of the detectors, which are in the rule's namespace, that evaluate it, by name."""
+    return sorted((each for each in detectors if selects(each, rule)), key=lambda each: each.name)
+
+
+def rule_findings(
+    rule: EventRule, detectors: Sequence[Detector], invalid: Sequence[str] = (), others: Sequence[EventRule] = ()
+) -> Findings:
+    """What is wrong with the rule.
+
+    Args:
+        rule: the rule.
+        detectors: those of its namespace that are valid.
+        invalid: the names of its namespace's other detectors.
+        others: the rules of its namespace, which its signals may name.
+    """
+    judges = selecting(rule, detectors)
+    if not judges:
+        return Findings(tuple(map(str, own_problems(rule))), (_not_selected(rule, detectors, invalid),))
+    having: dict[RuleProblem, list[str]] = {}  # problem → detectors with which the rule has it
+    passing: set[RuleProblem] = set()
+    for detector in judges:
+        beside = [each for each in others if each.name != rule.name and selects(detector, each)]
+        known = dependency_problems([rule, *beside]).get(rule.name, ())
+        passing |= {each for each in known if _names_what_is_not_there(each, rule, beside)}
+        for problem in dict.fromkeys(_compiled(rule, detector, known)):
+            having.setdefault(problem, []).append(detector.name)
+    own = {each for each in having if each.detector is None and each not in passing}
+    # A rule that one detector can evaluate is a good one.
+    refused = {name for each in own for name in having[each]} == {each.name for each in judges}
+    problems: list[str] = []
+    doubts: list[str] = []
+    for problem, names in having.items():
+        whose = "" if len(names) == len(judges) else f"with Detector {', '.join(names)}: "
+        (problems if refused and problem in own else doubts).append(f"{whose}{problem}")
+    return Findings(tuple(problems), tuple(doubts))
+
+
+def detector_findings(detector: Detector) -> Findings:
+    """What is wrong with the detector."""
+    problems = [
+        str(problem) for index, stream in enumerate(detector.spec.streams) for problem in stream_problems(stream, index)
+    ]
+    return Findings((*problems, *map(str, source_problems(detector))))
+
+
+def newly_wrong(rule: EventRule, new: Detector, old: Detector | None) -> tuple[str, ...]:
+    """What is wrong with a rule, which is in order as far as others are concerned, since its detector is as `new`.
+
+    Nothing where the detector does not select it, or where all was wrong with the `old` one as well, None if it is new.
+    """
+    if not selects(new, rule):
+        return ()
+    problems = _compiled(rule, new, ())
+    if problems and old is not None and selects(old, rule):
+        known = set(_compiled(rule, old, ()))
+        problems = [each for each in problems if each not in known]
+    return tuple(f"EventRule {rule.name}, {problem}" for problem in problems)
+
+
+def _compiled(rule: EventRule, detector: Detector, known: Sequence[RuleProblem]) -> Sequence[RuleProblem]:
+    try:
+        compile_rule(rule, detector, None, known)
+    except RuleError as error:
+        return error.problems
+    return ()
+
+
+def _names_what_is_not_there(problem: RuleProblem, rule: EventRule, beside: Sequence[EventRule]) -> bool:
+    """Whether it is about a signal whose rule is not there; else it is about a circle."""
+    match problem.path:
+        case ("spec", "signals", int(index), "rule"):
+            return rule.spec.signals[index].rule not in {rule.name, *(each.name for each in beside)}
+    return False
+
+
+def _not_selected(rule: EventRule, detectors: Sequence[Detector], invalid: Sequence[str]) -> str:
+    remedy = "; or ".join(_remedies(detectors, invalid)) or "create a Detector"
+    return f"no valid Detector in namespace {rule.namespace} selects the rule: {remedy}"
+
+
+def _remedies(detectors: Sequence[Detector], invalid: Sequence[str]) -> Iterator[str]:
+    wanted = [f"{each.name} selects {_labels(each)}" for each in sorted(detectors, key=lambda each: each.name)]
+    if wanted:
+        yield f"add labels to metadata.labels: {'; '.join(wanted)}"
+    yield from (f"correct Detector {name}, whose status says what is wrong with it" for name in sorted(invalid))
+
+
+def _labels(detector: Detector) -> str:
+    return ", ".join(f"{key}={value}" for key, value in sorted(detector.spec.rules.match_labels.items())) or "all"

@@ -1,0 +1,164 @@
+"""What is wrong with an ApplicationTemplate, found before any task names it. Pure.
+
+It is compiled, its expressions are checked for the types of the parameters they read, and it is rendered on examples.
+What fails on an example counts against the template only if no value of a task could change it; else it is a remark,
+and where the example can say nothing, it is nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from application_manager.core.claims import claims, parameters
+from application_manager.core.findings.examples import Example, examples, is_open
+from application_manager.core.findings.findings import Findings, field_of
+from application_manager.core.objects.charts import ChartObjects, ChartOutcome, ChartRequest
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, RenderError
+from wayside.api import ApplicationInstance, ApplicationTemplate
+from wayside.api.base import Metadata
+from wayside.api.parameter import Parameter, ParameterType
+from wayside.expressions import Environment, InterpolationError, Kind, compile_template
+from wayside.expressions.syntax import Path
+
+_KINDS: Mapping[ParameterType, Kind] = {
+    ParameterType.STRING: Kind.STRING,
+    ParameterType.NUMBER: Kind.DOUBLE,
+    ParameterType.INTEGER: Kind.DOUBLE,
+    ParameterType.BOOLEAN: Kind.BOOL,
+    ParameterType.ARRAY: Kind.LIST,
+    ParameterType.OBJECT: Kind.MAP,
+}
+_VARIABLES = {"parameters": Kind.MAP, "instance": Kind.MAP}
+_NAMES = "metadata.name"
+
+Reads = Iterable[tuple[str, frozenset[Path]]]
+"""Fields, each with what an expression in it reads."""
+
+
+def template_findings(template: ApplicationTemplate, policy: Policy) -> Findings:
+    """What is wrong with the template."""
+    problems: list[str] = []
+    try:
+        Renderer(template, policy)
+    except RenderError as error:
+        problems += error.problems
+    try:
+        claims.key_parameters(template)
+    except InterpolationError as error:
+        problems += [str(each) for each in (error, *error.others)]
+    if not problems:
+        problems += _mistyped(template)
+    if problems:
+        return Findings(tuple(dict.fromkeys(problems)))
+    return _on_examples(template, policy)
+
+
+def _mistyped(template: ApplicationTemplate) -> Iterator[str]:
+    """Expressions that use a parameter as another type than it has; one that may be null is of any."""
+    declared = template.spec.parameters
+    kinds = {
+        f"parameters.{name}": _KINDS[each.type]
+        for name, each in declared.items()
+        if each.required or each.default is not None
+    }
+    if not kinds:
+        return
+    environment = Environment(_VARIABLES).knowing(kinds)
+    for path, value in _texts(template):
+        try:
+            compile_template(value, environment, path=path)
+        except InterpolationError as error:
+            yield from (str(each) for each in (error, *error.others))
+
+
+def _texts(template: ApplicationTemplate) -> Iterator[tuple[str, Any]]:
+    spec = template.spec
+    if spec.key is not None:
+        yield "spec.key", spec.key
+    for name, content in sorted(spec.configuration.items()):
+        yield f"spec.configuration.{name}", content
+    for index, manifest in enumerate(spec.manifests):
+        yield f"spec.manifests[{index}]", manifest
+    if spec.helm is not None:
+        yield "spec.helm.values", spec.helm.values
+
+
+def _on_examples(template: ApplicationTemplate, policy: Policy) -> Findings:
+    problems: list[str] = []
+    remarks: list[str] = []
+    loose = _without_patterns(template)
+    renderer = Renderer(loose, policy)
+    reads = [(each.path, each.expression.paths) for each in renderer.embedded]
+    unguessable = frozenset(name for name, each in template.spec.parameters.items() if is_open(each))
+    for example in examples(template):
+        for problem in _rendered(loose, renderer, example):
+            read = _read(problem, loose, reads)
+            if not read & example.made_up:
+                problems.append(problem)
+            elif not read & unguessable & example.given.keys():
+                remarks.append(f"{problem}; so it is {example.said}")
+    return Findings(tuple(dict.fromkeys(problems)), remarks=tuple(dict.fromkeys(remarks)))
+
+
+def _without_patterns(template: ApplicationTemplate) -> ApplicationTemplate:
+    """The template, for examples, which match no pattern."""
+    loose: dict[str, Parameter] = {
+        name: each.model_copy(update={"pattern": None}) for name, each in template.spec.parameters.items()
+    }
+    return template.model_copy(update={"spec": template.spec.model_copy(update={"parameters": loose})})
+
+
+def _rendered(template: ApplicationTemplate, renderer: Renderer, example: Example) -> tuple[str, ...]:
+    """What goes wrong when the example's instance is rendered."""
+    complete = parameters.with_defaults(template.spec.parameters, example.given)
+    key = None
+    if template.spec.key is not None:
+        try:
+            key = claims.instance_key(template, complete)
+        except InterpolationError as error:
+            return (str(error),)
+    instance = ApplicationInstance.model_validate(
+        {
+            "kind": "ApplicationInstance",
+            "metadata": Metadata(name=claims.instance_name(template.name, key), namespace=template.namespace),
+            "spec": {"template": template.name, "key": key, "parameters": dict(example.given)},
+        }
+    )
+    try:
+        renderer.render(instance, _no_objects)
+    except RenderError as error:
+        return error.problems
+    return ()
+
+
+def _no_objects(_: ChartRequest) -> ChartOutcome:
+    """Of a chart, the values alone can be looked at without fetching it."""
+    return ChartObjects(())
+
+
+def _read(problem: str, template: ApplicationTemplate, reads: Reads) -> frozenset[str]:
+    """The parameters that what is said to be wrong may depend on."""
+    field = field_of(problem)
+    if field == "spec.key":
+        return claims.key_parameters(template)
+    if field == "spec.manifests":  # two objects of one name
+        touched = [paths for path, paths in reads if path.endswith(_NAMES)]
+    else:
+        touched = [paths for path, paths in reads if _within(path, field) or _within(field, path)]
+    every = frozenset(template.spec.parameters)
+    return frozenset().union(*map(partial(_parameters, every), touched))
+
+
+def _parameters(every: frozenset[str], paths: frozenset[Path]) -> frozenset[str]:
+    of_parameters = [path for path in paths if path[0] == "parameters"]
+    if any(len(path) == 1 for path in of_parameters):  # it looks at the whole map
+        return every
+    return frozenset(str(path[1]) for path in of_parameters)
+
+
+def _within(field: str, other: str) -> bool:
+    """Whether the field is the other, or a part of it."""
+    return field == other or (field.startswith(other) and field[len(other)] in ".[")

@@ -1,0 +1,135 @@
+"""The configurations by which the API server asks the manager about objects that are to be stored. Pure.
+
+A ValidatingWebhookConfiguration for templates, rules and detectors, and a MutatingWebhookConfiguration for pods that
+ask for a detector. What makes them safe to have is here: failurePolicy Ignore and a short timeout, so that a manager
+that is away or hangs delays a change and never prevents it; new specs only, of three kinds, and new pods only that bear
+the label; and no side effects, so that a dry run asks as well.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+from application_manager.core.findings.reviews import REVIEWED
+from application_manager.core.objects.sidecars import SIDECAR_LABEL
+from wayside.api.base import GROUP, VERSION
+
+PATH = "/admission"
+INJECTION_PATH = "/injection"
+TIMEOUT = 5  # s that a change waits for a manager that hangs
+_SERVICE = re.compile(r"(?P<namespace>[a-z0-9-]+)/(?P<name>[a-z0-9-]+)(?::(?P<port>[0-9]{1,5}))?")
+_URL = re.compile(r"https://(\[[0-9a-fA-F:]+\]|[^/:?#@\s]+)(:[0-9]{1,5})?")
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the API server finds the manager: a Service, or a URL.
+
+    Attributes:
+        client: the `clientConfig`, without the path and the authority's certificate.
+        hosts: the names that the manager's certificate must be for.
+    """
+
+    client: dict[str, Any]
+    hosts: tuple[str, ...]
+
+    @classmethod
+    def of_service(cls, text: str) -> Self:
+        """NAMESPACE/NAME[:PORT]. Raises ValueError."""
+        found = _SERVICE.fullmatch(text)
+        if found is None:
+            raise ValueError(f"{text!r} is no Service: write NAMESPACE/NAME or NAMESPACE/NAME:PORT")
+        namespace, name, port = found["namespace"], found["name"], int(found["port"] or 443)
+        client = {"service": {"namespace": namespace, "name": name, "port": port}}
+        return cls(client, tuple(f"{name}.{namespace}{end}" for end in (".svc", ".svc.cluster.local", "")))
+
+    @classmethod
+    def of_url(cls, text: str) -> Self:
+        """https://HOST[:PORT]. Raises ValueError."""
+        found = _URL.fullmatch(text.rstrip("/"))
+        if found is None:
+            raise ValueError(f"{text!r} is no place of a manager: write https://HOST:PORT, without a path")
+        return cls({"url": text.rstrip("/")}, (found[1].strip("[]"),))
+
+    def at(self, path: str, authority: bytes | None) -> dict[str, Any]:
+        """The `clientConfig` of a path; `authority`: see `webhook_configuration`."""
+        made: dict[str, Any] = (
+            {"service": self.client["service"] | {"path": path}}
+            if "service" in self.client
+            else {"url": f"{self.client['url']}{path}"}
+        )
+        return made | ({} if authority is None else {"caBundle": base64.b64encode(authority).decode()})
+
+
+def webhook_configuration(
+    place: Place, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
+) -> dict[str, Any]:
+    """What makes the API server ask about templates, rules and detectors.
+
+    Args:
+        place: where the manager is.
+        authority: the certificate (PEM) of the authority that signed the manager's; None where somebody else writes it
+            in, as cert-manager does.
+        namespaces: those that the manager looks after; empty: all.
+        name: the object's.
+    """
+    webhook: dict[str, Any] = {
+        "name": f"admission.{GROUP}",
+        "clientConfig": place.at(PATH, authority),
+        "rules": [
+            {
+                "apiGroups": [GROUP],
+                "apiVersions": [VERSION],
+                "operations": ["CREATE", "UPDATE"],
+                "resources": sorted(REVIEWED.values()),
+                "scope": "Namespaced",
+            }
+        ],
+        "failurePolicy": "Ignore",
+        "timeoutSeconds": TIMEOUT,
+        "sideEffects": "None",
+        "admissionReviewVersions": ["v1"],
+    }
+    return _configuration("ValidatingWebhookConfiguration", name, webhook, namespaces)
+
+
+def injection_configuration(
+    place: Place, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
+) -> dict[str, Any]:
+    """What makes the API server ask about pods that are to have a detector; the arguments are as above."""
+    webhook: dict[str, Any] = {
+        "name": f"injection.{GROUP}",
+        "clientConfig": place.at(INJECTION_PATH, authority),
+        "objectSelector": {"matchExpressions": [{"key": SIDECAR_LABEL, "operator": "Exists"}]},
+        "rules": [
+            {
+                "apiGroups": [""],
+                "apiVersions": ["v1"],
+                "operations": ["CREATE"],
+                "resources": ["pods"],
+                "scope": "Namespaced",
+            }
+        ],
+        "failurePolicy": "Ignore",
+        "timeoutSeconds": TIMEOUT,
+        "sideEffects": "None",
+        "reinvocationPolicy": "IfNeeded",  # another webhook may change the volumes or the account
+        "admissionReviewVersions": ["v1"],
+    }
+    return _configuration("MutatingWebhookConfiguration", name, webhook, namespaces)
+
+
+def _configuration(kind: str, name: str, webhook: dict[str, Any], namespaces: Sequence[str]) -> dict[str, Any]:
+    if namespaces:
+        named = {"key": "kubernetes.io/metadata.name", "operator": "In", "values": sorted(namespaces)}
+        webhook["namespaceSelector"] = {"matchExpressions": [named]}
+    return {
+        "apiVersion": "admissionregistration.k8s.io/v1",
+        "kind": kind,
+        "metadata": {"name": name, "labels": {"app.kubernetes.io/part-of": "wayside"}},
+        "webhooks": [webhook],
+    }

@@ -1,0 +1,163 @@
+"""Whether any node is as an object's pods require it, in words that name the field and the value. Pure.
+
+What is looked at is what a template renders from parameters: `nodeName`, `nodeSelector`, and the node affinity that is
+required. Taints, room and all else are the scheduler's to tell, on the pod.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from application_manager.core.health.pods import Trouble, TroubleReason
+
+Labels = Mapping[str, str]
+Nodes = Mapping[str, Labels]
+"""The labels of nodes, by name."""
+
+_SEVERAL = "-"  # in place of a label's key, where there are several
+_SHOWN = 5  # values that there are, in a message
+
+
+@dataclass(frozen=True, slots=True)
+class _Required:
+    """One requirement: in words, and whether a node of this name and labels meets it."""
+
+    words: str
+    key: str
+    meets: Callable[[str, Labels], bool]
+
+
+def is_placed(live: Mapping[str, Any]) -> bool:
+    """Whether the object's pods require anything of nodes."""
+    return any(True for _ in _required(pod_spec(live)))
+
+
+def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
+    """Why no node is as the object's pods require; None where one is."""
+    required = list(_required(pod_spec(live)))
+    if not required:
+        return None
+    unmet = [each for each in required if not any(each.meets(name, labels) for name, labels in nodes.items())]
+    together = any(all(each.meets(name, labels) for each in required) for name, labels in nodes.items())
+    if together:
+        return None
+    if unmet:
+        words = "; ".join(f"{each.words}{_instead(each.key, nodes)}" for each in unmet)
+    else:
+        words = f"{' and '.join(each.words for each in required)} at once"
+    what = f"{live['kind']} {live['metadata']['name']}"
+    message = f"{what} fits no node: {words}. Correct the value, or label a node"
+    return Trouble(TroubleReason.UNSCHEDULABLE, message)
+
+
+def pod_spec(live: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The spec of the object's pods; empty where it makes none."""
+    spec: Any = live.get("spec") or {}
+    match live.get("kind"):
+        case "Pod":
+            return dict(spec)
+        case "Deployment" | "StatefulSet" | "DaemonSet" | "Job":
+            return _at(spec, "template", "spec")
+        case "CronJob":
+            return _at(spec, "jobTemplate", "spec", "template", "spec")
+    return {}
+
+
+def _at(value: Any, *path: str) -> Mapping[str, Any]:
+    for each in path:
+        value = value.get(each) if isinstance(value, Mapping) else None
+    return value if isinstance(value, Mapping) else {}
+
+
+def _required(spec: Mapping[str, Any]) -> Iterator[_Required]:
+    if name := spec.get("nodeName"):
+        yield _Required(f"nodeName: there is no node {name}", "", partial(_is_named, name))
+    for key, value in sorted((spec.get("nodeSelector") or {}).items()):
+        yield _Required(f"nodeSelector: no node has the label {key}={value}", key, partial(_is_labelled, key, value))
+    affinity = _at(spec, "affinity", "nodeAffinity", "requiredDuringSchedulingIgnoredDuringExecution")
+    terms = [each for each in affinity.get("nodeSelectorTerms") or () if _expressions(each)]
+    if terms:
+        words = "affinity.nodeAffinity: no node has " + ", or ".join(_words(each) for each in terms)
+        keys = {key for each in terms for key, _, _ in _expressions(each)}
+        yield _Required(words, keys.pop() if len(keys) == 1 else _SEVERAL, partial(_meets_any, terms))
+
+
+def _is_named(wanted: str, name: str, _: Labels) -> bool:
+    return name == wanted
+
+
+def _is_labelled(key: str, value: str, _: str, labels: Labels) -> bool:
+    return labels.get(key) == value
+
+
+def _meets_any(terms: Iterable[Mapping[str, Any]], name: str, labels: Labels) -> bool:
+    return any(_meets(each, name, labels) for each in terms)
+
+
+def _expressions(term: Mapping[str, Any]) -> list[tuple[str, str, list[str]]]:
+    """Key, operator and values of a term's requirements; the key of a node's name is empty."""
+    fields = [("", str(each.get("operator")), each.get("values") or []) for each in term.get("matchFields") or ()]
+    labels = [
+        (str(each.get("key")), str(each.get("operator")), each.get("values") or [])
+        for each in term.get("matchExpressions") or ()
+    ]
+    return fields + labels
+
+
+def _words(term: Mapping[str, Any]) -> str:
+    return " and ".join(_in_words(*each) for each in _expressions(term))
+
+
+def _in_words(key: str, operator: str, values: Iterable[str]) -> str:
+    what, listed = f"the label {key}" if key else "the name", " or ".join(map(str, values))
+    match operator:
+        case "In":
+            return f"{what}={listed}" if key else f"{what} {listed}"
+        case "Exists":
+            return what
+        case "DoesNotExist":
+            return f"not {what}"
+    return f"{what} {operator} {listed}"
+
+
+def _meets(term: Mapping[str, Any], name: str, labels: Labels) -> bool:
+    """Whether a node meets a term, as the scheduler has it (`component-helpers/scheduling/corev1/nodeaffinity`)."""
+    return all(
+        _holds(operator, name if not key else labels.get(key), list(map(str, values)))
+        for key, operator, values in _expressions(term)
+    )
+
+
+def _holds(operator: str, value: str | None, values: list[str]) -> bool:
+    match operator:
+        case "In":
+            return value in values
+        case "NotIn":
+            return value not in values
+        case "Exists":
+            return value is not None
+        case "DoesNotExist":
+            return value is None
+        case "Gt" | "Lt":
+            try:
+                have, limit = int(value or ""), int(values[0])
+            except (ValueError, IndexError):
+                return False
+            return have > limit if operator == "Gt" else have < limit
+    return True  # an operator of the future: the scheduler will tell
+
+
+def _instead(key: str, nodes: Nodes) -> str:
+    """What there is in place of what is required."""
+    if not nodes:
+        return " (there are no nodes)"
+    if key == _SEVERAL:
+        return ""
+    found = sorted(nodes) if not key else sorted({labels[key] for labels in nodes.values() if key in labels})
+    if not found:
+        return " (none has a label of that key)"
+    more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+    return f" (there {'is' if len(found) == 1 else 'are'} {', '.join(found[:_SHOWN])}{more})"

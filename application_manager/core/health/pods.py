@@ -1,0 +1,159 @@
+"""What keeps a pod from running, in words for people who do not read pod statuses. Pure.
+
+The same trouble gives the same words, whatever the kubelet is at just now: an image is being pulled once more, a
+container that crashes runs for a moment. So a status that repeats them is not rewritten with each attempt.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+_LONGEST = 600  # characters of what a kubelet or a scheduler says
+
+_IMAGE = frozenset(
+    {
+        "ErrImagePull",
+        "ImagePullBackOff",
+        "ErrImageNeverPull",
+        "InvalidImageName",
+        "ImageInspectError",
+        "RegistryUnavailable",
+        "SignatureValidationFailed",
+    }
+)
+"""A container's waiting reasons that mean its image, from the kubelet's `pkg/kubelet/images/types.go`."""
+
+_CREATION = frozenset(
+    {
+        "CreateContainerConfigError",
+        "CreateContainerError",
+        "RunContainerError",
+        "PreCreateHookError",
+        "PostStartHookError",
+    }
+)
+
+
+class TroubleReason(StrEnum):
+    """One word for each trouble: reasons of the condition Ready, the most telling first."""
+
+    IMAGE_PULL_FAILED = "ImagePullFailed"
+    CONTAINER_FAILED = "ContainerFailed"
+    CRASH_LOOP = "CrashLoop"
+    POD_FAILED = "PodFailed"
+    UNSCHEDULABLE = "Unschedulable"
+    QUOTA_EXCEEDED = "QuotaExceeded"
+    ADMISSION_REFUSED = "AdmissionRefused"
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """Why a pod does not run.
+
+    Attributes:
+        message: names the image or container, and the cause; the same for all pods that have the same trouble.
+        hint: where to look further, which names the pod; empty where the message says it all.
+    """
+
+    reason: TroubleReason
+    message: str
+    hint: str = ""
+
+    @property
+    def text(self) -> str:
+        """The message with the hint."""
+        return f"{self.message} ({self.hint})" if self.hint else self.message
+
+
+def trouble(pod: Mapping[str, Any]) -> Trouble | None:
+    """What keeps the pod from running; None where nothing does, or nothing is known yet, or it is being deleted."""
+    status = pod.get("status") or {}
+    if pod["metadata"].get("deletionTimestamp") or status.get("phase") == "Succeeded":
+        return None
+    images = {str(each.get("name")): str(each.get("image", "")) for each in _containers(pod.get("spec") or {})}
+    for init, container in _statuses(status):
+        found = _of_container(container, images, pod, init=init)
+        if found is not None:
+            return found
+    if status.get("phase") == "Failed":
+        why = status.get("message") or status.get("reason") or "no reason is given"
+        return Trouble(TroubleReason.POD_FAILED, f"a pod failed: {_plain(why)}")
+    for condition in status.get("conditions") or ():
+        if condition.get("type") == "PodScheduled" and condition.get("status") == "False":
+            why = condition.get("message") or condition.get("reason") or "no reason is given"
+            return Trouble(TroubleReason.UNSCHEDULABLE, f"no node takes the pod: {_plain(why)}")
+    return None
+
+
+def summary(troubles: Iterable[Trouble]) -> list[Trouble]:
+    """Each different trouble once, the most telling first."""
+    order = list(TroubleReason)
+    different: dict[tuple[TroubleReason, str], Trouble] = {}
+    for each in sorted(troubles, key=lambda each: (order.index(each.reason), each.message, each.hint)):
+        different.setdefault((each.reason, each.message), each)
+    return list(different.values())
+
+
+def _containers(spec: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    yield from spec.get("initContainers") or ()
+    yield from spec.get("containers") or ()
+
+
+def _statuses(status: Mapping[str, Any]) -> Iterator[tuple[bool, Mapping[str, Any]]]:
+    """Whether it is an init container, and its status."""
+    for each in status.get("initContainerStatuses") or ():
+        yield True, each
+    for each in status.get("containerStatuses") or ():
+        yield False, each
+
+
+def _of_container(
+    container: Mapping[str, Any], images: Mapping[str, str], pod: Mapping[str, Any], *, init: bool
+) -> Trouble | None:
+    name = str(container.get("name"))
+    what = f"init container {name}" if init else f"container {name}"
+    state = container.get("state") or {}
+    waiting = state.get("waiting") or {}
+    reason = waiting.get("reason")
+    if reason in _IMAGE:
+        image = images.get(name) or container.get("image", "")
+        cause = _pull_cause(waiting.get("message") or "") or reason
+        return Trouble(TroubleReason.IMAGE_PULL_FAILED, f"image {image} cannot be pulled: {cause}")
+    if reason in _CREATION:
+        cause = _plain(waiting.get("message") or reason)
+        return Trouble(TroubleReason.CONTAINER_FAILED, f"{what} cannot be started: {cause}")
+    ended = state.get("terminated") or (container.get("lastState") or {}).get("terminated") or {}
+    if not ended.get("exitCode") or container.get("ready"):
+        return None
+    namespace, pod_name = pod["metadata"].get("namespace", "default"), pod["metadata"]["name"]
+    once = (pod.get("spec") or {}).get("restartPolicy") == "Never"
+    verb = "failed" if once else "crashes"
+    log = f"kubectl logs -n {namespace} {pod_name} -c {name}" + ("" if once else " --previous")
+    reason_of = TroubleReason.POD_FAILED if once else TroubleReason.CRASH_LOOP
+    return Trouble(reason_of, f"{what} {verb}: it ended with {_ending(ended)}", f"its log: {log}")
+
+
+def _ending(ended: Mapping[str, Any]) -> str:
+    code, reason = ended["exitCode"], ended.get("reason")
+    text = f"exit code {code}"
+    if reason == "OOMKilled":
+        text += ", killed for taking more memory than its limit"
+    elif reason and reason != "Error":
+        text += f" ({reason})"
+    message = _plain(ended.get("message") or "")
+    return f"{text}: {message}" if message else text
+
+
+def _pull_cause(message: str) -> str:
+    """The cause of a failed pull, without what says that it is being tried again."""
+    return _plain(re.sub(r'^Back-off pulling image "[^"]*"(: )?', "", message).removeprefix("ErrImagePull: "))
+
+
+def _plain(message: str) -> str:
+    """One line, without the wrapping of gRPC, and not too long."""
+    line = " ".join(re.sub(r"rpc error: code = \w+ desc = ", "", str(message)).split())
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"

@@ -1,0 +1,150 @@
+"""Whether an object that exists also does its work, judged by its status. Pure.
+
+The rules are those of `kubectl rollout status` for workloads and of the conditions Ready and Available for all else. A
+kind that says neither is ready by being there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from application_manager.core.health.refusals import without_names
+
+_LOAD_BALANCER = "LoadBalancer"
+
+
+def not_ready(live: Mapping[str, Any]) -> str | None:
+    """Why the object is not ready, in words that follow its name; None if it is.
+
+    Workloads are ready when their controller has seen their present spec and all their pods are available and of that
+    spec. A Job is ready once it runs or has completed, a PersistentVolumeClaim once it is bound, a Service of type
+    LoadBalancer once it has an address.
+    """
+    status = live.get("status") or {}
+    spec = live.get("spec") or {}
+    match live.get("kind"):
+        case "Deployment":
+            return _stale(live, status) or _deployment(spec, status)
+        case "StatefulSet":
+            return _stale(live, status) or _stateful_set(spec, status)
+        case "DaemonSet":
+            return _stale(live, status) or _daemon_set(spec, status)
+        case "Pod":
+            return None if _condition(status, "Ready") or status.get("phase") == "Succeeded" else "is not ready"
+        case "Job":
+            return _job(spec, status)
+        case "PersistentVolumeClaim":
+            return _claim(status)
+        case "Service":
+            pending = spec.get("type") == _LOAD_BALANCER and not (status.get("loadBalancer") or {}).get("ingress")
+            return "has no address from the load balancer yet" if pending else None
+    return _by_conditions(live, status)
+
+
+def _stale(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
+    seen, generation = status.get("observedGeneration", 0), live["metadata"].get("generation", 0)
+    return None if seen >= generation else "has not been looked at by its controller yet"
+
+
+def _deployment(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
+    wanted = _replicas(spec)
+    updated = status.get("updatedReplicas") or 0
+    problem = _count("available", status.get("availableReplicas"), wanted) or _present(updated, wanted)
+    left = (status.get("replicas") or 0) - updated
+    if problem is None and left > 0:
+        problem = f"still runs {_pods(left)} of its previous version"
+    if problem is None:
+        return None
+    refused = _find(status, "ReplicaFailure")
+    if refused.get("status") == "True":
+        return f"{problem}, for they cannot be made: {without_names(str(refused.get('message', '')))}"
+    progress = _find(status, "Progressing")
+    if progress.get("status") == "False":
+        return f"{problem}, and makes no progress"
+    return problem
+
+
+def _stateful_set(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
+    wanted = _replicas(spec)
+    problem = _count("available", status.get("availableReplicas"), wanted)
+    strategy = spec.get("updateStrategy") or {}
+    partial = strategy.get("type") == "OnDelete" or (strategy.get("rollingUpdate") or {}).get("partition")
+    if problem is None and not partial and status.get("updateRevision") != status.get("currentRevision"):
+        return _present(status.get("updatedReplicas") or 0, wanted)
+    return problem
+
+
+def _daemon_set(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
+    wanted = status.get("desiredNumberScheduled")
+    if wanted is None:
+        return "is not scheduled yet"
+    problem = _count("available", status.get("numberAvailable"), wanted)
+    if problem is None and (spec.get("updateStrategy") or {}).get("type") != "OnDelete":
+        return _present(status.get("updatedNumberScheduled") or 0, wanted)
+    return problem
+
+
+def _job(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
+    failed = _find(status, "Failed")
+    if failed.get("status") == "True":
+        return f"has failed: {failed.get('message') or failed.get('reason') or 'no reason is given'}"
+    if spec.get("suspend"):
+        return "is suspended (spec.suspend)"
+    running = (status.get("ready") or 0) > 0 or (status.get("succeeded") or 0) > 0
+    return None if running or _condition(status, "Complete") else "has no pod that runs"
+
+
+def _claim(status: Mapping[str, Any]) -> str | None:
+    match status.get("phase"):
+        case "Bound":
+            return None
+        case "Lost":
+            return "has lost its volume"
+    return "is not bound to a volume yet"
+
+
+def _by_conditions(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
+    """Why an object of any other kind is not ready, as its condition Ready, else Available, says."""
+    if not isinstance(status, Mapping) or not isinstance(status.get("conditions", []), list):
+        return None  # a kind with a status of another shape
+    for type_ in ("Ready", "Available"):
+        condition = _find(status, type_)
+        if not condition:
+            continue
+        if isinstance(seen := status.get("observedGeneration"), int) and seen < live["metadata"].get("generation", 0):
+            return "has not been looked at by its controller yet"
+        if condition.get("status") == "True":
+            return None
+        why = condition.get("message") or condition.get("reason") or "no reason is given"
+        return f"is not {type_.lower()}: {why}"
+    return None
+
+
+def _replicas(spec: Mapping[str, Any]) -> int:
+    replicas = spec.get("replicas")
+    return 1 if replicas is None else int(replicas)
+
+
+def _count(word: str, have: int | None, want: int) -> str | None:
+    return None if (have or 0) >= want else f"has {have or 0} of {want} pods {word}"
+
+
+def _present(have: int, want: int) -> str | None:
+    return _count("of its present version", have, want)
+
+
+def _pods(count: int) -> str:
+    return "1 pod" if count == 1 else f"{count} pods"
+
+
+def _condition(status: Mapping[str, Any], type_: str) -> bool:
+    return bool(_find(status, type_).get("status") == "True")
+
+
+def _find(status: Mapping[str, Any], type_: str) -> Mapping[str, Any]:
+    """The condition of the type; empty where there is none."""
+    for each in status.get("conditions") or ():
+        if isinstance(each, Mapping) and each.get("type") == type_:
+            return each
+    return {}

@@ -1,0 +1,102 @@
+"""What the cluster's own rules refuse: quotas, limit ranges, admission. Told from what the API server says. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from application_manager.core.health.pods import Trouble, TroubleReason
+from wayside.times import parse_time
+
+QUOTA_EXCEEDED = TroubleReason.QUOTA_EXCEEDED.value
+ADMISSION_REFUSED = TroubleReason.ADMISSION_REFUSED.value
+APPLY_REFUSED = "ApplyRefused"
+FAILED_CREATE = "FailedCreate"
+"""The reason of the Events of Kubernetes' controllers for pods that they cannot make."""
+
+_RETRIED = 20 * 60.0  # s
+_POD = re.compile(r'^.*?\bpods "[^"]*" is ', re.DOTALL)
+
+_REMEDIES = {
+    QUOTA_EXCEEDED: "raise the ResourceQuota, or wait until others end; it is tried again",
+    ADMISSION_REFUSED: "change the template, or what the cluster admits; it is tried again",
+}
+_NO_RIGHT = re.compile(r"cannot \w+ resource")  # the manager's account lacks a right: nothing that is admitted or not
+
+
+def reason_of(code: int, message: str) -> str:
+    """The reason of a refusal: by a ResourceQuota, by other admission (LimitRange, policies, webhooks), or else.
+
+    `code` is the HTTP status. A quota answers 403 with "exceeded quota" (`plugin/pkg/admission/resourcequota`), a
+    LimitRange and PodSecurity 403, a webhook or a policy with "denied", whatever the code.
+    """
+    if "exceeded quota" in message:
+        return QUOTA_EXCEEDED
+    if "denied the request" in message or "denied request" in message:
+        return ADMISSION_REFUSED
+    if code == 403 and not _NO_RIGHT.search(message):
+        return ADMISSION_REFUSED
+    return APPLY_REFUSED
+
+
+def with_remedy(reason: str, message: str) -> str:
+    """The message, with what helps."""
+    return f"{message}: {_REMEDIES[reason]}" if reason in _REMEDIES else message
+
+
+def refused_pods(live: Mapping[str, Any]) -> Trouble | None:
+    """Why the pods of a Deployment or ReplicaSet are refused, if they are; of the others only Events tell it."""
+    if live.get("kind") not in ("Deployment", "ReplicaSet"):
+        return None
+    for each in (live.get("status") or {}).get("conditions") or ():
+        if each.get("type") == "ReplicaFailure" and each.get("status") == "True":
+            return _trouble(str(each.get("message", "")))
+    return None
+
+
+def lacks_pods(live: Mapping[str, Any]) -> bool:
+    """Whether the controller of a StatefulSet, DaemonSet or Job has yet to make pods, and only its Events say why."""
+    spec, status = live.get("spec") or {}, live.get("status") or {}
+    match live.get("kind"):
+        case "StatefulSet":
+            return (status.get("replicas") or 0) < int(spec.get("replicas", 1))
+        case "DaemonSet":
+            return (status.get("currentNumberScheduled") or 0) < (status.get("desiredNumberScheduled") or 0)
+        case "Job":
+            seen = any(status.get(each) for each in ("active", "succeeded", "failed", "completionTime"))
+            return not seen and not spec.get("suspend")
+    return False
+
+
+def refused_by_events(events: Iterable[Mapping[str, Any]], now: float) -> Trouble | None:
+    """Why pods are refused, by the last of the Events FailedCreate of a workload that lacks pods; None if none is new.
+
+    `now` is in seconds since 1970. The controllers try again after 17 minutes at the latest.
+    """
+    told = [(_last(each), str(each.get("note", ""))) for each in events if each.get("reason") == FAILED_CREATE]
+    at, note = max(told, default=(0.0, ""))
+    return _trouble(note) if now - at < _RETRIED else None
+
+
+def without_names(message: str) -> str:
+    """The message without the name of the pod that was tried, which is another one each time."""
+    return _POD.sub("", message)
+
+
+def _trouble(message: str) -> Trouble:
+    said = without_names(message)
+    reason = TroubleReason(_of_pods(said))
+    return Trouble(reason, with_remedy(reason.value, f"pods are refused: {said}"))
+
+
+def _of_pods(message: str) -> str:
+    """Quota or admission: the right to make pods belongs to Kubernetes' own controllers, and is not in question."""
+    return QUOTA_EXCEEDED if reason_of(403, message) == QUOTA_EXCEEDED else ADMISSION_REFUSED
+
+
+def _last(event: Mapping[str, Any]) -> float:
+    """When it was last seen, in seconds since 1970, by whichever field its sender fills."""
+    series = event.get("series") or {}
+    stamps = (series.get("lastObservedTime"), event.get("deprecatedLastTimestamp"), event.get("eventTime"))
+    return max((parse_time(str(each)) / 1e9 for each in stamps if each), default=0.0)

@@ -1,0 +1,1 @@
+"""From a template and an instance to manifests: rendered, labelled, allowed."""

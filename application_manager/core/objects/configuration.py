@@ -1,0 +1,106 @@
+"""Live configuration: the files of a template become the texts of one ConfigMap of the instance. Pure.
+
+A ConfigMap of its own, so that a change reaches the running application and never the pod template, which would
+replace the pods. A text stays as it is; a map, a list, a number or a boolean is written in the format that the file's
+extension says.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from application_manager.core.claims import values
+from wayside.expressions import CompiledTemplate, Embedded, Environment, InterpolationError, compile_template
+from wayside.manifests import to_yaml
+
+CONFIG_MAP = ("v1", "ConfigMap")
+MAXIMUM_BYTES = 1_000_000  # of all files; the API server takes 1 MiB a ConfigMap, and etcd 1.5 MiB with all around it
+
+Check = Callable[[Embedded], Iterable[InterpolationError]]
+
+
+def config_map_name(instance: str) -> str:
+    """The name of an instance's ConfigMap: what `${instance.configMap}` stands for."""
+    return f"{instance}-configuration"
+
+
+def config_map(instance: str, files: Mapping[str, str]) -> dict[str, Any]:
+    """The ConfigMap that holds the files, without namespace, labels and owner."""
+    return {
+        "apiVersion": CONFIG_MAP[0],
+        "kind": CONFIG_MAP[1],
+        "metadata": {"name": config_map_name(instance)},
+        "data": dict(files),
+    }
+
+
+class Configuration:
+    """The files of a template, compiled. Raises InterpolationError, with all further ones in its `others`."""
+
+    def __init__(self, files: Mapping[str, Any], environment: Environment, check: Check) -> None:
+        self._files: dict[str, CompiledTemplate] = {}
+        errors: list[InterpolationError] = []
+        for name, content in sorted(files.items()):
+            try:
+                self._files[name] = compile_template(content, environment, path=_path(name), check=check)
+            except InterpolationError as error:
+                errors += [error, *error.others]
+        if errors:
+            errors[0].others = tuple(errors[1:])
+            raise errors[0]
+
+    @property
+    def embedded(self) -> tuple[Embedded, ...]:
+        """The expressions of all files."""
+        return tuple(each for compiled in self._files.values() for each in compiled.embedded)
+
+    def render(self, variables: Mapping[str, Any]) -> tuple[dict[str, str], list[str]]:
+        """The text of each file, and what is wrong, each problem with its field. A file that is null is left out."""
+        files: dict[str, str] = {}
+        problems: list[str] = []
+        for name, compiled in self._files.items():
+            try:
+                value = compiled.render(variables, integers=True)
+            except InterpolationError as error:
+                problems.append(str(error))
+                continue
+            if value is None:
+                continue
+            text = _text(name, value)
+            if text is None:
+                problems.append(
+                    f"{_path(name)}: is {_kind(value)}, and the name says no format: name the file .yaml or .json, or "
+                    "give a text"
+                )
+            else:
+                files[name] = text
+        size = sum(len(name.encode()) + len(text.encode()) for name, text in files.items())
+        if size > MAXIMUM_BYTES:
+            problems.append(
+                f"spec.configuration: the files have {size} bytes together, more than the {MAXIMUM_BYTES} that a "
+                "ConfigMap can hold: pass a reference to the data instead"
+            )
+        return files, problems
+
+
+def _path(name: str) -> str:
+    return f"spec.configuration.{name}"
+
+
+def _text(name: str, value: Any) -> str | None:
+    """The file's text, None where its name does not say how to write the value."""
+    if isinstance(value, str):
+        return value
+    plain = values.normal(value)
+    match name.rpartition(".")[2]:
+        case "json":
+            return json.dumps(plain, ensure_ascii=False, indent=2) + "\n"
+        case "yaml" | "yml":
+            return to_yaml([plain])
+    return None if isinstance(value, dict | list) else values.canonical(value)
+
+
+def _kind(value: Any) -> str:
+    return "a map" if isinstance(value, dict) else "a list"

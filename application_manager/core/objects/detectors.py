@@ -1,0 +1,262 @@
+"""The objects of a detector that the manager runs: an account, its rights, and the Deployment. Pure.
+
+Of one in others' pods (mode Sidecar, see `sidecars`) these are its rights alone, for the accounts of those pods.
+
+Only what is part of the pod stands in the Deployment: the image, resources, volumes and Secrets. All else of the
+Detector, and its rules, the detector follows itself, so a change of these starts nothing anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import PurePosixPath
+from typing import Any
+
+from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.rights import bound, detector_rights, merged, sidecar_rights
+from wayside.api import API_VERSION, Detector
+from wayside.api.pod import DetectorMode, DetectorPod
+
+Manifest = dict[str, Any]
+
+DETECTOR_LABEL = "wayside.dev/runs"
+"""On all objects of a detector, and on its pods: the Detector's name."""
+MANAGED_BY = "app.kubernetes.io/managed-by"
+MANAGER = "application-manager"
+SELECTOR = f"{DETECTOR_LABEL},{MANAGED_BY}={MANAGER}"
+"""The label selector of all objects of detectors that managers run."""
+
+KINDS = (
+    ("v1", "ServiceAccount", "serviceaccounts"),
+    ("rbac.authorization.k8s.io/v1", "Role", "roles"),
+    ("rbac.authorization.k8s.io/v1", "RoleBinding", "rolebindings"),
+    ("apps/v1", "Deployment", "deployments"),
+)
+"""apiVersion, kind and plural of a detector's objects, those first that the others need."""
+
+METRICS, METRICS_PORT = "metrics", 9100
+_SECRETS_FOLDER = "/etc/wayside/secrets"  # where the detector looks for them
+_SECRET_FIELDS = frozenset({"tlsSecret", "credentialsSecret", "uriSecret"})
+USER = 65532  # of our image; that volumes shall be writable to it, its group says
+_SCRATCH_SIZE = "256Mi"
+
+
+def object_name(detector: str) -> str:
+    """What all objects of the Detector are called."""
+    return f"detector-{detector}"
+
+
+def detector_roles(namespace: str, detector: str) -> list[Manifest]:
+    """The account, the Role and the RoleBinding with what the detector needs, and no more."""
+    name = object_name(detector)
+    account = {
+        "apiVersion": "v1",
+        "kind": "ServiceAccount",
+        "metadata": {"name": name, "namespace": namespace},
+        "automountServiceAccountToken": False,
+    }
+    return [account, *bound(name, namespace, merged(detector_rights(detector)), (namespace, name))]
+
+
+def sidecar_roles(namespace: str, detector: str, accounts: Iterable[str]) -> list[Manifest]:
+    """The Role and the RoleBinding with what the detector needs in others' pods, for their accounts and no others."""
+    whose = [(namespace, each) for each in sorted(set(accounts))]
+    return list(bound(object_name(detector), namespace, merged(sidecar_rights(detector)), *whose))
+
+
+def detector_objects(detector: Detector, defaults: PodDefaults) -> list[Manifest]:
+    """All objects of the Detector, as they are to be applied: labelled, and owned by it."""
+    if detector.spec.mode is DetectorMode.SIDECAR:
+        made = sidecar_roles(detector.namespace, detector.name, detector.spec.service_account_names or ())
+    else:
+        made = [*detector_roles(detector.namespace, detector.name), _deployment(detector, defaults)]
+    for each in made:
+        each["metadata"] |= {"labels": _labels(detector.name), "ownerReferences": [_owner(detector)]}
+    return made
+
+
+def secrets_of(detector: Detector) -> list[str]:
+    """The Secrets that its pod mounts: those that the Detector names, and those that its rules may use."""
+    pod = detector.spec.pod or DetectorPod()
+    return sorted({*_named(detector.spec.to_json()), *pod.secrets})
+
+
+def _named(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, child in value.items():
+            if key in _SECRET_FIELDS and isinstance(child, str):
+                yield child
+            else:
+                yield from _named(child)
+    elif isinstance(value, list):
+        for child in value:
+            yield from _named(child)
+
+
+def _owner(detector: Detector) -> Manifest:
+    return {
+        "apiVersion": API_VERSION,
+        "kind": "Detector",
+        "name": detector.name,
+        "uid": detector.metadata.uid,
+        "controller": True,
+        "blockOwnerDeletion": False,
+    }
+
+
+def _labels(name: str) -> dict[str, str]:
+    return {
+        "app.kubernetes.io/name": "wayside",
+        "app.kubernetes.io/component": "detector",
+        MANAGED_BY: MANAGER,
+        DETECTOR_LABEL: name,
+    }
+
+
+def _deployment(detector: Detector, defaults: PodDefaults) -> Manifest:
+    name = object_name(detector.name)
+    return {
+        "apiVersion": "apps/v1",
+        "kind": "Deployment",
+        "metadata": {"name": name, "namespace": detector.namespace},
+        "spec": {
+            "replicas": 1,
+            "strategy": {"type": "Recreate"},  # two of a name would wait for each other's Lease
+            "selector": {"matchLabels": {MANAGED_BY: MANAGER, DETECTOR_LABEL: detector.name}},
+            "template": {"metadata": {"labels": _labels(detector.name)}, "spec": _pod(detector, defaults)},
+        },
+    }
+
+
+def _pod(detector: Detector, defaults: PodDefaults) -> Manifest:
+    """The pod, as the restricted Pod Security Standard asks for it."""
+    pod = detector.spec.pod or DetectorPod()
+    volumes, mounts = volumes_of(detector)
+    probes = {
+        "startupProbe": probe("/healthz", 2, 60),
+        "livenessProbe": probe("/healthz", 10, 3),
+        "readinessProbe": probe("/readyz", 5, 2),
+    }
+    return {
+        "serviceAccountName": object_name(detector.name),
+        "automountServiceAccountToken": True,
+        "enableServiceLinks": False,
+        "terminationGracePeriodSeconds": 30,
+        "securityContext": {
+            "runAsNonRoot": True,
+            "runAsUser": USER,
+            "runAsGroup": USER,
+            "fsGroup": USER,
+            "fsGroupChangePolicy": "OnRootMismatch",
+            "seccompProfile": {"type": "RuntimeDefault"},
+        },
+        **({"imagePullSecrets": [{"name": each} for each in defaults.pull_secrets]} if defaults.pull_secrets else {}),
+        **({"nodeSelector": dict(pod.node_selector)} if pod.node_selector else {}),
+        **({"tolerations": [each.to_json() for each in pod.tolerations]} if pod.tolerations else {}),
+        "containers": [container(detector, defaults, mounts) | probes],
+        "volumes": volumes,
+    }
+
+
+def container(
+    detector: Detector,
+    defaults: PodDefaults,
+    mounts: list[Manifest],
+    *,
+    name: str = "detector",
+    port: int | None = METRICS_PORT,
+    port_name: str = METRICS,
+) -> Manifest:
+    """The container that runs the Detector, without probes.
+
+    Args:
+        detector: the Detector.
+        defaults: what holds for all detectors.
+        mounts: as `volumes_of` has them.
+        name: the container's.
+        port: where metrics and health are served; None: nowhere.
+        port_name: how scrapers find it.
+    """
+    pod = detector.spec.pod or DetectorPod()
+    metrics = {} if port is None else {"ports": [{"name": port_name, "containerPort": port, "protocol": "TCP"}]}
+    return {
+        "name": name,
+        "image": pod.image or defaults.image,
+        **({"imagePullPolicy": defaults.pull_policy.value} if defaults.pull_policy else {}),
+        "command": [
+            "detector",
+            "run",
+            f"--name={detector.name}",
+            *([] if port is None else [f"--metrics-port={port}"]),
+        ],
+        "env": _environment(pod, defaults),
+        **metrics,
+        "resources": pod.resources.to_json(),
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "capabilities": {"drop": ["ALL"]},
+            "readOnlyRootFilesystem": True,
+        },
+        "volumeMounts": mounts,
+    }
+
+
+def told(variable: str, path: str) -> Manifest:
+    """An environment variable that has a field of the pod, by the downward API."""
+    return {"name": variable, "valueFrom": {"fieldRef": {"fieldPath": path}}}
+
+
+def probe(path: str, period: int, failures: int, port_name: str = METRICS) -> Manifest:
+    """A probe of the container's port for metrics and health, every `period` seconds."""
+    get = {"path": path, "port": port_name}
+    return {"httpGet": get, "periodSeconds": period, "timeoutSeconds": 5, "failureThreshold": failures}
+
+
+def _environment(pod: DetectorPod, defaults: PodDefaults) -> list[Manifest]:
+    """Who the pod is, then what holds for all detectors, unless the Detector says otherwise, then what it says."""
+
+    given: dict[str, Manifest] = {name: {"value": value} for name, value in sorted(defaults.environment.items())}
+    for each in pod.env:
+        given.pop(each.name, None)
+        source = each.from_secret
+        given[each.name] = (
+            {"value": each.value or ""} if source is None else {"valueFrom": {"secretKeyRef": source.to_json()}}
+        )
+    own = [told("POD_NAME", "metadata.name"), told("POD_UID", "metadata.uid")]
+    return [*own, *({"name": name, **value} for name, value in given.items())]
+
+
+def volumes_of(detector: Detector, prefix: str = "") -> tuple[list[Manifest], list[Manifest]]:
+    """The volumes, and where they are mounted. A Secret that is not there yet keeps nothing from starting.
+
+    `prefix`: what the volumes' names begin with.
+    """
+    pod = detector.spec.pod or DetectorPod()
+    scratch = f"{prefix}scratch"
+    volumes: list[Manifest] = [{"name": scratch, "emptyDir": {"sizeLimit": _SCRATCH_SIZE}}]
+    mounts: list[Manifest] = [{"name": scratch, "mountPath": "/tmp"}]  # noqa: S108  a mount of the pod's own
+    for index, each in enumerate(sorted(pod.volumes, key=lambda each: each.path)):
+        name = f"{prefix}volume-{index}"
+        if each.claim is not None:
+            volumes.append({"name": name, "persistentVolumeClaim": {"claimName": each.claim}})
+        else:
+            volumes.append({"name": name, "emptyDir": {"sizeLimit": each.size} if each.size is not None else {}})
+        mounts.append({"name": name, "mountPath": each.path})
+    for index, path in enumerate(_without_volume(detector, pod)):
+        volumes.append({"name": f"{prefix}folder-{index}", "emptyDir": {}})
+        mounts.append({"name": f"{prefix}folder-{index}", "mountPath": path})
+    for index, secret in enumerate(secrets_of(detector)):
+        name = f"{prefix}secret-{index}"
+        volumes.append({"name": name, "secret": {"secretName": secret, "optional": True}})
+        mounts.append({"name": name, "mountPath": f"{_SECRETS_FOLDER}/{secret}", "readOnly": True})
+    return volumes, mounts
+
+
+def _without_volume(detector: Detector, pod: DetectorPod) -> list[str]:
+    """The folders that are in no volume, those within another one left out."""
+    found: list[PurePosixPath] = []
+    there = [PurePosixPath(each.path) for each in pod.volumes] + [PurePosixPath("/tmp")]  # noqa: S108  see above
+    for path in sorted(map(PurePosixPath, detector.spec.folders.values())):
+        if not any(path.is_relative_to(each) for each in (*there, *found)):
+            found.append(path)
+    return list(map(str, found))

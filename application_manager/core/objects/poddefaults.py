@@ -1,0 +1,50 @@
+"""What holds for the pods of all detectors that a manager runs, beside what each Detector says. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from wayside.api.pod import RESERVED_VARIABLES
+
+_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+class PullPolicy(StrEnum):
+    """When a node asks the registry for an image, as Kubernetes names it."""
+
+    ALWAYS = "Always"
+    IF_NOT_PRESENT = "IfNotPresent"
+    NEVER = "Never"
+
+
+@dataclass(frozen=True, slots=True)
+class PodDefaults:
+    """As the manager's options say.
+
+    Attributes:
+        image: of Detectors that name none.
+        pull_policy: of all images; None: Kubernetes' default, by the image's tag.
+        pull_secrets: by which nodes pull the images; each namespace with detectors has Secrets of these names.
+        environment: of the containers, e.g. where traces go; what a Detector gives itself wins.
+    """
+
+    image: str
+    pull_policy: PullPolicy | None = None
+    pull_secrets: tuple[str, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+def parse_environment(given: Iterable[str]) -> dict[str, str]:
+    """Read NAME=VALUE each. Raises ValueError for what is none."""
+    found = {}
+    for each in given:
+        name, equals, value = each.partition("=")
+        if not equals or _VARIABLE.fullmatch(name) is None:
+            raise ValueError(f"{each!r} is no variable: write NAME=VALUE, the name of letters, digits and _")
+        if name in RESERVED_VARIABLES:
+            raise ValueError(f"{name} is set for each pod by itself: leave it out")
+        found[name] = value
+    return found

@@ -1,0 +1,152 @@
+"""What a template may create: the administrator's word on kinds, namespaces and service accounts.
+
+The namespace is the wall: a template's objects stay in its own namespace, are of the allowed kinds and run with the
+listed service accounts. The account `default` is there for everyone, so its token is never mounted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+KindKey = tuple[str, str]
+"""apiVersion and kind."""
+
+DEFAULT_PLURALS: Mapping[KindKey, str] = {
+    ("apps/v1", "DaemonSet"): "daemonsets",
+    ("apps/v1", "Deployment"): "deployments",
+    ("apps/v1", "StatefulSet"): "statefulsets",
+    ("autoscaling/v2", "HorizontalPodAutoscaler"): "horizontalpodautoscalers",
+    ("batch/v1", "CronJob"): "cronjobs",
+    ("batch/v1", "Job"): "jobs",
+    ("networking.k8s.io/v1", "Ingress"): "ingresses",
+    ("networking.k8s.io/v1", "NetworkPolicy"): "networkpolicies",
+    ("policy/v1", "PodDisruptionBudget"): "poddisruptionbudgets",
+    ("v1", "ConfigMap"): "configmaps",
+    ("v1", "PersistentVolumeClaim"): "persistentvolumeclaims",
+    ("v1", "Pod"): "pods",
+    ("v1", "Secret"): "secrets",
+    ("v1", "Service"): "services",
+}
+"""The kinds that are allowed where the administrator says nothing, and what paths and roles call them."""
+
+DEFAULT_KINDS: frozenset[KindKey] = frozenset(DEFAULT_PLURALS)
+
+_NEVER_KINDS = frozenset({"Role", "RoleBinding", "ClusterRole", "ClusterRoleBinding", "ServiceAccount", "Namespace"})
+_NEVER_GROUPS = frozenset(
+    {
+        "admissionregistration.k8s.io",
+        "apiextensions.k8s.io",
+        "apiregistration.k8s.io",
+        "rbac.authorization.k8s.io",
+        "wayside.dev",
+    }
+)
+
+_POD_SPECS: Mapping[str, tuple[str, ...]] = {
+    "Pod": ("spec",),
+    "Deployment": ("spec", "template", "spec"),
+    "StatefulSet": ("spec", "template", "spec"),
+    "DaemonSet": ("spec", "template", "spec"),
+    "Job": ("spec", "template", "spec"),
+    "CronJob": ("spec", "jobTemplate", "spec", "template", "spec"),
+}
+
+_TOKEN_SECRET = "kubernetes.io/service-account-token"  # noqa: S105  a type of Secret, not one
+
+
+def kind_text(key: KindKey) -> str:
+    """A kind as options and messages write it, e.g. apps/v1/Deployment."""
+    return "/".join(key)
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """The kinds and service accounts that templates may use.
+
+    Raises ValueError for a kind that no administrator can allow.
+    """
+
+    kinds: frozenset[KindKey] = DEFAULT_KINDS
+    service_accounts: frozenset[str] = frozenset({"default"})
+
+    def __post_init__(self) -> None:
+        for api_version, kind in sorted(self.kinds):
+            if kind in _NEVER_KINDS or api_version.partition("/")[0] in _NEVER_GROUPS:
+                raise ValueError(
+                    f"{api_version}/{kind} can never be allowed: it could give a template rights beyond its namespace"
+                )
+
+    @classmethod
+    def parse(cls, kinds: list[str] | None, service_accounts: list[str] | None) -> Self:
+        """The policy of the options `--allowed-kinds` and `--service-accounts`, None or empty where not given.
+
+        Raises ValueError for what is no kind, or one that can never be allowed.
+        """
+        parsed = frozenset(_parse_kind(each) for each in kinds) if kinds else DEFAULT_KINDS
+        return cls(parsed, frozenset(service_accounts or ["default"]))
+
+    def kind_problem(self, api_version: str, kind: str) -> str | None:
+        """Why the kind may not be used, or None if it may."""
+        if (api_version, kind) in self.kinds:
+            return None
+        same = sorted(kind_text(key) for key in self.kinds if key[1] == kind)
+        choice = (
+            f"write {' or '.join(same)}" if same else f"allowed are {', '.join(sorted(map(kind_text, self.kinds)))}"
+        )
+        return f"{kind_text((api_version, kind))} is not of the kinds that the administrator allows: {choice}"
+
+    def pod_problems(self, manifest: dict[str, Any]) -> Iterator[tuple[str, str]]:
+        """Field and problem of each thing in the manifest's pods that is not allowed."""
+        if manifest.get("kind") == "Secret" and manifest.get("type") == _TOKEN_SECRET:
+            yield "type", f"{_TOKEN_SECRET} would hold a service account's token: remove it"
+        path = _POD_SPECS.get(str(manifest.get("kind")))
+        spec = _pod_spec(manifest)
+        if path is None or spec is None:
+            return
+        where = ".".join(path)
+        account = spec.get("serviceAccountName", spec.get("serviceAccount", "default"))
+        if account not in self.service_accounts:
+            listed = ", ".join(sorted(self.service_accounts))
+            yield (
+                f"{where}.serviceAccountName",
+                f"{account!r} is not of the service accounts that the administrator lists: use one of {listed}",
+            )
+        elif account == "default":
+            yield from _token_problems(spec, where)
+
+    def completed(self, manifest: dict[str, Any]) -> dict[str, Any]:
+        """The manifest, in place, with the token of the account `default` kept out of its pods."""
+        spec = _pod_spec(manifest)
+        if spec is not None and spec.get("serviceAccountName", "default") == "default":
+            spec.setdefault("automountServiceAccountToken", False)
+        return manifest
+
+
+def _parse_kind(text: str) -> KindKey:
+    api_version, slash, kind = text.rpartition("/")
+    if not slash or not api_version or not kind[:1].isupper():
+        raise ValueError(f"{text!r} is no kind: write apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service")
+    return api_version, kind
+
+
+def _pod_spec(manifest: dict[str, Any]) -> dict[str, Any] | None:
+    here: Any = manifest
+    for part in _POD_SPECS.get(str(manifest.get("kind")), ("",)):
+        here = here.get(part) if isinstance(here, dict) else None
+    return here if isinstance(here, dict) else None
+
+
+def _token_problems(spec: dict[str, Any], where: str) -> Iterator[tuple[str, str]]:
+    remedy = "remove it, or use a service account that the administrator lists"
+    if spec.get("automountServiceAccountToken"):
+        yield f"{where}.automountServiceAccountToken", f"true would mount the token of the account default: {remedy}"
+    volumes = spec.get("volumes")
+    for index, volume in enumerate(volumes if isinstance(volumes, list) else []):
+        projected = volume.get("projected") if isinstance(volume, dict) else None
+        sources = projected.get("sources") if isinstance(projected, dict) else None
+        for number, source in enumerate(sources if isinstance(sources, list) else []):
+            if isinstance(source, dict) and "serviceAccountToken" in source:
+                field = f"{where}.volumes[{index}].projected.sources[{number}].serviceAccountToken"
+                yield field, f"would mount the token of the account default: {remedy}"

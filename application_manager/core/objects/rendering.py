@@ -1,0 +1,279 @@
+"""Rendering: a template and an instance give manifests, and the same two give the same bytes.
+
+Pure. A `Renderer` holds a template compiled once; `render` fills in an instance. What the template may not do is said
+with the field, the value and the remedy; then nothing is rendered at all.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, cast
+
+from application_manager.core.claims import parameters, values
+from application_manager.core.claims.claims import unknown_members
+from application_manager.core.objects.charts import ChartFailure, ChartRequest, Charts, ChartSource, no_charts
+from application_manager.core.objects.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
+from application_manager.core.objects.labelling import labelled
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.suspension import stated_replicas, stopped, yielded
+from wayside.api import ApplicationInstance, ApplicationTemplate
+from wayside.api.base import API_VERSION
+from wayside.api.chart import Helm
+from wayside.expressions import CompiledTemplate, Embedded, Environment, InterpolationError, Kind, compile_template
+
+_INSTANCE_VARIABLES = ("name", "key", "namespace")
+_WITH_CONFIGURATION = (*_INSTANCE_VARIABLES, "configMap")
+_ENVIRONMENT = Environment({"parameters": Kind.MAP, "instance": Kind.MAP})
+_RESERVED_METADATA = ("ownerReferences", "generateName", "uid", "resourceVersion", "managedFields", "finalizers")
+
+_NAME = re.compile(
+    r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-z0-9])?)*"
+)  # RFC 1123 subdomain, for all kinds
+_LONGEST_NAME = 253  # characters
+
+MOST_EXPRESSIONS = 1000
+"""In one template: each takes about a millisecond to compile, and no template is to hold up the manager."""
+
+Manifest = dict[str, Any]
+
+
+class RenderError(Exception):
+    """A template that cannot be rendered; `problems` holds all that is wrong, each with field, value and remedy."""
+
+    def __init__(self, problems: list[str], reason: str = "RenderFailed") -> None:
+        super().__init__("; ".join(problems))
+        self.problems = tuple(problems)
+        self.reason = reason
+
+
+class ChartPending(Exception):  # noqa: N818  no error: the answer is still to come
+    """The instance's chart is being rendered; render again once it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rendering:
+    """The objects of an instance: manifests without owner, which `owned` adds, and a digest of them all.
+
+    `replicas`: of each workload that can be scaled, what the template states; None where it leaves that to others.
+    """
+
+    manifests: tuple[Manifest, ...]
+    digest: str
+    replicas: Mapping[tuple[str, str, str], int | None] = field(default_factory=dict)
+
+    def keys(self) -> set[tuple[str, str, str]]:
+        """What tells the objects apart: apiVersion, kind and name of each."""
+        return {object_key(each) for each in self.manifests}
+
+
+class Renderer:
+    """A template, compiled.
+
+    Raises RenderError for expressions that do not compile or name what there is not, and for kinds not allowed.
+    """
+
+    def __init__(self, template: ApplicationTemplate, policy: Policy) -> None:
+        self.template = template
+        self._policy = policy
+        if (count := _expressions(template)) > MOST_EXPRESSIONS:
+            raise RenderError(
+                [
+                    f"spec: has {count} expressions in ${{…}}, more than the {MOST_EXPRESSIONS} that a template may "
+                    "have: give longer texts with fewer of them, or make several templates of it"
+                ]
+            )
+        self._keyed = template.spec.key is not None
+        self._manifests: list[CompiledTemplate] = []
+        problems = parameters.template_problems(template)
+        configured = bool(template.spec.configuration)
+        members = _WITH_CONFIGURATION if configured else _INSTANCE_VARIABLES
+        known = {"parameters": tuple(sorted(template.spec.parameters)), "instance": members}
+        check = partial(unknown_members, known)
+        self._configuration: Configuration | None = None
+        if configured:
+            if problem := policy.kind_problem(*CONFIG_MAP):
+                problems.append(f"spec.configuration: becomes a ConfigMap, but {problem}")
+            try:
+                self._configuration = Configuration(template.spec.configuration, _ENVIRONMENT, check)
+            except InterpolationError as error:
+                problems += [str(each) for each in (error, *error.others)]
+        for index, manifest in enumerate(template.spec.manifests):
+            path = f"spec.manifests[{index}]"
+            kind_problem = policy.kind_problem(manifest["apiVersion"], manifest["kind"])
+            if kind_problem:
+                problems.append(f"{path}.kind: {kind_problem}")
+            try:
+                compiled = compile_template(manifest, _ENVIRONMENT, path=path, check=check)
+            except InterpolationError as error:
+                problems += [str(each) for each in (error, *error.others)]
+            else:
+                self._manifests.append(compiled)
+        self._values: CompiledTemplate | None = None
+        if template.spec.helm is not None:
+            try:
+                where = "spec.helm.values"
+                self._values = compile_template(template.spec.helm.values, _ENVIRONMENT, path=where, check=check)
+            except InterpolationError as error:
+                problems += [str(each) for each in (error, *error.others)]
+        if problems:
+            raise RenderError(problems)
+
+    @property
+    def embedded(self) -> tuple[Embedded, ...]:
+        """All expressions of the template but the key, with their fields."""
+        compiled = [*self._manifests, *([self._values] if self._values is not None else [])]
+        of_files = self._configuration.embedded if self._configuration is not None else ()
+        return (*of_files, *(each for one in compiled for each in one.embedded))
+
+    def render(self, instance: ApplicationInstance, charts: Charts = no_charts) -> Rendering:
+        """The instance's objects; `charts` knows what became of a chart.
+
+        Raises RenderError where an expression fails on the instance's values, or a manifest may not be as it is, and
+        ChartPending where the chart's rendering is still to come.
+        """
+        spec = self.template.spec
+        problems = parameters.problems(spec.parameters, instance.spec.parameters, self.template.name, "spec.parameters")
+        if problems:
+            raise RenderError(problems)
+        complete = parameters.with_defaults(spec.parameters, instance.spec.parameters)
+        about = {"name": instance.name, "key": instance.spec.key, "namespace": instance.namespace}
+        if self._configuration is not None:
+            about["configMap"] = config_map_name(instance.name)
+        variables = {"parameters": {name: complete.get(name) for name in spec.parameters}, "instance": about}
+        manifests: list[Manifest] = []
+        if self._configuration is not None:
+            files, problems = self._configuration.render(variables)
+            manifests.append(labelled(config_map(instance.name, files), instance))
+        for index, compiled in enumerate(self._manifests):
+            path = f"spec.manifests[{index}]"
+            try:
+                # Copied, since a template without ${…} somewhere gives out its own parts.
+                manifest = cast("Manifest", copy.deepcopy(compiled.render(variables, integers=True)))
+            except InterpolationError as error:
+                problems.append(str(error))
+                continue
+            found = [f"{path}.{field}: {problem}" for field, problem in self._problems(manifest, instance)]
+            problems += found
+            if not found:
+                manifests.append(labelled(self._policy.completed(manifest), instance))
+        if spec.helm is not None and self._values is not None and not problems:
+            for where, manifest in self._chart_manifests(spec.helm, self._values, instance, variables, charts):
+                found = [f"{where}: {field}: {problem}" for field, problem in self._problems(manifest, instance)]
+                if kind_problem := self._policy.kind_problem(manifest["apiVersion"], manifest["kind"]):
+                    found.append(f"{where}: {kind_problem}; or turn it off by the chart's values")
+                problems += found
+                if not found:
+                    manifests.append(labelled(self._policy.completed(manifest), instance))
+        problems += _duplicates(manifests)
+        if problems:
+            raise RenderError(problems)
+        manifests = yielded(manifests)
+        replicas = stated_replicas(manifests)
+        if instance.spec.suspended:
+            manifests = stopped(manifests)
+        return Rendering(tuple(manifests), digest(manifests), replicas)
+
+    def _chart_manifests(
+        self,
+        helm: Helm,
+        compiled: CompiledTemplate,
+        instance: ApplicationInstance,
+        variables: Mapping[str, Any],
+        charts: Charts,
+    ) -> Iterator[tuple[str, Manifest]]:
+        """The chart's objects, each with where it stands."""
+        try:
+            given = compiled.render(variables, integers=True)
+        except InterpolationError as error:
+            raise RenderError([str(error)]) from None
+        request = ChartRequest(ChartSource.of(helm), instance.namespace, instance.name, values.canonical(given or {}))
+        outcome = charts(request)
+        if outcome is None:
+            raise ChartPending(f"chart {request.source} is being rendered")
+        if isinstance(outcome, ChartFailure):
+            raise RenderError([outcome.message], outcome.reason)
+        for each in outcome.objects:
+            # Copied and in one form, since what comes from the chart is kept for the next time.
+            yield f"spec.helm: {each.file} of chart {helm.chart}", cast("Manifest", values.normal(each.manifest))
+
+    def _problems(self, manifest: Manifest, instance: ApplicationInstance) -> Iterator[tuple[str, str]]:
+        metadata = manifest.get("metadata")
+        if not isinstance(metadata, dict):
+            yield "metadata", "is missing: give metadata.name"
+            return
+        name = metadata.get("name")
+        if not isinstance(name, str) or not name:
+            yield "metadata.name", f"{values.shown(name)} is no name: give a text, e.g. ${{instance.name}}"
+        elif len(name) > _LONGEST_NAME or not _NAME.fullmatch(name):
+            yield (
+                "metadata.name",
+                f"{values.shown(name)} is no name for an object: it takes at most {_LONGEST_NAME} lower-case letters, "
+                "digits, - and ., with a letter or digit at both ends",
+            )
+        elif self._keyed and instance.name not in name:
+            yield (
+                "metadata.name",
+                f"{name!r} would be the same for several instances: with spec.key, each name must contain "
+                "${instance.name}",
+            )
+        namespace = metadata.get("namespace", instance.namespace)
+        if namespace != instance.namespace:
+            yield (
+                "metadata.namespace",
+                f"{namespace!r} is not the template's own namespace, {instance.namespace}: remove the field, "
+                "or make the template in that namespace",
+            )
+        for reserved in _RESERVED_METADATA:
+            if reserved in metadata:
+                yield f"metadata.{reserved}", "is the manager's to say: remove it"
+        for member in ("labels", "annotations"):
+            texts = metadata.get(member)
+            if texts is not None and not isinstance(texts, dict):
+                yield f"metadata.{member}", f"{values.shown(texts)} is no map: give names and texts"
+        yield from self._policy.pod_problems(manifest)
+
+
+def digest(manifests: list[Manifest]) -> str:
+    """A digest of manifests: equal exactly if their canonical bytes are."""
+    return hashlib.sha256(values.canonical(manifests).encode()).hexdigest()
+
+
+def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
+    """The manifest with the instance, which has a uid by now, as its owner and controller."""
+    owner = {
+        "apiVersion": API_VERSION,
+        "kind": instance.kind,
+        "name": instance.name,
+        "uid": instance.metadata.uid,
+        "controller": True,
+    }
+    return {**manifest, "metadata": {**manifest["metadata"], "ownerReferences": [owner]}}
+
+
+def object_key(manifest: Mapping[str, Any]) -> tuple[str, str, str]:
+    """What tells the objects of one instance apart: apiVersion, kind and name."""
+    return manifest["apiVersion"], manifest["kind"], manifest["metadata"]["name"]
+
+
+def _expressions(template: ApplicationTemplate) -> int:
+    """How many `${` there are to be compiled."""
+    spec = template.spec
+    text = json.dumps([spec.configuration, spec.manifests, spec.helm.values if spec.helm is not None else None])
+    return text.count("${") - text.count("$${")
+
+
+def _duplicates(manifests: list[Manifest]) -> list[str]:
+    seen: set[tuple[str, str, str]] = set()
+    found = []
+    for manifest in manifests:
+        key = object_key(manifest)
+        if key in seen:
+            found.append(f"spec.manifests: {key[1]} {key[2]!r} is there twice: give each its own name")
+        seen.add(key)
+    return found

@@ -1,0 +1,219 @@
+"""What the manager's account must be allowed to do, from the kinds that templates may create. Pure.
+
+One table, read three times: `application-manager rbac` prints it as roles, a manager that starts asks the API server
+for each of its entries, and the tests hold it against what a manager does. A verb that nothing needs is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from application_manager.core.objects.policy import KindKey
+from application_manager.core.objects.suspension import SCALED
+from wayside.api import API_VERSION
+from wayside.leases import lease_name
+
+_GROUP = API_VERSION.partition("/")[0]
+_LEASES = "coordination.k8s.io"
+_LOOKING = ("list", "watch")
+_TOLD_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
+"""The kinds whose status does not tell that their pods are refused (core/health/refusals.py)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Right:
+    """Verbs on a resource.
+
+    Attributes:
+        group: the API group, empty for the core group.
+        resource: the plural, with `/<subresource>` where it is one.
+        verbs: as roles name them.
+        purpose: what does not work without it.
+        vital: whether nothing works without it.
+        name: the one object that it is limited to; empty: all.
+    """
+
+    group: str
+    resource: str
+    verbs: tuple[str, ...]
+    purpose: str
+    vital: bool = False
+    name: str = ""
+
+    def rule(self) -> dict[str, Any]:
+        """As a role has it."""
+        names = {"resourceNames": [self.name]} if self.name else {}
+        return {"apiGroups": [self.group], "resources": [self.resource], "verbs": list(self.verbs)} | names
+
+    def lack(self, verb: str, where: str) -> str:
+        """What to say where the verb is not allowed; `where` is "in namespace x" or "in all namespaces"."""
+        of = f" of {self.group}" if self.group else ""
+        name = f" {self.name}" if self.name else ""
+        return f"its account may not {verb} {self.resource}{name}{of} {where}: {self.purpose}"
+
+
+REMEDY = "grant what `application-manager rbac` prints"
+
+
+def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[Right]:
+    """What is needed in each namespace that is looked after.
+
+    Args:
+        plurals: of the kinds that are allowed.
+        detectors: whether the manager runs detectors too.
+    """
+    return [*_own(), *_children(plurals), *(_running_detectors() if detectors else ())]
+
+
+def detector_rights(name: str) -> list[Right]:
+    """What the Detector of that name must be allowed to do in its namespace, where it runs by itself."""
+    return [
+        *_detecting(name, "hold"),
+        Right(_LEASES, "leases", ("get", "update"), "it counts as lost", vital=True, name=lease_name(name)),
+        Right(_LEASES, "leases", ("create",), "it counts as lost", vital=True),
+    ]
+
+
+def sidecar_rights(name: str) -> list[Right]:
+    """What the Detector of that name must be allowed to do in its namespace, where it runs in others' pods.
+
+    Each pod has a Lease of its own, whose name no role knows: that the others' are left alone, the chart's policy sees
+    to, by the verb `hold-as-pod`.
+    """
+    return [
+        *_detecting(name, "hold-as-pod"),
+        Right(_LEASES, "leases", ("get", "update", "create"), "it counts as lost", vital=True),
+    ]
+
+
+def _detecting(name: str, hold: str) -> Iterator[Right]:
+    tasks = ("get", "list", "watch", "create", "patch", "delete")
+    yield Right(_GROUP, "detectors", _LOOKING, "it does not know what to take in", vital=True, name=name)
+    yield Right(_GROUP, "detectors", (hold,), "the chart's policy refuses its tasks and its Lease", name=name)
+    yield Right(_GROUP, "eventrules", _LOOKING, "it does not know its rules", vital=True)
+    yield Right(_GROUP, "applicationtasks", tasks, "what it detects has no consequence", vital=True)
+
+
+def lease_rights(name: str) -> list[Right]:
+    """What is needed in the namespace of the managers' own Lease."""
+    purpose = "no manager becomes active"
+    return [
+        Right(_LEASES, "leases", ("get", "update"), purpose, vital=True, name=name),
+        Right(_LEASES, "leases", ("create",), purpose, vital=True),  # of what is not there yet, no role knows the name
+    ]
+
+
+def node_rights() -> list[Right]:
+    """What is of use for the whole cluster, and can be done without: nodes belong to no namespace."""
+    return [Right("", "nodes", ("list",), "that no node is as a template requires is left to the scheduler to say")]
+
+
+def _own() -> Iterator[Right]:
+    yield Right(_GROUP, "applicationtemplates", ("get", *_LOOKING), "nothing can be decided", vital=True)
+    instances = ("get", *_LOOKING, "create", "patch", "delete")
+    yield Right(_GROUP, "applicationinstances", instances, "no instance is made, changed or released", vital=True)
+    yield Right(_GROUP, "applicationtasks", _LOOKING, "nothing can be decided", vital=True)
+    yield Right(_GROUP, "applicationtasks", ("delete",), "finished tasks stay for ever")
+    yield Right(_GROUP, "detectors", _LOOKING, "nothing can be judged", vital=True)
+    yield Right(_GROUP, "eventrules", _LOOKING, "nothing can be judged", vital=True)
+    for plural in ("applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"):
+        yield Right(_GROUP, f"{plural}/status", ("patch",), "nobody learns how they are")
+    yield Right(_LEASES, "leases", ("get", *_LOOKING), "holders that are lost are not noticed", vital=True)
+    yield Right("events.k8s.io", "events", ("create",), "no Kubernetes Events are posted")
+
+
+def _running_detectors() -> Iterator[Right]:
+    """To make a detector's objects; what it hands on by their Roles, the manager must have itself (no `escalate`)."""
+    no_detector = "no detector is run"
+    for group, resource in (
+        ("", "serviceaccounts"),
+        ("rbac.authorization.k8s.io", "roles"),
+        ("rbac.authorization.k8s.io", "rolebindings"),
+        ("apps", "deployments"),
+    ):
+        yield Right(group, resource, ("get", "list", "create", "patch", "delete"), no_detector)
+    yield Right("", "pods", ("list",), "why a detector does not run, or is not in a pod, is not seen")
+    for each in (*detector_rights(""), *sidecar_rights("")):
+        yield Right(each.group, each.resource, each.verbs, no_detector)
+
+
+def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
+    all_verbs = ("get", *_LOOKING, "create", "patch", "delete")
+    for (api_version, kind), plural in sorted(plurals.items()):
+        group = api_version.rpartition("/")[0]
+        yield Right(group, plural, _LOOKING, f"what becomes of each {kind} is not seen", vital=True)
+        others = tuple(verb for verb in all_verbs if verb not in _LOOKING)
+        yield Right(group, plural, others, f"no {kind} of a template is made, changed or removed")
+        if (api_version, kind) in SCALED:
+            yield Right(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
+    if _TOLD_BY_EVENTS & plurals.keys():
+        yield Right(
+            "events.k8s.io", "events", ("list",), "why pods of other workloads than Deployments are refused is not said"
+        )
+    if ("v1", "Pod") not in plurals:
+        yield Right("", "pods", _LOOKING, "why workloads do not run is not seen", vital=True)
+        yield Right("", "pods", ("patch",), "running applications learn of a changed configuration late")
+
+
+def roles(
+    plurals: Mapping[KindKey, str],
+    namespaces: Iterable[str],
+    lease: tuple[str, str],
+    account: tuple[str, str],
+    name: str = "wayside-application-manager",
+    *,
+    detectors: bool = False,
+) -> list[dict[str, Any]]:
+    """The roles and their bindings, as manifests.
+
+    Args:
+        plurals: of the kinds that are allowed.
+        namespaces: those that are looked after: a Role in each; empty: a ClusterRole.
+        lease: namespace and name of the managers' Lease.
+        account: namespace and name of the manager's service account.
+        name: of all roles and bindings; that of the Lease has `-lease` behind it.
+        detectors: whether the manager runs detectors too.
+    """
+    where = list(dict.fromkeys(namespaces))
+    rules = merged([*rights(plurals, detectors=detectors), *([] if where else node_rights())])
+    found: list[dict[str, Any]] = []
+    everywhere: list[str | None] = [None]
+    for namespace in where or everywhere:
+        found += bound(name, namespace, rules, account)
+    return [*found, *bound(f"{name}-lease", lease[0], merged(lease_rights(lease[1])), account)]
+
+
+def merged(needed: Iterable[Right]) -> list[dict[str, Any]]:
+    """As few rules as say the same: resources of a group with the same verbs are one."""
+    verbs: dict[tuple[str, str, str], dict[str, None]] = {}
+    for each in needed:
+        verbs.setdefault((each.group, each.name, each.resource), {}).update(dict.fromkeys(each.verbs))
+    alike: dict[tuple[str, str, frozenset[str]], Right] = {}
+    resources: dict[tuple[str, str, frozenset[str]], list[str]] = {}
+    for (group, only, resource), its in verbs.items():
+        key = (group, only, frozenset(its))
+        alike.setdefault(key, Right(group, resource, tuple(its), "", name=only))
+        resources.setdefault(key, []).append(resource)
+    return [each.rule() | {"resources": resources[key]} for key, each in alike.items()]
+
+
+def bound(
+    name: str, namespace: str | None, rules: list[dict[str, Any]], *accounts: tuple[str, str]
+) -> Iterator[dict[str, Any]]:
+    """A role with these rules and the binding of the accounts, each namespace and name, to it.
+
+    Both are for the namespace, or without one for the cluster.
+    """
+    api, group = "rbac.authorization.k8s.io/v1", "rbac.authorization.k8s.io"
+    prefix = "" if namespace else "Cluster"
+    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
+    yield {"apiVersion": api, "kind": f"{prefix}Role", "metadata": metadata, "rules": rules}
+    yield {
+        "apiVersion": api,
+        "kind": f"{prefix}RoleBinding",
+        "metadata": metadata,
+        "roleRef": {"apiGroup": group, "kind": f"{prefix}Role", "name": name},
+        "subjects": [{"kind": "ServiceAccount", "namespace": each[0], "name": each[1]} for each in accounts],
+    }

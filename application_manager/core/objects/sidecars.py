@@ -1,0 +1,171 @@
+"""The detector as a sidecar: what a pod gets that names a Detector in its label. Pure.
+
+The webhook adds it to pods, and `application-manager inject` to manifests. It is a native sidecar, an init container
+that is always restarted: it starts before the pod's own containers, ends after them, and keeps no Job from completing.
+
+The pod shall not suffer from it. So nothing of it is waited for: no startup probe holds back the other containers, and
+no readiness probe takes the pod out of its Services. It comes after all other init containers, for which it would be
+too late anyway; its names are its own; and its token is a volume of its own, whatever the pod or its account say about
+mounting one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from application_manager.core.objects.detectors import USER, Manifest, container, probe, told, volumes_of
+from application_manager.core.objects.poddefaults import PodDefaults
+from wayside.api import Detector
+
+SIDECAR_LABEL = "wayside.dev/detector"
+"""On pods: the Detector that they ask for."""
+CONTAINER = "wayside-detector"
+"""The name of the container. A pod that has one of this name has its detector."""
+
+_PREFIX = "wayside-"
+_TOKEN = f"{_PREFIX}token"
+_TOKEN_FOLDER = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105  a folder
+_TOKEN_SECONDS = 3607  # the kubelet renews it in time; the value that Kubernetes itself uses
+_METRICS = "wayside-metrics"  # scrapers find ports by their names, over all containers of a pod
+_FIRST_PORT = 9464  # not 9100, which many pods have themselves
+_STARTING = 120  # s that a detector may take until its health counts
+
+
+@dataclass(frozen=True, slots=True)
+class Addition:
+    """What is added to the lists of a pod's spec, by their fields."""
+
+    items: dict[str, list[Manifest]]
+
+
+class UnfitError(ValueError):
+    """With the sidecar the pod would not be valid, and would not be made at all."""
+
+
+def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults) -> Addition | None:
+    """What the spec of a pod lacks of the Detector's sidecar; None where it has one.
+
+    Args:
+        spec: of the pod.
+        detector: the Detector.
+        defaults: what holds for all detectors.
+
+    Raises:
+        UnfitError: they do not go together.
+    """
+    if has_sidecar(spec):
+        return None
+    volumes, mounts = volumes_of(detector, _PREFIX)
+    volumes.append(_token())
+    mounts.append({"name": _TOKEN, "mountPath": _TOKEN_FOLDER, "readOnly": True})
+    paths = [each["mountPath"].rstrip("/") for each in mounts]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise UnfitError(f"Detector {detector.name} has two volumes at {path}: give its folder another path")
+    there = {each.get("name"): each for each in _list(spec, "volumes")}
+    for each in volumes:
+        if each["name"] in there and there[each["name"]] != each:
+            raise UnfitError(
+                f"spec.volumes: the name {each['name']} is taken, and the detector needs it: rename the pod's volume"
+            )
+    keys = {each.get("name") for each in _list(spec, "imagePullSecrets")}
+    items = {
+        "initContainers": [_sidecar(detector, defaults, mounts, _port(spec))],
+        "volumes": [each for each in volumes if each["name"] not in there],
+        "imagePullSecrets": [{"name": each} for each in defaults.pull_secrets if each not in keys],
+    }
+    return Addition({field: each for field, each in items.items() if each})
+
+
+def has_sidecar(spec: Mapping[str, Any]) -> bool:
+    """Whether the spec of a pod has the detector's container, be it ours or one that its author wrote."""
+    return any(each.get("name") == CONTAINER for each in _all_containers(spec))
+
+
+def sidecar_pods(pods: Iterable[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    """Of each pod that has the sidecar, what concerns it alone, as if there were nothing else in the pod."""
+    for pod in pods:
+        spec, status = pod.get("spec") or {}, pod.get("status") or {}
+        if has_sidecar(spec):
+            yield {
+                "metadata": pod["metadata"],
+                "spec": {"initContainers": [each for each in _all_containers(spec) if each.get("name") == CONTAINER]},
+                "status": {
+                    "phase": status.get("phase"),
+                    "initContainerStatuses": [
+                        each
+                        for field in ("initContainerStatuses", "containerStatuses")
+                        for each in _list(status, field)
+                        if each.get("name") == CONTAINER
+                    ],
+                },
+            }
+
+
+def added(spec: Mapping[str, Any], given: Addition) -> Manifest:
+    """The pod's spec with the addition."""
+    return {**spec, **{field: [*_list(spec, field), *items] for field, items in given.items.items()}}
+
+
+def patch(spec: Mapping[str, Any], given: Addition) -> list[dict[str, Any]]:
+    """The same as a JSON patch of the pod (RFC 6902), which touches nothing else."""
+    operations: list[dict[str, Any]] = []
+    for field, items in given.items.items():
+        if _list(spec, field):
+            operations += [{"op": "add", "path": f"/spec/{field}/-", "value": each} for each in items]
+        else:
+            operations.append({"op": "add", "path": f"/spec/{field}", "value": items})
+    return operations
+
+
+def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], port: int | None) -> Manifest:
+    made = container(detector, defaults, mounts, name=CONTAINER, port=port, port_name=_METRICS)
+    made["command"] += ["--as-pod", "--namespace=$(POD_NAMESPACE)"]
+    made["env"].append(told("POD_NAMESPACE", "metadata.namespace"))
+    for each in made["env"]:  # a Secret that is not there would keep the whole pod from starting
+        if "secretKeyRef" in each.get("valueFrom", {}):
+            each["valueFrom"]["secretKeyRef"] |= {"optional": True}
+    # The pod's own securityContext is its author's, so all that the restricted standard asks for is said here.
+    made["securityContext"] |= {
+        "runAsNonRoot": True,
+        "runAsUser": USER,
+        "runAsGroup": USER,
+        "seccompProfile": {"type": "RuntimeDefault"},
+    }
+    health = (
+        {}
+        if port is None
+        else {"livenessProbe": probe("/healthz", 10, 3, _METRICS) | {"initialDelaySeconds": _STARTING}}
+    )
+    return made | {"restartPolicy": "Always"} | health
+
+
+def _port(spec: Mapping[str, Any]) -> int | None:
+    """A port for metrics and health that no other container of the pod says to be its own.
+
+    None in a pod of the node's network: there it could be another pod's, and would keep a second pod from the node.
+    """
+    if spec.get("hostNetwork"):
+        return None
+    taken = {port.get("containerPort") for each in _all_containers(spec) for port in _list(each, "ports")}
+    return next(port for port in range(_FIRST_PORT, 65536) if port not in taken)
+
+
+def _token() -> Manifest:
+    """The account's token, bound to the pod: what the ServiceAccount admission mounts where it may."""
+    sources = [
+        {"serviceAccountToken": {"path": "token", "expirationSeconds": _TOKEN_SECONDS}},
+        {"configMap": {"name": "kube-root-ca.crt", "items": [{"key": "ca.crt", "path": "ca.crt"}]}},
+        {"downwardAPI": {"items": [{"path": "namespace", "fieldRef": {"fieldPath": "metadata.namespace"}}]}},
+    ]
+    return {"name": _TOKEN, "projected": {"sources": sources}}
+
+
+def _all_containers(spec: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
+    return [*_list(spec, "initContainers"), *_list(spec, "containers")]
+
+
+def _list(of: Mapping[str, Any], field: str) -> list[Any]:
+    return of.get(field) or []

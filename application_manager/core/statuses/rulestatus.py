@@ -1,0 +1,103 @@
+"""Statuses of EventRules and Detectors: whether a detector can evaluate them, and if not, what is wrong where. Pure.
+
+The same compiler that the detector runs judges here. It does not know the message types of ROS, which are the
+detector's to know, so a misspelt type, or field of a message, is told by the detector alone: what is accepted here is
+accepted as far as can be told, and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from application_manager.core.conditions import Aspect, updated
+from application_manager.core.findings.findings import Findings
+from application_manager.core.findings.rulefindings import detector_findings, rule_findings, selecting, selects
+from application_manager.core.statuses.running import RUNNING
+from wayside.api import Detector, EventRule
+from wayside.api.detector import DetectorStatus
+from wayside.api.eventrule import EventRuleStatus
+
+Status = TypeVar("Status", EventRuleStatus, DetectorStatus)
+
+_AS_FAR_AS = "as far as can be told without the message types; what they show to be wrong, the detector's log says"
+
+
+def rule_status(
+    rule: EventRule,
+    detectors: Sequence[Detector],
+    now: float,
+    invalid: Sequence[str] = (),
+    others: Sequence[EventRule] = (),
+    remarks: Sequence[str] = (),
+) -> EventRuleStatus:
+    """The rule's status.
+
+    Args:
+        rule: the rule.
+        detectors: those of its namespace that are valid.
+        now: seconds since 1970.
+        invalid: the names of its namespace's other detectors.
+        others: the rules of its namespace, which its signals may name.
+        remarks: what else is worth knowing of it.
+    """
+    selected = selecting(rule, detectors)
+    findings = replace(rule_findings(rule, detectors, invalid, others), remarks=tuple(remarks))
+    old = rule.status or EventRuleStatus()
+    generation = rule.metadata.generation
+    return EventRuleStatus(
+        observed_generation=generation,
+        detectors=[each.name for each in selected],
+        conditions=list(updated(old.conditions, (_rule_aspect(findings, bool(selected)),), generation, now)),
+    )
+
+
+def detector_status(
+    detector: Detector, rules: Sequence[EventRule], now: float, running: Aspect | None = None
+) -> DetectorStatus:
+    """The detector's status.
+
+    Args:
+        detector: the Detector.
+        rules: those of its namespace.
+        now: seconds since 1970.
+        running: whether it runs, where that is for the manager to say and is known.
+    """
+    old = detector.status or DetectorStatus()
+    aspects = [_aspect(detector_findings(detector), "DetectorInvalid"), *([] if running is None else [running])]
+    kept = [each for each in old.conditions if detector.spec.mode is not None or each.type != RUNNING]
+    generation = detector.metadata.generation
+    return DetectorStatus(
+        observed_generation=generation,
+        rules=sum(1 for each in rules if selects(detector, each)),
+        conditions=list(updated(kept, aspects, generation, now)),
+    )
+
+
+def unreadable_status(status: Status, reason: str, problem: str, generation: int, now: float) -> Status:
+    """The status of a rule or detector that the API server took and that is none.
+
+    Args:
+        status: as it is.
+        reason: for programs.
+        problem: what is wrong, with its field and the remedy.
+        generation: the object's.
+        now: seconds since 1970.
+    """
+    aspect = Aspect("Accepted", False, reason, problem)
+    conditions = list(updated(status.conditions, (aspect,), generation, now))
+    return status.model_copy(update={"observed_generation": generation, "conditions": conditions})
+
+
+def _rule_aspect(findings: Findings, selected: bool) -> Aspect:
+    if selected or findings.problems:
+        return _aspect(findings, "RuleInvalid")
+    return Aspect("Accepted", False, "NotSelected", "; ".join(findings.doubts))
+
+
+def _aspect(findings: Findings, reason: str) -> Aspect:
+    if findings.faults:
+        return Aspect("Accepted", False, reason, "; ".join(findings.faults))
+    but = f"; but {'; '.join(findings.remarks)}" if findings.remarks else ""
+    return Aspect("Accepted", True, "Accepted", f"nothing is wrong, {_AS_FAR_AS}{but}")

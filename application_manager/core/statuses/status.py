@@ -1,0 +1,279 @@
+"""Statuses: what the manager says of tasks, instances and templates. Pure.
+
+They are honest (Ready means that the workload is ready) and quiet: the same state gives the same status, so nothing is
+written that is not news.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from application_manager.core.claims.operations import ACCEPTED, Standing, Verdict
+from application_manager.core.conditions import Aspect, find, holds, updated
+from application_manager.core.demand import byhand, fallback
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.findings.findings import Findings
+from application_manager.core.objects.suspension import autoscalers, pods_left
+from wayside.api import ApplicationInstance, ApplicationTask
+from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
+from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase
+from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.api.base import Condition
+from wayside.api.operation import Operation
+from wayside.times import format_seconds, parse_seconds
+
+Json = dict[str, Any]
+
+_NAMES_SHOWN = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """What an instance has given to its tasks so far.
+
+    Attributes:
+        applied: whether all objects are as they should be.
+        ready: whether its workloads are ready.
+        problem: why it is not applied or not ready, in words; empty where only time is lacking.
+        reason: the problem's word for programs, where it keeps the instance from being ready.
+        suspended: whether it is to be at zero.
+        stopped: whether it is at zero.
+    """
+
+    instance: str
+    applied: bool
+    ready: bool
+    problem: str = ""
+    reason: str = ""
+    suspended: bool = False
+    stopped: bool = False
+
+
+def together(services: Sequence[Service]) -> Service:
+    """What several instances, at least one, have given to a task that means them all."""
+    return Service(
+        instance=", ".join(sorted(each.instance for each in services)),
+        applied=all(each.applied for each in services),
+        ready=all(each.ready for each in services),
+        problem="; ".join(sorted(each.problem for each in services if each.problem)),
+        reason=next((each.reason for each in services if each.reason), ""),
+        suspended=any(each.suspended for each in services),
+        stopped=all(each.stopped for each in services),
+    )
+
+
+def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None, now: float) -> ApplicationTaskStatus:
+    """The task's status; Applied and Ready stay True once they were. `service` is that of the verdict's instance."""
+    old = task.status or ApplicationTaskStatus()
+    finished = verdict.standing is Standing.FINISHED
+    aspects: list[Aspect] = []
+    if not finished:
+        accepted = verdict.standing in (Standing.COUNTS, Standing.WAITING)
+        aspects.append(Aspect("Accepted", accepted, verdict.reason, verdict.message))
+        if find(old.conditions, "Finished") is not None:
+            aspects.append(Aspect("Finished", False, "HolderReturned", "the holder is back"))
+    else:
+        aspects.append(Aspect("Finished", True, verdict.reason, verdict.message))
+    suspends = task.spec.operation is Operation.SUSPEND
+    if verdict.standing is Standing.COUNTS and service is not None:
+        done = service.stopped if suspends else service.ready
+        word = "suspended" if suspends else "ready"
+        aspects += [
+            _latched(old.conditions, "Applied", service.applied, "Applied", "NotApplied", service),
+            _latched(old.conditions, "Ready", done, "Ready", "NotReady", service, word),
+        ]
+    conditions = updated(old.conditions, aspects, task.metadata.generation, now)
+    instance = old.instance or verdict.instance if finished else verdict.instance
+    return ApplicationTaskStatus(
+        phase=_task_phase(verdict, service, suspends),
+        instance=instance,
+        message=_task_message(verdict, service, suspends),
+        observed_generation=task.metadata.generation,
+        conditions=list(conditions),
+    )
+
+
+def finished_since(task: ApplicationTask) -> float | None:
+    """When the task's status began to say that it is finished, in seconds since 1970; None where it does not."""
+    condition = find(task.status.conditions, "Finished") if task.status else None
+    return parse_seconds(condition.last_transition_time) if condition and condition.status == "True" else None
+
+
+def _latched(
+    known: Sequence[Condition],
+    type_: str,
+    now_holds: bool,
+    reason: str,
+    otherwise: str,
+    service: Service,
+    word: str = "applied",
+) -> Aspect:
+    if now_holds or holds(known, type_):
+        since = f"; now: {service.problem}" if service.problem and not now_holds else ""
+        return Aspect(type_, True, reason, f"instance {service.instance} was {word}{since}")
+    if service.applied and service.reason and word != "suspended":
+        otherwise = service.reason
+    return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {word} yet")
+
+
+def _task_phase(verdict: Verdict, service: Service | None, suspends: bool) -> TaskPhase:
+    match verdict.standing:
+        case Standing.WAITING:
+            return TaskPhase.WAITING
+        case Standing.FINISHED:
+            return TaskPhase.FINISHED
+        case Standing.REFUSED:
+            return TaskPhase.REFUSED
+        case Standing.LAPSED:
+            return TaskPhase.LAPSED
+    if service is None or not service.applied:
+        return TaskPhase.PENDING
+    if suspends:
+        return TaskPhase.READY if service.stopped else TaskPhase.ACTIVE
+    if service.suspended:
+        return TaskPhase.SUSPENDED
+    return TaskPhase.READY if service.ready else TaskPhase.ACTIVE
+
+
+def _task_message(verdict: Verdict, service: Service | None, suspends: bool) -> str | None:
+    if verdict.standing is not Standing.COUNTS:
+        return _short(verdict.message)
+    told = [] if verdict.reason == ACCEPTED else [verdict.message]
+    if service is None:
+        return _short("; ".join([*told, f"instance {verdict.instance} is not made yet"]))
+    done, word = (service.stopped, "suspended") if suspends else (service.ready, "ready")
+    if service.applied and done:
+        return _short("; ".join(told))
+    lacks = word if service.applied else "applied"
+    return _short("; ".join([*told, service.problem or f"instance {service.instance} is not {lacks} yet"]))
+
+
+def instance_status(
+    instance: ApplicationInstance,
+    decision: Decision,
+    applied: Aspect,
+    ready: Aspect,
+    objects: Iterable[ObjectReference],
+    spec_hash: str | None,
+    now: float,
+    suspended: Aspect | None = None,
+) -> ApplicationInstanceStatus:
+    """The instance's status.
+
+    `applied`, `ready` and `suspended` are its conditions, the last of which is None where it was never suspended;
+    `spec_hash` is that of what was last applied.
+    """
+    old = instance.status or ApplicationInstanceStatus()
+    lingering = decision.release_time is not None
+    if lingering:
+        phase = InstancePhase.LINGERING
+    elif not applied.holds:
+        phase = InstancePhase.FAILED if applied.reason not in ("Waiting", "ChartPending") else InstancePhase.PENDING
+    elif instance.spec.suspended:
+        phase = InstancePhase.SUSPENDED
+    else:
+        phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
+    generation = instance.metadata.generation
+    return ApplicationInstanceStatus(
+        phase=phase,
+        message=_instance_message(instance, decision, applied, ready),
+        observed_generation=generation,
+        spec_hash=spec_hash,
+        release_time=None if decision.release_time is None else format_seconds(decision.release_time),
+        objects=list(objects),
+        suspended_replicas=old.suspended_replicas,
+        demands=demands(decision),
+        conditions=list(
+            updated(
+                old.conditions,
+                (
+                    applied,
+                    ready,
+                    *([suspended] if suspended else []),
+                    *_capped(old.conditions, decision),
+                    *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
+                    *byhand.aspects(instance),
+                ),
+                generation,
+                now,
+            )
+        ),
+    )
+
+
+def suspension_aspect(
+    instance: ApplicationInstance, decision: Decision, objects: Iterable[Mapping[str, Any] | None]
+) -> Aspect | None:
+    """The condition Suspended of an instance with these live objects; None before it ever was suspended."""
+    known = instance.status.conditions if instance.status else ()
+    if not instance.spec.suspended:
+        if find(known, "Suspended") is None:
+            return None
+        return Aspect("Suspended", False, "NotSuspended", "no task suspends it")
+    there = [each for each in objects if each is not None]
+    left = [f"{each['kind']} {each['metadata']['name']} has {n} pods" for each in there if (n := pods_left(each))]
+    whose = f"task {decision.suspender} suspends it" if decision.suspender else "spec.suspended is true"
+    if left:
+        return Aspect("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
+    resting = "".join(f"; HorizontalPodAutoscaler {each} rests until then" for each in autoscalers(there))
+    return Aspect("Suspended", True, "Suspended", f"{whose}, and its workloads are at zero{resting}")
+
+
+def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:
+    """The condition Capped, from when a merged sum went beyond its bounds for the first time."""
+    if decision.capped:
+        return [Aspect("Capped", True, "SumBeyondBounds", "; ".join(decision.capped))]
+    if find(known, "Capped") is not None:
+        return [Aspect("Capped", False, "WithinBounds", "all merged values are as the tasks say")]
+    return []
+
+
+def _instance_message(instance: ApplicationInstance, decision: Decision, applied: Aspect, ready: Aspect) -> str | None:
+    parts = ["paused"] if decision.paused else []
+    if not applied.holds:
+        parts.append(applied.message)
+    elif not ready.holds:
+        parts.append(ready.message)
+    if decision.release_time is not None:
+        parts.append(f"released at {format_seconds(decision.release_time)} unless a demand comes")
+    elif byhand.is_held(instance) and not decision.wanted:
+        parts.append("held though nobody demands it")
+    parts += decision.capped
+    parts += [f"stands in for {each}" for each in decision.stands_in_for]
+    return _short("; ".join(parts))
+
+
+def _short(message: str) -> str | None:
+    """The message as a column shows it; None where it is empty."""
+    longest = 512
+    return (message if len(message) <= longest else f"{message[: longest - 1]}…") or None
+
+
+def demands(decision: Decision) -> Demands:
+    """How many tasks the instance serves, and the first of them."""
+    return Demands(count=len(decision.tasks), names=list(decision.tasks[:_NAMES_SHOWN]))
+
+
+def template_status(
+    old: ApplicationTemplateStatus, generation: int, findings: Findings, instances: int, now: float
+) -> ApplicationTemplateStatus:
+    """The template's status, with why it cannot be rendered, if it cannot."""
+    if findings.problems:
+        accepted = Aspect("Accepted", False, "TemplateInvalid", "; ".join(findings.problems))
+    else:
+        but = f", but {'; '.join(findings.remarks)}" if findings.remarks else ""
+        accepted = Aspect("Accepted", True, "Accepted", f"the template can be rendered{but}")
+    return ApplicationTemplateStatus(
+        observed_generation=generation,
+        instances=instances,
+        conditions=list(updated(old.conditions, (accepted,), generation, now)),
+    )
+
+
+def difference(old: Json, new: Json) -> Json:
+    """The JSON merge patch that makes `old` of `new`, on the first level: empty where they are equal."""
+    patch: Json = {key: value for key, value in new.items() if old.get(key) != value}
+    patch |= {key: None for key in old if key not in new}
+    return patch

@@ -1,0 +1,1 @@
+"""What the manager knows of the cluster, with its indexes, in memory."""

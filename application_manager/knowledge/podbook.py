@@ -1,0 +1,57 @@
+"""Pods that are in trouble, by the instance that they belong to: an index, kept up to date pod by pod.
+
+Pods are told by the instance's label, which the rendering puts into pod templates. Of those that run well, which are
+nearly all, nothing is kept here.
+"""
+
+from __future__ import annotations
+
+from application_manager.cluster.store import Name, Object, name_of
+from application_manager.core.health.pods import Trouble, summary, trouble
+from application_manager.core.objects.labelling import INSTANCE_LABEL
+
+
+class PodBook:
+    """Troubles of pods."""
+
+    def __init__(self) -> None:
+        self._troubles: dict[Name, dict[Name, Trouble]] = {}
+
+    def note(self, pod: Object) -> bool:
+        """Note a pod as it is now; whether that changes what `troubles` says of its instance."""
+        instance = _instance_of(pod)
+        if instance is None:
+            return False
+        before = self.troubles(instance)
+        found = trouble(pod)
+        if found is None:
+            self._drop(instance, name_of(pod))
+        else:
+            self._troubles.setdefault(instance, {})[name_of(pod)] = found
+        return before != self.troubles(instance)
+
+    def forget(self, pod: Object) -> bool:
+        """Forget a pod that is gone; whether that changes what `troubles` says of its instance."""
+        instance = _instance_of(pod)
+        if instance is None:
+            return False
+        before = self.troubles(instance)
+        self._drop(instance, name_of(pod))
+        return before != self.troubles(instance)
+
+    def troubles(self, instance: Name) -> list[Trouble]:
+        """The different troubles of an instance's pods, the most telling first."""
+        members = self._troubles.get(instance)
+        return summary(members.values()) if members else []
+
+    def _drop(self, instance: Name, pod: Name) -> None:
+        members = self._troubles.get(instance)
+        if members is not None:
+            members.pop(pod, None)
+            if not members:
+                del self._troubles[instance]
+
+
+def _instance_of(pod: Object) -> Name | None:
+    instance = (pod["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
+    return (pod["metadata"]["namespace"], instance) if instance else None

@@ -1,0 +1,102 @@
+"""/metrics, /healthz and /readyz over HTTP, in the manager's own event loop: one that hangs does not answer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from typing import Protocol
+
+from aiohttp import web
+
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.measures import Measures
+
+STALLED_AFTER = 300.0
+"""Seconds without the end of a resync, at the least, after which the manager counts as stalled."""
+
+_RESYNCS = 3  # and so many times the time between two
+
+Lack = Callable[[], str | None]
+"""What is lacking, in words; None where nothing is."""
+
+_TEXT = "text/plain; version=0.0.4; charset=utf-8"
+
+
+class Queue(Protocol):
+    """What tells of a worker that is at one key for too long."""
+
+    def stuck(self, limit: float) -> str | None:
+        """The key and for how long, in words."""
+
+
+def stalled(measures: Measures, every: float, queues: Sequence[Queue] = (), least: float = STALLED_AFTER) -> Lack:
+    """Whether work has stalled: no resync has ended, or a worker was at one key, for too long.
+
+    A resync that fails, the API server being away, ends as well. Any thread may ask.
+
+    Args:
+        measures: knows when the last resync ended.
+        every: seconds between two resyncs.
+        queues: whose workers are looked at.
+        least: seconds that count as too long, or three times `every` if that is more.
+    """
+    limit = max(least, _RESYNCS * every)
+
+    def look() -> str | None:
+        stuck = next(filter(None, (queue.stuck(limit) for queue in queues)), None)
+        if stuck is not None:
+            return stuck
+        since = time.monotonic() - measures.looked
+        return f"no resync has ended for {since:.0f} s" if since > limit else None
+
+    return look
+
+
+@asynccontextmanager
+async def pages(
+    port: int | None, measures: Measures, healthy: Lack, ready: Lack, role: Callable[[], str] = str
+) -> AsyncIterator[int | None]:
+    """Serve on all addresses while the block runs; the port, None where none is wanted. Port 0 takes a free one.
+
+    `role` is what /readyz says beside "ok", if anything: a standby is ready as well.
+
+    Raises ConfigurationError where the port is taken.
+    """
+    if port is None:
+        yield None
+        return
+    application = web.Application()
+
+    async def metrics(_: web.Request) -> web.Response:
+        return _answer(measures.text())
+
+    async def healthz(_: web.Request) -> web.Response:
+        return _judged(healthy())
+
+    async def readyz(_: web.Request) -> web.Response:
+        return _judged(healthy() or ready(), role())
+
+    for path, page in (("/metrics", metrics), ("/healthz", healthz), ("/readyz", readyz)):
+        application.router.add_get(path, page)
+    runner = web.AppRunner(application, access_log=None, handle_signals=False, shutdown_timeout=1)
+    await runner.setup()
+    try:
+        try:
+            await web.TCPSite(runner, port=port).start()
+        except OSError as error:
+            reason = error.strerror or error
+            raise ConfigurationError(f"--metrics-port {port}: {reason}: give another port") from error
+        # With port 0, IPv6 has a port of its own; an IPv4 address is a pair.
+        yield next(int(each[1]) for each in sorted(runner.addresses, key=len))
+    finally:
+        await runner.cleanup()
+
+
+def _answer(text: bytes, status: int = 200) -> web.Response:
+    return web.Response(body=text, status=status, headers={"Content-Type": _TEXT})
+
+
+def _judged(lack: str | None, role: str = "") -> web.Response:
+    said = lack or ", ".join(filter(None, ("ok", role)))
+    return _answer(f"{said}\n".encode(), 200 if lack is None else 503)

@@ -1,0 +1,185 @@
+"""The spans of what is done for tasks, where traces are on (see `wayside.tracing`), and the task bears its trace.
+
+A task that an instance serves for the first time gets `reconcile`, with `apply` in it, and `ready` once its workloads
+are. Each is in the task's own trace; where an instance serves several tasks, `reconcile` is linked to the others.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+from prometheus_client.core import CounterMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from application_manager.cluster.store import Name
+from application_manager.core.claims.operations import Standing
+from application_manager.core.conditions import changed, find, holds
+from application_manager.knowledge.world import Record, World
+from application_manager.measures import PREFIX
+from wayside.api import ApplicationTask
+from wayside.api.applicationtask import TRACEPARENT_ANNOTATION, ApplicationTaskStatus
+from wayside.times import parse_seconds
+from wayside.tracecontext import Attribute, Span, TraceContext, parse_traceparent
+from wayside.tracing import Tracing
+
+_REMEMBERED = 10_000
+"""Tasks that are not ready yet; beyond it the oldest are forgotten, and their `ready` has the task as its parent."""
+_LINKS = 20
+"""Other tasks that a `reconcile` is linked to, the first in their order."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class _Known:
+    """A task that is not ready yet: its `reconcile`, since when it is applied (ns), and what failed last."""
+
+    reconcile: TraceContext | None = None
+    applied: int = 0
+    failure: str = ""
+
+
+class TaskTraces:
+    """Tells the spans of tasks. Only the event loop's thread."""
+
+    def __init__(self, told: Tracing, world: World) -> None:
+        self.tracing = told
+        self._world = world
+        self._known: OrderedDict[str, _Known] = OrderedDict()
+        self._said = False
+
+    async def reconciling(self, name: Name, work: Callable[[Name], Awaitable[None]]) -> None:
+        """Do the work on an instance, and tell what it did for tasks."""
+        began, before = time.time_ns(), self._world.records.get(name)
+        try:
+            await work(name)
+        finally:
+            record = self._world.records.get(name)
+            if record is not None and record is not before and not record.decision.withheld:
+                self._reconciled(name, began, record)
+
+    def told(self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus) -> None:
+        """A task's status was written: tell what came of it."""
+        context = _context(task)
+        if context is None:
+            return
+        about = {**_about(task), "wayside.instance": new.instance or ""}
+        now = time.time_ns()
+        for each in changed(old.conditions, new.conditions):
+            if each.type == "Accepted" and each.status == "False":
+                word = str(new.phase.value).lower() if new.phase else "refused"
+                self._emit(
+                    Span(word, now, now, parent=context, attributes=about, error=f"{each.reason}: {each.message}")
+                )
+            elif each.type == "Ready" and each.status == "True" and not holds(old.conditions, "Ready"):
+                self._ready(task, context, new, now, None)
+            elif each.type == "Finished" and each.status == "True":
+                ready = find(new.conditions, "Ready")
+                if ready is not None and ready.status == "False":
+                    self._ready(task, context, new, now, f"{ready.reason}: {ready.message}")
+                self._known.pop(task.metadata.uid, None)
+
+    def _reconciled(self, name: Name, began: int, record: Record) -> None:
+        ended = time.time_ns()
+        served: dict[str, tuple[ApplicationTask, TraceContext]] = {}
+        for task_name, verdict in record.decision.verdicts.items():
+            task = self._world.task((name[0], task_name))
+            if verdict.standing is Standing.COUNTS and task is not None and (context := _context(task)) is not None:
+                served[task_name] = (task, context)
+        for task, context in served.values():
+            self._serves(name, task, context, served, began, ended, record)
+
+    def _serves(
+        self,
+        name: Name,
+        task: ApplicationTask,
+        context: TraceContext,
+        served: Mapping[str, tuple[ApplicationTask, TraceContext]],
+        began: int,
+        ended: int,
+        record: Record,
+    ) -> None:
+        """Tell `reconcile` and `apply` of a task, unless it was applied before, or this failure was told."""
+        if task.status is not None and holds(task.status.conditions, "Applied"):
+            return
+        known = self._remembered(task.metadata.uid)
+        aspect, took = record.applied.aspect, record.applied.took
+        failure = "" if aspect.holds else f"{aspect.reason}: {aspect.message}"
+        if known.applied or (failure and failure == known.failure):
+            return
+        about = {**_about(task), "wayside.instance": name[1]}
+        links = [other for each, other in served.items() if each != task.name][:_LINKS]
+        known.failure = failure
+        known.reconcile = self._emit(
+            Span(
+                f"reconcile {record.decision.template}",
+                began,
+                ended,
+                parent=context,
+                attributes={**about, "wayside.demands": len(served)},
+                links=[other for _, other in links],
+                error=failure or None,
+            )
+        )
+        if took is not None:
+            span = Span("apply", *took, parent=known.reconcile, attributes=about, error=failure or None)
+            self._emit(span)
+        if aspect.holds:
+            known.applied = ended
+
+    def _ready(
+        self, task: ApplicationTask, context: TraceContext, status: ApplicationTaskStatus, now: int, failure: str | None
+    ) -> None:
+        known = self._known.pop(task.metadata.uid, None)
+        applied = find(status.conditions, "Applied")
+        start = round(parse_seconds(applied.last_transition_time) * 1e9) if applied is not None else now
+        if known is not None and known.applied:
+            start = known.applied
+        parent = known.reconcile if known is not None and known.reconcile is not None else context
+        about = {**_about(task), "wayside.instance": status.instance or ""}
+        self._emit(Span("ready", min(start, now), now, parent=parent, attributes=about, error=failure))
+
+    def _emit(self, span: Span) -> TraceContext:
+        if self.tracing.failed and not self._said:
+            self._said = True
+            log.warning("spans are not taken by %s; those lost are counted in the metrics", self.tracing.endpoint)
+        return self.tracing.emit(span)
+
+    def _remembered(self, uid: str) -> _Known:
+        known = self._known.setdefault(uid, _Known())
+        while len(self._known) > _REMEMBERED:
+            self._known.popitem(last=False)
+        return known
+
+
+class LostSpans(Collector):
+    """Spans that nobody got, as a Prometheus metric."""
+
+    def __init__(self, told: Tracing) -> None:
+        self._told = told
+
+    def collect(self) -> Iterator[Metric]:
+        """The metric as of now."""
+        family = CounterMetricFamily(f"{PREFIX}spans_dropped", "Spans that nobody got", labels=("cause",))
+        family.add_metric(("full",), self._told.dropped)
+        family.add_metric(("failed",), self._told.failed)
+        yield family
+
+
+def _context(task: ApplicationTask) -> TraceContext | None:
+    """Where the task stands; None where it bears no trace, or one that is not recorded."""
+    context = parse_traceparent(task.metadata.annotations.get(TRACEPARENT_ANNOTATION))
+    return context if context is not None and context.sampled else None
+
+
+def _about(task: ApplicationTask) -> dict[str, Attribute]:
+    return {
+        "k8s.namespace.name": task.namespace,
+        "wayside.task": task.name,
+        "wayside.template": task.spec.template,
+        "wayside.operation": task.spec.operation.value,
+    }

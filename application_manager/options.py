@@ -1,0 +1,53 @@
+"""What a manager is told when it is started."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zenoh
+
+from application_manager.admission.reviewing import Serving
+from application_manager.charts.chartcache import default_folder
+from application_manager.charts.helm import Helm
+from application_manager.cluster.leadership import LeaseKey
+from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.policy import Policy
+from application_manager.observability.pages import STALLED_AFTER
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What the command line says.
+
+    Attributes:
+        policy: what templates may create.
+        namespaces: those to look at; empty: all.
+        max_instances: how many instances a namespace may have; None: any number.
+        resync: seconds between two full resyncs.
+        ttl_after_finished: seconds that finished tasks are kept.
+        metrics_port: where metrics and health are served; None: nowhere.
+        zenoh: where configurations are published; None: nowhere.
+        helm: renders charts.
+        chart_cache: the folder in which fetched charts are kept.
+        chart_folder: the folder with the charts of the image.
+        admission: where the API server's questions about objects are answered; None: nowhere.
+        lease: by which one of several managers is active.
+        stalled_after: seconds after which the watchdog ends a manager whose work has stalled.
+        detectors: what holds for the pods of detectors; None: no detector is run.
+    """
+
+    policy: Policy = field(default_factory=Policy)
+    namespaces: tuple[str, ...] = ()
+    max_instances: int | None = None
+    resync: float = 60.0
+    ttl_after_finished: float = 3600.0
+    metrics_port: int | None = None
+    zenoh: zenoh.Config | None = None
+    helm: Helm = field(default_factory=Helm)
+    chart_cache: Path = field(default_factory=default_folder)
+    chart_folder: Path = Path("/charts")
+    admission: Serving | None = None
+    lease: LeaseKey = field(default_factory=lambda: LeaseKey("default"))
+    stalled_after: float = STALLED_AFTER
+    detectors: PodDefaults | None = None

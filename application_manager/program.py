@@ -1,0 +1,14 @@
+"""The console script: able to end before the rest is imported, which takes a while."""
+
+from __future__ import annotations
+
+from wayside.beginning import end_on_sigterm, importing
+
+
+def main() -> None:
+    """Run the command line."""
+    end_on_sigterm()
+    with importing():
+        from application_manager.cli import main as run  # noqa: PLC0415  that is the point
+
+    run()

@@ -1,0 +1,75 @@
+"""Looking at the objects of the detectors that the manager runs, and at the pods with them, every few seconds.
+
+There are few of them, and a look shows all that a watch could have missed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
+from application_manager.cluster.store import Name
+from application_manager.core.objects.detectors import KINDS, SELECTOR
+from application_manager.core.objects.sidecars import SIDECAR_LABEL
+from application_manager.knowledge.detectorbook import DetectorBook
+from application_manager.knowledge.world import DETECTOR, World
+
+LOOK_EVERY = 3.0  # s
+_KINDS = tuple(Resource(*each) for each in KINDS)
+_PODS = Resource("v1", "Pod", "pods")
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorWatch:
+    """Lists them.
+
+    Attributes:
+        namespaces: where; empty: everywhere.
+        detector: asks for a Detector's objects to be looked after.
+    """
+
+    world: World
+    client: Client
+    book: DetectorBook
+    namespaces: tuple[str, ...]
+    detector: Callable[[Name], None]
+
+    async def run(self) -> None:
+        """Look until cancelled, where the manager runs detectors."""
+        failed = ""
+        while self.book.defaults is not None:
+            try:
+                await self.look()
+                failed = ""
+            except (ApiError, Unreachable) as error:
+                if str(error) != failed:
+                    log.warning("the objects of detectors cannot be looked at: %s", error)
+                failed = str(error)
+            await asyncio.sleep(LOOK_EVERY)
+        await asyncio.Event().wait()
+
+    async def look(self) -> None:
+        """Look once. Raises ApiError or Unreachable."""
+        objects: list[Object] = []
+        for resource in _KINDS:
+            objects += await self._list(resource, SELECTOR)
+        before = set(self.book.asking)
+        self.book.take(objects, await self._list(_PODS, SELECTOR), await self._list(_PODS, SIDECAR_LABEL))
+        for name in {
+            *self.book.objects,
+            *before,
+            *self.book.asking,
+            *(name for name, _ in self.world.store.all(DETECTOR)),
+        }:
+            self.detector(name)
+
+    async def _list(self, resource: Resource, labels: str) -> list[Object]:
+        found: list[Object] = []
+        for namespace in self.namespaces or (None,):
+            found += (await self.client.list(resource, namespace, labels=labels))[0]
+        return found

@@ -1,0 +1,93 @@
+"""Looking at the API server's health, and at Leases that seem to have lapsed."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from application_manager.cluster.client import LEASES, ApiError, Client, Resource, Unreachable
+from application_manager.cluster.store import Name
+from application_manager.core.holders.leases import HolderKey
+from application_manager.knowledge.world import World
+from wayside.leases import lease_name
+
+LOOK_EVERY = 1.0  # s
+_AT_ONCE = 8  # Leases read at once: few, since what runs goes before
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseWatch:
+    """Measures the time in which we reach the API server, on which Leases lapse.
+
+    Attributes:
+        probe: what is listed to see whether the API server and its storage answer.
+        namespaces: where; empty: anywhere.
+        instance: asks for an instance to be reconciled.
+    """
+
+    world: World
+    client: Client
+    probe: Resource
+    namespaces: tuple[str, ...]
+    instance: Callable[[Name], None]
+
+    async def run(self) -> None:
+        """Look until cancelled. Reading never holds up the look at the health, by which all Leases are judged."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._measure(), name="health")
+            group.create_task(self._read(), name="overdue leases")
+
+    async def _measure(self) -> None:
+        was_reached = True
+        while True:
+            reached = await self._reached()
+            self.world.healthy.look(time.monotonic(), succeeded=reached)
+            if reached != was_reached:
+                log.warning("the API server answers again" if reached else "the API server does not answer")
+                was_reached = reached
+            await asyncio.sleep(LOOK_EVERY)
+
+    async def _read(self) -> None:
+        while True:
+            if self.world.healthy.reached:
+                await self.read_due()
+            await asyncio.sleep(LOOK_EVERY)
+
+    async def _reached(self) -> bool:
+        try:
+            await self.client.list(self.probe, next(iter(self.namespaces), None), limit=1)
+        except Unreachable:
+            return False
+        except ApiError as error:
+            return error.code < 500
+        return True
+
+    async def read_due(self) -> None:
+        """Read the Leases that are unchanged for longer than they last; news of them also come by watching.
+
+        One that cannot be read is left as it was seen last, and does not concern the others.
+        """
+        at = self.world.healthy.elapsed
+        gate = asyncio.Semaphore(_AT_ONCE)
+        due = [each for each in self.world.claims.holders().items() if self.world.leases.due(each[0], at)]
+        problems = [each for each in await asyncio.gather(*(self._look_at(*each, gate) for each in due)) if each]
+        if problems:
+            others = f", and {len(problems) - 1} more Leases cannot be read" if len(problems) > 1 else ""
+            log.warning("leases: %s%s", problems[0], others)
+
+    async def _look_at(self, key: HolderKey, instances: Iterable[Name], gate: asyncio.Semaphore) -> Exception | None:
+        """Read one Lease; what failed, if anything."""
+        async with gate:
+            try:
+                raw = await self.client.get(LEASES, key[0], lease_name(key[1]))
+            except (ApiError, Unreachable) as error:
+                return error
+        self.world.leases.observe(key, raw, self.world.healthy.elapsed)
+        for instance in instances:
+            self.instance(instance)
+        return None

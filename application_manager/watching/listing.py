@@ -1,0 +1,81 @@
+"""Listing everything: once before anything is decided, and periodically, in case a watch missed something."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from application_manager.cluster.client import ApiError, Client, Resource, Unreachable
+from application_manager.cluster.starting import until_answered
+from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.knowledge.world import World
+from application_manager.measures import Measures
+from application_manager.watching.router import Router
+
+FIRST_RESYNC = 3.0  # s after the watches began: what vanished between our first list and theirs
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """Lists what the manager looks at.
+
+    Attributes:
+        own: our own kinds, those that others depend on first.
+        children: the kinds of instances' objects.
+        namespaces: where; empty: everywhere.
+        every: seconds between two resyncs.
+        measures: told of each resync.
+    """
+
+    world: World
+    client: Client
+    router: Router
+    own: Sequence[Resource]
+    children: Sequence[Resource]
+    namespaces: tuple[str, ...]
+    every: float
+    measures: Measures
+
+    async def first(self) -> None:
+        """List everything, however long the API server takes to answer.
+
+        Raises ApiError where it refuses for good.
+        """
+        await until_answered(self._everything)
+        self.measures.resynced(well=True)
+
+    async def resync(self, watching: asyncio.Event) -> None:
+        """List everything again and again, once the watches have begun, until cancelled."""
+        await watching.wait()
+        await asyncio.sleep(min(FIRST_RESYNC, self.every))
+        while True:
+            began = time.monotonic()
+            try:
+                await self._everything()
+            except (ApiError, Unreachable) as error:
+                log.warning("resync: %s", error)
+                self.measures.resynced(well=False)
+            else:
+                self.measures.resynced(well=True)
+            self.world.leases.forget_except(self.world.claims.holders())
+            await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
+
+    async def _everything(self) -> None:
+        for resource in self.own:
+            await self._list(resource, "")
+        await asyncio.gather(*(self._list(resource, INSTANCE_LABEL) for resource in self.children))
+        self.router.everything()
+
+    async def _list(self, resource: Resource, labels: str) -> None:
+        for namespace in self.namespaces or (None,):
+            listed, version = await self.client.list(resource, namespace, labels=labels)
+            for raw in listed:
+                self.router.observe(raw)
+            kind = (resource.api_version, resource.kind)
+            for entry in self.world.store.missing(kind, listed, version, namespace):
+                self.router.vanished(entry.raw)

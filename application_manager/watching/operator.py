@@ -1,0 +1,91 @@
+"""The registrations with kopf, and nothing else: every event is handed on, nothing is handled here.
+
+Only `on.event`, which neither adds finalizers nor writes to objects. Handlers return None, and kopf's own Events,
+peering and progress storage are off. Leases are filtered by name, an instance's objects by label, on the server.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Collection, Iterator
+from typing import Any
+
+import kopf
+
+from application_manager.cluster.client import LEASES, Object, Resource
+from application_manager.core.objects.labelling import INSTANCE_LABEL
+from wayside.leases import holder_of
+
+News = Callable[[Object], None]
+
+_PAUSES = (0.1, 0.2, 0.5)  # s, between attempts to reach the API server; then the last again and again
+_LONG_PAUSE = 1.0  # s
+
+
+class _Pauses:
+    """An endless series of pauses, which can be begun anew: a watch never gives up."""
+
+    def __iter__(self) -> Iterator[float]:
+        yield from _PAUSES
+        while True:
+            yield _LONG_PAUSE
+
+
+async def watch(
+    own: Collection[Resource],
+    children: Collection[Resource],
+    *,
+    observe: News,
+    vanished: News,
+    connect: Callable[[], Awaitable[kopf.ConnectionInfo]],
+    namespaces: Collection[str],
+    ready: asyncio.Event,
+) -> None:
+    """Hand on the news of our own kinds, of Leases, and of what bears an instance's label, until cancelled.
+
+    `namespaces` empty: all. `ready` is set once kopf has started. `connect` is asked for credentials at the start, and
+    again when the API server no longer takes them.
+    """
+    logging.getLogger("kopf").setLevel(logging.WARNING)
+    registry = kopf.OperatorRegistry()
+    settings = kopf.OperatorSettings()
+    settings.posting.enabled = False
+    settings.scanning.disabled = True  # the kinds and namespaces are given, so it needs no right to watch CRDs
+    settings.networking.error_backoffs = _Pauses()
+    settings.networking.request_timeout = 15
+    settings.networking.connect_timeout = 5
+    settings.process.ultimate_exiting_timeout = None
+    settings.queueing.exit_timeout = 0.1  # s; what is lost by stopping at once is seen again at the next start
+
+    async def login(**_: Any) -> kopf.ConnectionInfo:
+        return await connect()
+
+    async def handle(event: Any, **_: Any) -> None:
+        raw = dict(event["object"])
+        if event["type"] == "DELETED":
+            vanished(raw)
+        else:
+            observe(raw)
+
+    def is_holders(name: str, **_: Any) -> bool:
+        return holder_of(name) is not None
+
+    kopf.on.login(registry=registry)(login)
+    for resource in own:
+        kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handle)
+    kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=registry, when=is_holders)(handle)
+    for resource in children:
+        kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handle)
+        settings.watching.label_selectors[resource.group, resource.version, resource.plural] = INSTANCE_LABEL
+
+    identity: Any = "application-manager"  # else kopf asks for the user's name, and a container's may have none
+    await kopf.operator(
+        registry=registry,
+        settings=settings,
+        identity=identity,
+        standalone=True,
+        clusterwide=not namespaces,
+        namespaces=namespaces,
+        ready_flag=ready,
+    )

@@ -1,0 +1,228 @@
+"""What a piece of news means: it enters the world, and whatever depends on it is asked to be looked at again.
+
+News are watch events, answers to our own writes, and lists; all take the same way, and what is no news ends here.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from application_manager.cluster.apply import Applier
+from application_manager.cluster.client import Object
+from application_manager.cluster.store import Entry, Name, kind_of, name_of
+from application_manager.core.health.readiness import not_ready
+from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
+from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.suspension import pods_left
+from application_manager.knowledge.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, POD, TASK, TEMPLATE, World
+from application_manager.work.rulework import RuleKey
+from wayside.api import ApplicationInstance
+from wayside.leases import holder_of
+
+Ask = Callable[[Name], None]
+
+_RULES = (DETECTOR, EVENT_RULE)
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Router:
+    """Takes news.
+
+    Attributes:
+        instance, task, template, rule: ask for one of these to be reconciled; `rule` is for Detectors as well.
+        configuration: asks for an instance's configuration to be brought to those that follow it.
+    """
+
+    world: World
+    applier: Applier
+    instance: Ask
+    task: Ask
+    template: Ask
+    rule: Callable[[RuleKey], None]
+    configuration: Ask
+
+    def observe(self, raw: Object) -> None:
+        """Take an object as it was read."""
+        kind, name = kind_of(raw), name_of(raw)
+        if kind == LEASE:
+            self._lease(name, raw)
+            return
+        old = self.world.store.get(kind, name)
+        entry = self.world.store.put(raw)
+        if entry is None:
+            return
+        if old is not None and old.uid != entry.uid:
+            self.applier.forget(old.raw)
+        if kind == TASK:
+            self._task(name, entry)
+        elif kind == TEMPLATE:
+            self._template(name, old, entry)
+        elif kind == INSTANCE:
+            self._instance(name, old, entry)
+        elif kind in _RULES:
+            if old is None or _written(old) != _written(entry):
+                self._rules(name[0])
+        else:
+            self._child(old, entry)
+
+    def vanished(self, raw: Object) -> None:
+        """Take the news that an object is gone."""
+        kind, name = kind_of(raw), name_of(raw)
+        if kind == LEASE:
+            self._lease(name, None)
+            return
+        entry = self.world.store.remove(raw)
+        if entry is None:
+            return
+        if kind == TASK:
+            self._ask_all(self.world.claims.forget(name))
+        elif kind == TEMPLATE:
+            self.world.forget_template(name)
+            self.world.note_limits(name)
+            self._claim_again(name)
+            self._rules(name[0])
+        elif kind == INSTANCE:
+            self._look_at_one(name)
+            self.configuration(name)
+            if isinstance(entry.model, ApplicationInstance):
+                self.template((name[0], entry.model.spec.template))
+        elif kind in _RULES:
+            self._rules(name[0])
+        elif kind == POD and _is_a_workloads(raw):
+            if self.world.pods.forget(raw):
+                self._ask_for_owner(raw)
+        else:
+            self.world.pods.forget(raw)
+            self.applier.forget(raw)
+            self._ask_for_owner(raw)
+            self._ask_for_configuration(raw)
+
+    def everything(self) -> None:
+        """Ask for all that there is."""
+        for name, _ in self.world.store.all(TEMPLATE):
+            self.template(name)
+        instances = {name for name, _ in self.world.store.all(INSTANCE)}
+        instances |= {name for name, _ in self.world.store.all(TEMPLATE)}  # for their baselines
+        self._ask_all(instances | set(self.world.claims.instances()))
+        for name, _ in self.world.store.all(TASK):
+            self.task(name)
+        for kind in _RULES:
+            for name, _ in self.world.store.all(kind):
+                self.rule((kind, name))
+
+    def _task(self, name: Name, entry: Entry) -> None:
+        of = entry.raw["spec"].get("template", "")
+        before = self.world.claims.claim(name)
+        touched = self.world.claims.note(name, entry, self.world.template((name[0], of)))
+        after = self.world.claims.claim(name)
+        # A task whose status alone changed, which is mostly our own doing, concerns no instance.
+        same = before is not None and after is not None and before.task.spec == after.task.spec
+        if not same or before is None or before.task.metadata.uid != entry.uid:
+            self._ask_all(touched)
+        self.task(name)
+
+    def _template(self, name: Name, old: Entry | None, entry: Entry) -> None:
+        self.template(name)
+        self.world.note_limits(name)
+        if old is None or old.uid != entry.uid or old.raw["spec"] != entry.raw["spec"]:
+            self._claim_again(name)
+            self._rules(name[0])
+
+    def _claim_again(self, template: Name) -> None:
+        """Ask all tasks of the template anew what they claim, and look at all its instances."""
+        touched = {template, *self.world.instances_of(template)}  # its own name is that of its baseline
+        touched |= self.world.falling_back_to(template)
+        for name in self.world.claims.tasks_of(template):
+            entry = self.world.store.get(TASK, name)
+            if entry is not None:
+                touched |= self.world.claims.note(name, entry, self.world.template(template))
+                self.task(name)
+        self._ask_all(touched)
+
+    def _instance(self, name: Name, old: Entry | None, entry: Entry) -> None:
+        self._look_at_one(name)
+        if (old is None or old.uid != entry.uid) and isinstance(entry.model, ApplicationInstance):
+            self.template((name[0], entry.model.spec.template))
+
+    def _child(self, old: Entry | None, entry: Entry) -> None:
+        if kind_of(entry.raw) == POD:
+            if self.world.pods.note(entry.raw):
+                self._ask_for_owner(entry.raw)
+            if _is_a_workloads(entry.raw):
+                return  # that its pods are ready, a workload says itself
+        self.applier.note(entry.raw)
+        if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
+            self._ask_for_owner(entry.raw)
+        if old is None or old.raw.get("data") != entry.raw.get("data"):
+            self._ask_for_configuration(entry.raw)
+
+    def _significance(self, entry: Entry) -> tuple[str, bool, str | None, bool]:
+        """What of an object matters to its instance; workloads change their status far more often."""
+        raw = entry.raw
+        return entry.uid, "deletionTimestamp" in raw["metadata"], not_ready(raw), pods_left(raw) > 0
+
+    def _ask_for_owner(self, raw: Object) -> None:
+        owner = _instance_of(raw)
+        if owner is not None:
+            self.instance(owner)
+
+    def _ask_for_configuration(self, raw: Object) -> None:
+        owner = _instance_of(raw)
+        if kind_of(raw) == CONFIG_MAP and owner is not None and name_of(raw)[1] == config_map_name(owner[1]):
+            self.configuration(owner)
+
+    def _lease(self, name: Name, raw: Object | None) -> None:
+        holder = holder_of(name[1])
+        if holder is None:
+            return
+        key = (name[0], holder)
+        at = self.world.healthy.elapsed
+        before = self.world.leases.view(key, at)
+        renewed = self.world.leases.observe(key, raw, at)
+        if renewed and (not before.renewed or before.unchanged >= before.duration):
+            log.info("holder %s/%s renews its Lease", *key)
+            self._ask_all(self.world.claims.holders().get(key, ()))
+
+    def _rules(self, namespace: str) -> None:
+        """Rules and detectors of a namespace are judged together: either may be what is wrong with the other.
+
+        And what rules say of templates, these may have changed.
+        """
+        for kind in _RULES:
+            for name, _ in self.world.store.all(kind):
+                if name[0] == namespace:
+                    self.rule((kind, name))
+
+    def look_at(self, name: Name) -> None:
+        """Ask for an instance, or for all of a template where the name stands for these."""
+        for each in self.world.meant(name):
+            self._look_at_one(each)
+
+    def _look_at_one(self, instance: Name) -> None:
+        self.world.places.touch(instance)
+        self.instance(instance)
+
+    def _ask_all(self, instances: Iterable[Name]) -> None:
+        for name in instances:
+            self.look_at(name)
+
+
+def _instance_of(raw: Object) -> Name | None:
+    """The instance whose label the object bears."""
+    owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
+    return (raw["metadata"]["namespace"], owner) if owner else None
+
+
+def _written(entry: Entry) -> tuple[object, object]:
+    """What people write of a rule or a detector."""
+    return entry.raw["spec"], entry.raw["metadata"].get("labels")
+
+
+def _is_a_workloads(pod: Object) -> bool:
+    """Whether the pod belongs to a workload, and not to the instance itself."""
+    owners = pod["metadata"].get("ownerReferences") or ()
+    return any(each.get("controller") and each["kind"] != ApplicationInstance.__name__ for each in owners)

@@ -1,0 +1,133 @@
+"""What only the active manager does: the queues work, Events are posted, configurations published.
+
+Several times over, if need be: whoever cannot renew its Lease stops at once and becomes a standby, and may become
+active again. At the end of the process what is under way is finished, within a bound, and then the Lease is released.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Coroutine, Sequence
+from typing import Any, Protocol
+
+from application_manager.cluster.client import Client
+from application_manager.cluster.leadership import Leadership
+
+FINISHING = 3.0
+"""Seconds that what is under way at the end is given; what is given up then, the next start takes up."""
+
+_AGAIN = 0.5  # s until a task that goes on is cancelled again
+
+log = logging.getLogger(__name__)
+
+
+class Begin(Protocol):
+    """Gets ready to act; `again`: somebody else may have acted since the first look at everything."""
+
+    async def __call__(self, *, again: bool) -> None:
+        """Get ready."""
+
+
+class Worker(Protocol):
+    """What works until it is cancelled, or told to finish."""
+
+    async def run(self) -> None:
+        """Work."""
+
+    def finish(self) -> None:
+        """End once what is under way is done."""
+
+
+async def acting(
+    leadership: Leadership,
+    client: Client,
+    queues: Sequence[Worker],
+    tellers: Sequence[Worker],
+    begin: Begin,
+    stop: asyncio.Event,
+) -> None:
+    """Act whenever this manager is active, until told to stop; the Lease is released then.
+
+    Args:
+        leadership: says when to act.
+        client: by which all is written.
+        queues: what works.
+        tellers: what tells of the work, and therefore ends after it.
+        begin: called each time before the work begins.
+        stop: the end.
+    """
+    stopping = asyncio.create_task(stop.wait(), name="stop")
+    again = not leadership.active
+    try:
+        while await _first(leadership.wait_active(), stopping):
+            over = asyncio.create_task(leadership.wait_over(), name="lost")
+            work = asyncio.create_task(_work(queues, tellers, begin, again), name="work")
+            try:
+                await asyncio.wait((work, over, stopping), return_when=asyncio.FIRST_COMPLETED)
+                if stopping.done() and not work.done():
+                    for queue in queues:
+                        queue.finish()
+                    await asyncio.wait((work, over), timeout=FINISHING, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                await ended(work, over)
+            if not work.cancelled():
+                work.result()
+            again = True
+    finally:
+        stopping.cancel()
+    await _release(leadership, client)
+
+
+async def _work(queues: Sequence[Worker], tellers: Sequence[Worker], begin: Begin, again: bool) -> None:
+    """Act; returns once all queues have finished, and then all tellers."""
+    await begin(again=again)
+    working = asyncio.create_task(_run(queues), name="queues")
+    telling = asyncio.create_task(_run(tellers), name="tellers")
+    try:
+        await asyncio.wait((working, telling), return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            for teller in tellers:
+                teller.finish()
+            await telling
+    finally:
+        await ended(working, telling)
+    for task in (working, telling):
+        if not task.cancelled():
+            task.result()
+
+
+async def _run(workers: Sequence[Worker]) -> None:
+    async with asyncio.TaskGroup() as group:
+        for worker in workers:
+            group.create_task(worker.run())
+
+
+async def ended(*tasks: asyncio.Task[Any]) -> None:
+    """Cancel the tasks until they have ended: one that gathers may lose its cancellation to an error of a part."""
+    pending = {each for each in tasks if not each.done()}
+    while pending:
+        for task in pending:
+            task.cancel()
+        _, pending = await asyncio.wait(pending, timeout=_AGAIN)
+
+
+async def _first(wanted: Coroutine[None, None, None], stopping: asyncio.Task[bool]) -> bool:
+    """Whether the wanted comes before the end."""
+    waiting = asyncio.create_task(wanted)
+    try:
+        await asyncio.wait((waiting, stopping), return_when=asyncio.FIRST_COMPLETED)
+        return not stopping.done()
+    finally:
+        waiting.cancel()
+
+
+async def _release(leadership: Leadership, client: Client) -> None:
+    """Release the Lease, unless a request that was given up may yet be done: then it lapses by itself."""
+    if not leadership.active:
+        return
+    if client.open_until > time.monotonic():
+        log.warning("requests are under way without an answer: the Lease is not released, a standby waits for its end")
+        return
+    await leadership.release()

@@ -1,0 +1,80 @@
+"""Bringing an instance's configuration to those that follow it: its pods, by way of the kubelet, and Zenoh.
+
+Level-triggered: what the ConfigMap holds now is compared with what each pod was told last, so the work can be done
+again at any time. It only makes things fast: without it the kubelet brings the same content a minute later.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from application_manager.cluster.apply import Applier, controller_uid
+from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.store import Name
+from application_manager.core.objects import following
+from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
+from application_manager.knowledge.world import World
+from application_manager.work.publishing import Publisher
+from wayside.api import ApplicationInstance
+
+PODS = Resource("v1", "Pod", "pods")
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigurationWork:
+    """Brings configurations out."""
+
+    world: World
+    client: Client
+    applier: Applier
+    publisher: Publisher
+
+    async def reconcile(self, name: Name) -> None:
+        """Publish the instance's configuration, and tell those of its pods that were not told of it.
+
+        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        """
+        instance = self.world.instance(name)
+        live = self.applier.live(name[0], (*CONFIG_MAP, config_map_name(name[1])))
+        if instance is None or live is None or controller_uid(live) != instance.metadata.uid:
+            self.publisher.withdraw(name)
+            return
+        files = live.get("data") or {}
+        self.publisher.publish(name, files)
+        try:
+            told = await self._tell(name, instance, following.fingerprint(files))
+        except ApiError as error:
+            if not error.permanent and not error.terminating:
+                raise
+            log.warning("instance %s/%s: its pods learn of their configuration late: %s", *name, error)
+            return
+        if told:
+            log.info("instance %s/%s: %d pods are told of their new configuration", *name, told)
+
+    async def _tell(self, name: Name, instance: ApplicationInstance, content: str) -> int:
+        pods: dict[str, Object] = {}
+        for selector in following.selectors(self._workloads(name, instance)):
+            listed, _ = await self.client.list(PODS, name[0], labels=selector)
+            pods |= {each["metadata"]["uid"]: each for each in listed}
+        told = 0
+        for pod, uid in following.behind(pods.values(), name[1], content):
+            try:
+                await self.client.annotate(PODS, name[0], pod, uid, {following.ANNOTATION: content})
+            except ApiError as error:
+                if error.code not in (404, 409):  # gone, or another pod of that name
+                    raise
+            else:
+                told += 1
+        return told
+
+    def _workloads(self, name: Name, instance: ApplicationInstance) -> list[Object]:
+        record = self.world.records.get(name)
+        if record is not None and record.uid == instance.metadata.uid:
+            objects = list(record.applied.objects)
+        else:
+            objects = list(instance.status.objects) if instance.status else []
+        found = (self.applier.live(name[0], (each.api_version, each.kind, each.name)) for each in objects)
+        return [each for each in found if each is not None]

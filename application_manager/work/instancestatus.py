@@ -1,0 +1,210 @@
+"""Saying how an instance is, after the work: its status, its Events, and the news for its tasks.
+
+Apart from the work itself, so that words never hold up what runs. Until a status is written, the world's record of the
+instance stands for it; should we die before, the work is done again, and finds that nothing is left to do.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from application_manager.cluster.apply import Applied, Applier, ObjectKey
+from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.failedpods import FailedPodsLook
+from application_manager.cluster.nodes import NodeLook
+from application_manager.cluster.store import Name
+from application_manager.core.conditions import Aspect
+from application_manager.core.demand.byhand import PAUSE_ANNOTATION
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.demand.fallback import READY_TIMEOUT
+from application_manager.core.health.placement import is_placed, misplaced
+from application_manager.core.health.pods import Trouble, summary
+from application_manager.core.health.readiness import not_ready
+from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
+from application_manager.core.statuses.status import Service, difference, instance_status, suspension_aspect
+from application_manager.knowledge.world import Served, World
+from application_manager.work.recorder import Reason, Recorder
+from wayside.api import ApplicationInstance
+from wayside.api.applicationinstance import ApplicationInstanceStatus
+
+_TROUBLES_SHOWN = 3
+_AGAIN = 5.0  # s until nodes and Events are looked at again for what is not ready for their sake
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class InstanceStatusWork:
+    """Writes statuses of instances.
+
+    Attributes:
+        instances: where ApplicationInstances live.
+        task_changed: asks for a task's status to be looked at.
+        observe: takes an object that was read.
+        nodes: tells of the cluster's nodes.
+        failed_pods: tells why pods could not be made.
+        again: asks for an instance at a time, in seconds since 1970.
+    """
+
+    world: World
+    client: Client
+    applier: Applier
+    recorder: Recorder
+    instances: Resource
+    task_changed: Callable[[Name], None]
+    observe: Callable[[Object], None]
+    nodes: NodeLook
+    failed_pods: FailedPodsLook
+    again: Callable[[Name, float], None]
+
+    async def reconcile(self, name: Name) -> None:
+        """Write the instance's status if it is news.
+
+        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        """
+        instance, record = self.world.instance(name), self.world.records.get(name)
+        if instance is None or record is None or record.uid != instance.metadata.uid:
+            return
+        looked_up = await self._looked_up(instance, record.applied)
+        instance, record = self.world.instance(name), self.world.records.get(name)
+        if instance is None or record is None or record.uid != instance.metadata.uid:
+            return
+        now = time.time()
+        old = instance.status or ApplicationInstanceStatus()
+        applied = record.applied
+        live = self._live(instance, applied)
+        troubles = self._troubles(name, live, looked_up)
+        suspended = suspension_aspect(instance, record.decision, live.values())
+        ready = _overdue(self._ready(instance, live, troubles), record.decision)
+        new = instance_status(
+            instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now, suspended
+        )
+        patch = difference(old.to_json() if instance.status else {}, new.to_json())
+        if patch:
+            uid = instance.metadata.uid
+            try:
+                self.observe(await self.client.patch_status(self.instances, name[0], name[1], uid, patch))
+            except ApiError as error:
+                if error.terminating or error.code in (404, 409):  # the instance is gone, or another has its name
+                    return
+                raise
+            self.recorder.transitions(instance, old.conditions, new.conditions, now)
+            if old.release_time is None and new.release_time is not None:
+                note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
+                self.recorder.say(instance, Reason.LINGERING, note, now)
+        # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
+        why_not = "" if applied.aspect.holds else applied.aspect.message
+        reason = ""
+        if applied.aspect.holds and suspended is not None and instance.spec.suspended:
+            why_not, reason = suspended.message, ready.reason
+        elif applied.aspect.holds and not ready.holds and troubles:
+            why_not, reason = _text(troubles), ready.reason
+        if record.decision.overdue and not ready.holds and not instance.spec.suspended:
+            late = f"instance {name[1]} was not ready for {record.decision.overdue}"
+            why_not, reason = ": ".join(filter(None, (late, why_not))), reason or READY_TIMEOUT
+        if record.decision.withheld and applied.aspect.holds:
+            why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): it does not get the task's values"
+        serves = applied.aspect.holds and not record.decision.withheld
+        service = Service(
+            name[1],
+            serves,
+            serves and ready.holds,
+            why_not,
+            reason,
+            suspended=instance.spec.suspended,
+            stopped=serves and suspended is not None and suspended.holds,
+        )
+        self.tell(name, record.decision, service)
+
+    def tell_why_not_made(self, name: Name, decision: Decision, problem: str) -> None:
+        """Let the tasks know why the instance is not there that they demand."""
+        self.tell(name, decision, Service(name[1], applied=False, ready=False, problem=problem))
+
+    def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:
+        """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
+        old = self.world.served.pop(name, None)
+        verdicts = decision.verdicts if decision is not None else {}
+        for task in old.verdicts.keys() - verdicts.keys() if old is not None else ():
+            self.task_changed((name[0], task))  # one that means all instances may have others yet
+        if decision is None:
+            return
+        given = service or Service(name[1], applied=False, ready=False)
+        served = Served(decision.verdicts, given, decision.fallback)
+        self.world.served[name] = served
+        all_changed = old is None or old.service != served.service or old.fallback != served.fallback
+        for task, verdict in decision.verdicts.items():
+            if all_changed or old is None or old.verdicts.get(task) != verdict:
+                self.task_changed((name[0], task))
+
+    def _troubles(
+        self, name: Name, objects: Mapping[ObjectKey, Object | None], looked_up: Sequence[Trouble]
+    ) -> list[Trouble]:
+        """Those of its pods, and why pods cannot be made or fit no node."""
+        refused = [found for each in objects.values() if each is not None and (found := refused_pods(each)) is not None]
+        return summary([*self.world.pods.troubles(name), *refused, *looked_up])
+
+    async def _looked_up(self, instance: ApplicationInstance, applied: Applied) -> list[Trouble]:
+        """The troubles of what is not ready that no watch tells: no node is as required, pods are refused."""
+        if instance.spec.suspended:
+            return []
+        live = [each for each in self._live(instance, applied).values() if each is not None and not_ready(each)]
+        found = [*await self._misfits(live), *await self._refused(live)]
+        if found or any(lacks_pods(each) for each in live):
+            self.again((instance.namespace, instance.name), time.time() + _AGAIN)
+        return found
+
+    async def _misfits(self, live: Sequence[Object]) -> list[Trouble]:
+        """Which of the objects require what no node has."""
+        bound = [each for each in live if is_placed(each)]
+        nodes = await self.nodes.labels() if bound else None
+        return [] if nodes is None else [trouble for each in bound if (trouble := misplaced(each, nodes)) is not None]
+
+    async def _refused(self, live: Sequence[Object]) -> list[Trouble]:
+        """Why pods of the objects are refused that say so in Events alone."""
+        lacking = [each["metadata"] for each in live if lacks_pods(each)]
+        told = [
+            refused_by_events(await self.failed_pods.events(each["namespace"], each["uid"]), time.time())
+            for each in lacking
+        ]
+        return [each for each in told if each is not None]
+
+    def _live(self, instance: ApplicationInstance, applied: Applied) -> dict[ObjectKey, Object | None]:
+        """The instance's objects, as watched."""
+        keys = [(each.api_version, each.kind, each.name) for each in applied.objects]
+        return {key: self.applier.live(instance.namespace, key) for key in keys}
+
+    def _ready(
+        self, instance: ApplicationInstance, objects: Mapping[ObjectKey, Object | None], troubles: Sequence[Trouble]
+    ) -> Aspect:
+        missing = []
+        for (_, kind, name), live in objects.items():
+            problem = "does not exist" if live is None else not_ready(live)
+            if problem is not None:
+                missing.append(f"{kind} {name} {problem}")
+        if not objects:
+            return Aspect("Ready", False, "NotApplied", "nothing is applied yet")
+        if instance.spec.suspended:
+            return Aspect("Ready", False, "Suspended", "the instance is suspended")
+        if missing:
+            reason = troubles[0].reason.value if troubles else "NotReady"
+            refused = [found for each in objects.values() if each is not None and (found := refused_pods(each))]
+            others = [each for each in troubles if each not in refused]  # which the words of the workload tell already
+            return Aspect("Ready", False, reason, ": ".join(filter(None, ("; ".join(missing), _text(others)))))
+        return Aspect("Ready", True, "Ready", "all workloads are ready")
+
+
+def _overdue(ready: Aspect, decision: Decision) -> Aspect:
+    """The condition Ready of what is beyond its readyTimeout: it says so, unless it knows better why."""
+    if ready.holds or not decision.overdue or ready.reason == "Suspended":
+        return ready
+    reason = READY_TIMEOUT if ready.reason in ("NotReady", "NotApplied") else ready.reason
+    return Aspect("Ready", False, reason, f"not ready for {decision.overdue}: {ready.message}")
+
+
+def _text(troubles: Sequence[Trouble]) -> str:
+    """The most telling troubles, as a condition says them."""
+    more = f"; and {len(troubles) - _TROUBLES_SHOWN} more" if len(troubles) > _TROUBLES_SHOWN else ""
+    return "; ".join(each.text for each in troubles[:_TROUBLES_SHOWN]) + more

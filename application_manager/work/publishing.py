@@ -1,0 +1,215 @@
+"""The instances' configurations on Zenoh: each is published when it changes, and told to whoever asks for it.
+
+On `wayside/instances/<namespace>/<name>/configuration`, as a JSON object of file names and texts. A deletion of the key
+says that the instance is gone.
+
+Zenoh has threads of its own and may be slow or away, so it never touches the event loop: the loop leaves what is newest
+of each instance here, and one thread brings it out. What is not yet out is replaced by what is newer, so there is at
+most one content for each instance. After a lost connection everything is published again, since nobody knows what was
+missed meanwhile.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import zenoh
+
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.cluster.store import Name
+
+_ALL = "wayside/instances/*/*/configuration"
+_RETRIES = (0.2, 0.5, 1.0, 2.0)
+"""Seconds between attempts to reach the network; the last one repeats."""
+_REPEATS = (0.0, 1.0, 5.0)
+"""Seconds after a new connection at which all is published: what is put before the other side has told of its
+subscribers reaches nobody."""
+_CLOSING = 2.0  # s that the thread is given to end
+
+log = logging.getLogger(__name__)
+
+
+def key_of(name: Name) -> str:
+    """The key of an instance's configuration."""
+    return f"wayside/instances/{name[0]}/{name[1]}/configuration"
+
+
+def settings(given: Sequence[str]) -> zenoh.Config:
+    """How to take part in the network: as a client of the endpoints given, or as the one file given says.
+
+    Raises ConfigurationError for what is neither.
+    """
+    if len(given) == 1 and Path(given[0]).suffix in (".json5", ".json", ".yaml", ".yml"):
+        try:
+            return zenoh.Config.from_file(given[0])
+        except (zenoh.ZError, OSError) as error:
+            raise ConfigurationError(
+                f"--zenoh: {given[0]} is no Zenoh configuration that can be read: {error}"
+            ) from None
+    config = zenoh.Config()
+    for path, value in (
+        ("mode", "client"),
+        ("connect/endpoints", list(given)),
+        ("connect/timeout_ms", 0),
+        ("connect/exit_on_failure", True),  # we try again ourselves, and can be stopped meanwhile
+        ("scouting/multicast/enabled", False),
+    ):
+        try:
+            config.insert_json5(path, json.dumps(value))
+        except zenoh.ZError:
+            raise ConfigurationError(
+                f"--zenoh: {', '.join(given)} must be endpoints such as tcp/zenoh:7447, or one Zenoh configuration "
+                "file that ends with .json5"
+            ) from None
+    return config
+
+
+class Publisher:
+    """Takes configurations at once and publishes them in the background. Without a network it takes them for nothing.
+
+    `publish` and `withdraw` are for one thread, the event loop's.
+    """
+
+    def __init__(self, config: zenoh.Config | None) -> None:
+        self._config = config
+        self._lock = threading.Condition()
+        self._contents: dict[str, bytes] = {}
+        self._pending: dict[str, None] = {}  # keys whose content, or whose end, is not out yet, in order
+        self._repeats: list[float] = []  # when all is to be published again, by the monotonic clock
+        self._ended = False
+        self._over = asyncio.Event()
+
+    def publish(self, name: Name, files: Mapping[str, str]) -> None:
+        """Publish the content of the files if it is news."""
+        key, content = key_of(name), json.dumps(files, ensure_ascii=False, sort_keys=True).encode()
+        with self._lock:
+            if self._config is not None and self._contents.get(key) != content:
+                self._contents[key] = content
+                self._pending[key] = None
+                self._lock.notify()
+
+    def withdraw(self, name: Name) -> None:
+        """Say that the instance is gone, or has no configuration any more, if it had one."""
+        key = key_of(name)
+        with self._lock:
+            if self._contents.pop(key, None) is not None:
+                self._pending[key] = None
+                self._lock.notify()
+
+    def forget(self) -> None:
+        """Know of no configuration any more, without saying anything: another manager has published since."""
+        with self._lock:
+            self._contents.clear()
+            self._pending.clear()
+
+    def finish(self) -> None:
+        """Let `run` return."""
+        self._over.set()
+
+    async def run(self) -> None:
+        """Publish until cancelled, or told to finish. Cancelled, it can be run again."""
+        config = self._config
+        if config is None:
+            await self._over.wait()
+            return
+        with self._lock:
+            self._ended = False
+        loop, over = asyncio.get_running_loop(), self._over
+        failure: list[BaseException] = []
+
+        def work() -> None:
+            try:
+                self._work(config)
+            except BaseException as error:  # noqa: BLE001  not lost: raised below, which ends the manager
+                failure.append(error)
+            finally:
+                if not self._ended:
+                    loop.call_soon_threadsafe(over.set)
+
+        thread = threading.Thread(target=work, name="zenoh", daemon=True)
+        thread.start()
+        try:
+            await over.wait()
+        finally:
+            with self._lock:
+                self._ended = True
+                self._lock.notify()
+            await asyncio.to_thread(thread.join, _CLOSING)
+        if failure:
+            raise failure[0]
+
+    def _work(self, config: zenoh.Config) -> None:
+        session = self._opened(config)
+        if session is None:
+            return
+        with session:
+            listener = session.info.declare_transport_events_listener(self._transport, history=True)
+            queryable = session.declare_queryable(_ALL, self._answer)  # both last as long as they are held
+            while (pending := self._next()) is not None:
+                for key, content in pending:
+                    if content is None:
+                        session.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
+                    else:
+                        session.put(
+                            key,
+                            content,
+                            encoding=zenoh.Encoding.APPLICATION_JSON,
+                            congestion_control=zenoh.CongestionControl.BLOCK,
+                        )
+            del queryable, listener
+
+    def _opened(self, config: zenoh.Config) -> zenoh.Session | None:
+        attempt = 0
+        while True:
+            try:
+                return zenoh.open(config)
+            except zenoh.ZError as error:
+                if attempt == 0:
+                    log.warning("zenoh cannot be reached, configurations are not published there; trying on: %s", error)
+            with self._lock:
+                if self._lock.wait_for(lambda: self._ended, _RETRIES[min(attempt, len(_RETRIES) - 1)]):
+                    return None
+            attempt += 1
+
+    def _next(self) -> list[tuple[str, bytes | None]] | None:
+        """Wait for news; None once we are to end."""
+        with self._lock:
+            while not self._ended and not self._pending:
+                now = time.monotonic()
+                if self._repeats and self._repeats[0] <= now:
+                    self._repeats.pop(0)
+                    self._pending |= dict.fromkeys(self._contents)
+                else:
+                    self._lock.wait(self._repeats[0] - now if self._repeats else None)
+            if self._ended:
+                return None
+            news = [(key, self._contents.get(key)) for key in self._pending]
+            self._pending.clear()
+            return news
+
+    def _transport(self, event: zenoh.TransportEvent) -> None:
+        """Zenoh's thread calls it for every connection that opens or closes."""
+        with self._lock:
+            if event.kind == zenoh.SampleKind.PUT:
+                now = time.monotonic()
+                self._repeats = [now + each for each in _REPEATS]
+                self._lock.notify()
+                log.info("zenoh: connected, %d configurations are published", len(self._contents))
+            elif not self._ended:
+                log.warning("zenoh: a connection is lost; trying on")
+
+    def _answer(self, query: zenoh.Query) -> None:
+        """Zenoh's thread calls it for every question."""
+        asked = query.key_expr
+        with self._lock:
+            exact = self._contents.get(str(asked))
+            found = {str(asked): exact} if exact is not None else dict(self._contents)
+        for key, content in found.items():
+            if content is not None and asked.intersects(zenoh.KeyExpr(key)):
+                query.reply(key, content, encoding=zenoh.Encoding.APPLICATION_JSON)

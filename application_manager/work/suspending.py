@@ -1,0 +1,116 @@
+"""Taking an instance's workloads to zero, and back to what they were, whenever the manager may be killed in between.
+
+What they had is written into the instance's status before any of them is touched, and removed from it only once all of
+them are back. So what is found there tells at any time what is left to do; a look at the objects tells what is done.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from application_manager.cluster.apply import Applier, controller_uid
+from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.core.objects.rendering import Rendering
+from application_manager.core.objects.suspension import ObjectKey
+from wayside.api import ApplicationInstance
+from wayside.api.applicationinstance import SuspendedReplicas
+
+_ATTEMPTS = 5  # at a scale, where somebody else keeps changing the object
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Suspending:
+    """Scales the workloads of instances.
+
+    Attributes:
+        instances: where ApplicationInstances live.
+        observe: takes an object that was read.
+    """
+
+    client: Client
+    applier: Applier
+    instances: Resource
+    observe: Callable[[Object], None]
+
+    async def settle(self, instance: ApplicationInstance, rendering: Rendering) -> None:
+        """Bring the workloads to where the instance's spec wants them, before its manifests are applied.
+
+        Raises ApiError or Unreachable for what may pass.
+        """
+        noted = {
+            (each.api_version, each.kind, each.name): each.replicas
+            for each in (instance.status.suspended_replicas if instance.status else ())
+        }
+        if instance.spec.suspended:
+            await self._stop(instance, rendering, noted)
+        elif noted:
+            await self._resume(instance, rendering, noted)
+
+    async def _stop(self, instance: ApplicationInstance, rendering: Rendering, noted: dict[ObjectKey, int]) -> None:
+        to_stop = [key for key in rendering.replicas if key not in noted or not self._is_at_zero(instance, key)]
+        live = {key: await self._own(instance, key) for key in to_stop}
+        missing = {}
+        for key in to_stop:
+            if key not in noted:
+                raw, stated = live[key], rendering.replicas[key]
+                missing[key] = int(raw["spec"].get("replicas", 1)) if raw else 1 if stated is None else stated
+        wanted = {key: replicas for key, replicas in noted.items() if key in rendering.replicas} | missing
+        if wanted != noted:
+            await self._note(instance, wanted)
+        for key, raw in live.items():
+            if raw is not None:
+                await self._scale(instance, key, raw, 0)
+
+    async def _resume(self, instance: ApplicationInstance, rendering: Rendering, noted: dict[ObjectKey, int]) -> None:
+        for key, before in noted.items():
+            raw = await self._own(instance, key) if key in rendering.replicas else None
+            if raw is not None and raw["spec"].get("replicas", 1) == 0:
+                stated = rendering.replicas[key]
+                await self._scale(instance, key, raw, before if stated is None else stated)
+        await self._note(instance, {})
+
+    def _is_at_zero(self, instance: ApplicationInstance, key: ObjectKey) -> bool:
+        """Whether the object, as watched, has no replicas; one that does not exist is made without any."""
+        live = self.applier.live(instance.namespace, key)
+        return live is None or live["spec"].get("replicas", 1) == 0
+
+    async def _own(self, instance: ApplicationInstance, key: ObjectKey) -> Object | None:
+        """The object, read anew; None where there is none, or one that is not the instance's."""
+        raw = await self.client.get(await self.applier.resource(key), instance.namespace, key[2])
+        return raw if raw is not None and controller_uid(raw) == instance.metadata.uid else None
+
+    async def _scale(self, instance: ApplicationInstance, key: ObjectKey, raw: Object, replicas: int) -> None:
+        resource, current = await self.applier.resource(key), raw
+        for attempt in range(_ATTEMPTS):
+            if current["spec"].get("replicas", 1) == replicas:
+                return
+            version = current["metadata"]["resourceVersion"]
+            try:
+                await self.client.scale(resource, instance.namespace, key[2], version, replicas)
+            except ApiError as error:
+                if error.code != 409 or attempt == _ATTEMPTS - 1:
+                    raise
+                found = await self._own(instance, key)
+                if found is None:
+                    return
+                current = found
+            else:
+                log.info("instance %s/%s: %s %s to %d replicas", *_name(instance), key[1], key[2], replicas)
+                return
+
+    async def _note(self, instance: ApplicationInstance, replicas: dict[ObjectKey, int]) -> None:
+        noted = [
+            SuspendedReplicas(api_version=key[0], kind=key[1], name=key[2], replicas=count).to_json()
+            for key, count in sorted(replicas.items())
+        ]
+        status = {"suspendedReplicas": noted}
+        uid = instance.metadata.uid
+        self.observe(await self.client.patch_status(self.instances, *_name(instance), uid, status))
+
+
+def _name(instance: ApplicationInstance) -> tuple[str, str]:
+    return instance.namespace, instance.name

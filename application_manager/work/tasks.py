@@ -1,0 +1,149 @@
+"""Reconciling one task: its status, and its deletion some time after it has finished."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.store import Name
+from application_manager.core.claims.claims import Claim, Refused, template_of_all
+from application_manager.core.claims.operations import Standing, Verdict, gathered
+from application_manager.core.conditions import changed, holds
+from application_manager.core.demand.fallback import FALLEN_BACK, turned
+from application_manager.core.statuses.status import Service, difference, finished_since, task_status, together
+from application_manager.knowledge.world import World
+from application_manager.measures import Measures
+from application_manager.observability.tracing import TaskTraces
+from application_manager.work.recorder import Recorder
+from wayside.api import ApplicationTask
+from wayside.api.applicationtask import ApplicationTaskStatus
+from wayside.times import parse_seconds
+
+_OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, whose Events tell of them
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TaskWork:
+    """Says what became of tasks.
+
+    Attributes:
+        tasks: where ApplicationTasks live.
+        templates: where ApplicationTemplates live.
+        ttl: seconds that a finished task is kept.
+        again: asks for a task at a time, in seconds since 1970.
+        observe: takes an object that was read.
+        measures: told of refusals, and of the times from event to service.
+        traces: told likewise, where traces are on.
+    """
+
+    world: World
+    client: Client
+    recorder: Recorder
+    tasks: Resource
+    templates: Resource
+    ttl: float
+    again: Callable[[Name, float], None]
+    observe: Callable[[Object], None]
+    measures: Measures
+    traces: TaskTraces | None = None
+
+    async def reconcile(self, name: Name) -> None:
+        """Write the task's status if it is news; delete the task when its time has come.
+
+        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        """
+        task = self.world.task(name)
+        known = self._verdict(name)
+        if task is None or known is None or task.metadata.deletion_timestamp is not None:
+            return
+        verdict, service = known
+        if verdict.reason == Refused.TEMPLATE_NOT_FOUND and await self._has_template(name[0], task.spec.template):
+            return  # the watch of templates was behind that of tasks; the template's news bring us back
+        now = time.time()
+        old = task.status or ApplicationTaskStatus()
+        new = task_status(task, verdict, service, now)
+        patch = difference(old.to_json() if task.status else {}, new.to_json())
+        try:
+            if patch:
+                uid = task.metadata.uid
+                self.observe(await self.client.patch_status(self.tasks, name[0], name[1], uid, patch))
+                own = [each for each in new.conditions if each.type in _OWN_CONDITIONS]
+                self.recorder.transitions(task, old.conditions, own, now)
+                self._measure(task, old, new, now)
+                if self.traces is not None:
+                    self.traces.told(task, old, new)
+            if verdict.standing is Standing.FINISHED:
+                await self._expire(name)
+        except ApiError as error:
+            if error.terminating or error.code == 404:  # the task or its namespace is gone
+                return
+            raise
+
+    def _measure(
+        self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus, now: float
+    ) -> None:
+        """Tell what became of the task, once for each news of it."""
+        for each in changed(old.conditions, new.conditions):
+            if each.type == "Accepted" and each.status == "False":
+                self.measures.refused(each.reason)
+            elif each.status == "True" and task.spec.event is not None and not holds(old.conditions, each.type):
+                since_start = now - parse_seconds(task.spec.event.start_time)
+                if each.type == "Applied":
+                    self.measures.applied(since_start)
+                elif each.type == "Ready":
+                    self.measures.ready(since_start)
+
+    async def _has_template(self, namespace: str, template: str) -> bool:
+        found = await self.client.get(self.templates, namespace, template)
+        if found is not None:
+            self.observe(found)
+        return found is not None
+
+    def _verdict(self, name: Name) -> tuple[Verdict, Service | None] | None:
+        """What became of the task; None where its instance was not looked at yet."""
+        verdict = self.world.claims.verdict(name)
+        if verdict is not None:
+            return verdict, None
+        claimed = self.world.claims.claim(name)
+        if claimed is not None and (template := template_of_all(claimed.instance)) is not None:
+            return self._of_all(name, claimed, (name[0], template))
+        served = self.world.served.get((name[0], claimed.instance)) if claimed is not None else None
+        if served is None or name[1] not in served.verdicts:
+            return None
+        instead = served.fallback.instance_of(name[1]) if served.fallback is not None else None
+        other = self.world.served.get((name[0], instead)) if instead is not None else None
+        others = other.verdicts if other is not None else {}
+        verdict = turned(served.verdicts[name[1]], name[1], served.fallback, others)
+        serves = other if other is not None and verdict.reason == FALLEN_BACK else served
+        return verdict, serves.service
+
+    def _of_all(self, name: Name, claimed: Claim, template: Name) -> tuple[Verdict, Service | None] | None:
+        """What became of a task that means all instances of a template, from what was said of it by each."""
+        alone = self.world.served.get((name[0], claimed.instance))
+        if alone is None or name[1] not in alone.verdicts:
+            return None
+        each = {
+            instance[1]: served
+            for instance in self.world.meant((name[0], claimed.instance))
+            if (served := self.world.served.get(instance)) is not None and served is not alone
+        }
+        parts = {instance: served.verdicts[name[1]] for instance, served in each.items() if name[1] in served.verdicts}
+        verdict = gathered(claimed, parts, alone.verdicts[name[1]])
+        serving = [each[instance].service for instance, part in parts.items() if part.standing is Standing.COUNTS]
+        return verdict, together(serving) if serving else None
+
+    async def _expire(self, name: Name) -> None:
+        task = self.world.task(name)
+        since = finished_since(task) if task is not None else None
+        if task is None or since is None:
+            return
+        if time.time() < since + self.ttl:
+            self.again(name, since + self.ttl)
+            return
+        await self.client.delete(self.tasks, name[0], name[1], task.metadata.uid)
+        log.info("task %s/%s: deleted, %g s after it finished", *name, self.ttl)

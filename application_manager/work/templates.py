@@ -1,0 +1,72 @@
+"""Reconciling one template: whether it can be rendered, and how many instances it has."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.store import Name
+from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.findings.findings import Findings
+from application_manager.core.findings.templatefindings import template_findings
+from application_manager.core.statuses.status import difference, template_status
+from application_manager.knowledge.world import TEMPLATE, World
+from application_manager.work.recorder import Recorder
+from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.api.base import Kind, Metadata
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateWork:
+    """Says how templates are.
+
+    Attributes:
+        templates: where ApplicationTemplates live.
+        observe: takes an object that was read.
+    """
+
+    world: World
+    client: Client
+    recorder: Recorder
+    templates: Resource
+    observe: Callable[[Object], None]
+
+    async def reconcile(self, name: Name) -> None:
+        """Write the template's status if it is news.
+
+        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        """
+        entry = self.world.store.get(TEMPLATE, name)
+        if entry is None:
+            return
+        metadata = Metadata.model_validate(entry.raw["metadata"])
+        now = time.time()
+        old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
+        findings = await self._findings(name)
+        new = template_status(old, metadata.generation, findings, len(self.world.instances_of(name)), now)
+        patch = difference(old.to_json() if entry.raw.get("status") else {}, new.to_json())
+        if not patch:
+            return
+        try:
+            self.observe(await self.client.patch_status(self.templates, name[0], name[1], metadata.uid, patch))
+        except ApiError as error:
+            if error.terminating or error.code == 404:
+                return
+            raise
+        about = Kind(kind=self.templates.kind, metadata=metadata)
+        self.recorder.transitions(about, old.conditions, new.conditions, now)
+
+    async def _findings(self, name: Name) -> Findings:
+        template = self.world.template(name)
+        if isinstance(template, InvalidTemplate):
+            return Findings((template.problem,))
+        if template is None:
+            return Findings()
+        found = self.world.known_findings(template)
+        if found is None:  # beside the event loop: a template may take a second
+            found = await asyncio.to_thread(template_findings, template, self.world.policy)
+            self.world.note_findings(template, found)
+        return found

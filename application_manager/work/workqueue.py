@@ -1,0 +1,177 @@
+"""Keys to reconcile: each at most once at a time, several at once, again after a failure.
+
+A key that is asked for while it waits is not added again; asked for while it runs, it runs once more afterwards. So
+there are never more entries than objects, and the queue needs no other bound. A failure is tried again after a growing,
+jittered pause, or after what the API server asks for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Hashable
+from typing import Any, Generic, TypeVar
+
+from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.measures import Measures
+
+Key = TypeVar("Key", bound=Hashable)
+
+FIRST_PAUSE = 0.2  # s, doubled with every failure of the key
+LONGEST_PAUSE = 10.0  # s
+_TURN, _TURNS = 0.05, 20  # s, and how many of them a queue waits for the one before it
+_SHORTEST_DELAY = 0.1  # s, so that a time that is nearly there does not spin
+
+log = logging.getLogger(__name__)
+
+
+class WorkQueue(Generic[Key]):
+    """Runs `work(key)` for every key asked for, on `concurrency` workers.
+
+    While the queue `after` has keys that wait, this one is slowed down to one key a second and worker.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        work: Callable[[Key], Awaitable[None]],
+        concurrency: int,
+        after: WorkQueue[Any] | None = None,
+        measures: Measures | None = None,
+    ) -> None:
+        self.name = name
+        self._measures = measures or Measures()
+        self._after = after
+        self._work = work
+        self._concurrency = concurrency
+        self._waiting: deque[Key] = deque()
+        self._queued: set[Key] = set()
+        self._running: dict[Key, float] = {}  # and since when, on the monotonic clock
+        self._again: set[Key] = set()
+        self._failures: dict[Key, int] = {}
+        self._timers: dict[Key, asyncio.TimerHandle] = {}
+        self._wake = asyncio.Event()
+        self._ending = False
+
+    @property
+    def depth(self) -> tuple[int, int]:
+        """How many keys wait for a worker, and how many for their time."""
+        return len(self._waiting), len(self._timers)
+
+    @property
+    def busy(self) -> bool:
+        """Whether keys wait for a worker."""
+        return bool(self._waiting)
+
+    def stuck(self, limit: float) -> str | None:
+        """The key that a worker is at for longer than so many seconds, in words; any thread may ask."""
+        now = time.monotonic()
+        for key, began in list(self._running.items()):
+            if now - began > limit:
+                return f"{self.name} {_text(key)} is worked on for {now - began:.0f} s"
+        return None
+
+    def add(self, key: Key) -> None:
+        """Ask for the key to be worked on soon."""
+        if key in self._running:
+            self._again.add(key)
+        elif key not in self._queued:
+            self._queued.add(key)
+            self._waiting.append(key)
+            self._wake.set()
+
+    def add_at(self, key: Key, when: float) -> None:
+        """Ask for the key at `when`, in seconds since 1970; the earliest time asked for counts."""
+        self._add_after(key, max(_SHORTEST_DELAY, when - time.time()))
+
+    def _add_after(self, key: Key, delay: float) -> None:
+        loop = asyncio.get_running_loop()
+        known = self._timers.get(key)
+        if known is not None:
+            if known.when() <= loop.time() + delay:
+                return
+            known.cancel()
+        self._timers[key] = loop.call_later(delay, self._fire, key)
+
+    def _fire(self, key: Key) -> None:
+        self._timers.pop(key, None)
+        self.add(key)
+
+    def finish(self) -> None:
+        """Begin no further key, for good: `run` returns once those that are worked on are done."""
+        self._ending = True
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Work until cancelled, or told to finish. Cancelled, it can be run again, and goes on with what waits."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                for index in range(self._concurrency):
+                    group.create_task(self._worker(), name=f"{self.name} worker {index}")
+        finally:
+            for timer in self._timers.values():
+                timer.cancel()
+            self._timers.clear()
+
+    async def _worker(self) -> None:
+        while not self._ending:
+            await self._let_others_go_first()
+            while not self._waiting and not self._ending:
+                self._wake.clear()
+                await self._wake.wait()
+            if self._ending:
+                return
+            key = self._waiting.popleft()
+            self._queued.discard(key)
+            self._running[key] = time.monotonic()
+            try:
+                await self._once(key)
+            finally:
+                del self._running[key]
+            if key in self._again:
+                self._again.discard(key)
+                self.add(key)
+            _heed_cancellation()
+
+    async def _let_others_go_first(self) -> None:
+        for _ in range(_TURNS):
+            if self._ending or self._after is None or not self._after.busy:
+                return
+            await asyncio.sleep(_TURN)
+
+    async def _once(self, key: Key) -> None:
+        began, failed = time.monotonic(), True
+        try:
+            await self._work(key)
+        except (ApiError, Unreachable) as error:
+            pause = self._pause(key, error.retry_after if isinstance(error, ApiError) else None)
+            log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
+            self._add_after(key, pause)
+        except Exception:  # a defect in one key's work must not stop the others; it is logged, and tried again
+            pause = self._pause(key, None)
+            log.exception("%s %s failed; again in %.1f s", self.name, _text(key), pause)
+            self._add_after(key, pause)
+        else:
+            failed = False
+            self._failures.pop(key, None)
+        self._measures.reconciled(self.name, time.monotonic() - began, failed=failed)
+
+    def _pause(self, key: Key, asked: float | None) -> float:
+        failures = self._failures.get(key, 0)
+        self._failures[key] = failures + 1
+        pause: float = min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** min(failures, 10))
+        return max(asked or 0.0, pause * random.uniform(0.7, 1.3))  # noqa: S311  jitter, not a secret
+
+
+def _heed_cancellation() -> None:
+    """Be cancelled where a cancellation was lost: gather gives an error of one of its parts in place of it."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
+def _text(key: object) -> str:
+    return "/".join(map(str, key)) if isinstance(key, tuple) else str(key)

@@ -1,0 +1,64 @@
+"""`python -m charts.generate`: write the files of the chart that follow from the code (`make crds` does it).
+
+`files/crds/` are the CRDs as in crds/; `files/rights.yaml` is the manager's table of rights, from which the chart makes
+its roles as `application-manager rbac` does.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from application_manager.core.objects.policy import DEFAULT_PLURALS, KindKey, kind_text
+from application_manager.core.objects.rights import lease_rights, merged, node_rights, rights
+from wayside.api.__main__ import crd_files
+from wayside.manifests import to_yaml
+
+FILES = Path(__file__).parent / "wayside" / "files"
+LEASE = "NAME-OF-THE-LEASE"
+"""What stands for the name of the managers' Lease."""
+
+_POD = ("v1", "Pod")
+_ANY: KindKey = ("example.com/v1", "Example")
+_NOTE = "# Written by `make crds` from the manager's table of rights: change that, not this.\n"
+
+
+def chart_files() -> dict[str, str]:
+    """The text of each file, by its path in the chart's folder `files`."""
+    return {f"crds/{name}": text for name, text in crd_files().items()} | {"rights.yaml": _NOTE + to_yaml([_rights()])}
+
+
+def _rights() -> dict[str, Any]:
+    """Rules as roles have them: those that are always needed, and what each kind and running detectors bring."""
+    without_pods, pods = rights({}), rights({_POD: "pods"})
+    return {
+        "always": merged(each for each in without_pods if each in pods),
+        "withoutPods": merged(each for each in without_pods if each not in pods),
+        "detectors": merged(each for each in rights({}, detectors=True) if each not in without_pods),
+        "cluster": merged(node_rights()),
+        "kinds": {kind_text(kind): _added(kind, plural) for kind, plural in sorted(DEFAULT_PLURALS.items())},
+        "otherKindVerbs": _added(_ANY, "examples")[0]["verbs"],
+        "lease": merged(lease_rights(LEASE)),
+    }
+
+
+def _added(kind: KindKey, plural: str) -> list[dict[str, Any]]:
+    others = {} if kind == _POD else {_POD: "pods"}
+    before = rights(others)
+    return merged(each for each in rights(others | {kind: plural}) if each not in before)
+
+
+def main() -> None:
+    """Write the files, and remove CRDs of kinds that there are no more."""
+    files = chart_files()
+    for old in (FILES / "crds").glob("*.yaml"):
+        if f"crds/{old.name}" not in files:
+            old.unlink()
+    for name, text in files.items():
+        path = FILES / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""`helm test`: the manager is ready, and what the API server asks it, it answers with a certificate that is trusted.
+
+Arguments: where /readyz is served; with the webhook also where that is, the file of its authority, and a
+namespace that the manager looks after.
+"""
+
+import json
+import ssl
+import sys
+import time
+import urllib.request
+
+PATIENCE = 60.0  # s; just after an install the Services lead nowhere yet
+WRONG = {
+    "apiVersion": "wayside.dev/v1alpha1",
+    "kind": "ApplicationTemplate",
+    "metadata": {"name": "wrong"},
+    "spec": {"manifests": [{"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "${there.is.none}"}}]},
+}
+
+
+def ready(base):
+    """Say that the manager is ready; OSError where it is not."""
+    with urllib.request.urlopen(f"{base}/readyz", timeout=5) as answer:
+        print("the manager is ready:", answer.read().decode().strip())
+
+
+def refuses(base, authority, namespace):
+    """Say that the webhook refuses what is wrong; OSError where it does not, or has a certificate of somebody else."""
+    group = {"group": "wayside.dev", "version": "v1alpha1"}
+    request = {
+        "uid": "test",
+        "kind": group | {"kind": "ApplicationTemplate"},
+        "resource": group | {"resource": "applicationtemplates"},
+        "name": "wrong",
+        "namespace": namespace,
+        "operation": "CREATE",
+        "object": WRONG | {"metadata": WRONG["metadata"] | {"namespace": namespace}},
+        "userInfo": {},
+        "dryRun": True,
+    }
+    review = json.dumps({"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview", "request": request})
+    asked = urllib.request.Request(f"{base}/admission", review.encode(), {"Content-Type": "application/json"})
+    with urllib.request.urlopen(asked, timeout=5, context=ssl.create_default_context(cafile=authority)) as answer:
+        response = json.load(answer)["response"]
+    if response["allowed"]:
+        raise OSError("a template that is wrong is not refused")
+    print("the webhook refuses what is wrong:", response["status"]["message"])
+
+
+def wait(check, *arguments):
+    """Try until it succeeds; exit with what is wrong where that takes too long."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return check(*arguments)
+        except OSError as error:
+            if time.monotonic() > end:
+                sys.exit(f"{arguments[0]}: {error}")
+        time.sleep(1)
+
+
+wait(ready, sys.argv[1])
+if len(sys.argv) > 2:
+    wait(refuses, *sys.argv[2:])

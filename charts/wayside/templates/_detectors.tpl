@@ -1,0 +1,37 @@
+{{/* The spec of a Detector of the values: without a mode, and unless run is false, the manager is to run it.
+Of a list: the root, and the Detector. */}}
+{{- define "wayside.detectorSpec" -}}
+{{- $root := index . 0 -}}{{- $d := index . 1 -}}
+{{- $spec := deepCopy $d.spec -}}
+{{- if and (not (hasKey $spec "mode")) (ne (toString $d.run) "false") -}}{{- $_ := set $spec "mode" "Standalone" -}}{{- end -}}
+{{- if and $spec.mode (not $root.Values.manager.detectors.run) -}}
+{{- fail (printf "detectors: %s is of mode %s, but manager.detectors.run is false: set that, or give the Detector run: false and no mode" $d.name $spec.mode) -}}
+{{- end -}}
+{{- toYaml $spec -}}
+{{- end -}}
+
+{{/* The namespace of an object of the values; it must be one that the manager looks after. Of a list: the root, the kind,
+and the object. */}}
+{{- define "wayside.lookedAfter" -}}
+{{- $root := index . 0 -}}{{- $object := index . 2 -}}
+{{- $namespace := default $root.Release.Namespace $object.namespace -}}
+{{- with $root.Values.manager.namespaces -}}
+{{- if not (has $namespace .) -}}
+{{- fail (printf "%s %s is in namespace %s, which the manager does not look after: add it to manager.namespaces, or give it the namespace of one of them (%s)" (index $ 1) $object.name $namespace (join ", " .)) -}}
+{{- end -}}
+{{- end -}}
+{{- $namespace -}}
+{{- end -}}
+
+{{/* What the pods bear of the detector of this name, which the manager runs. */}}
+{{- define "wayside.detectorSelector" -}}
+app.kubernetes.io/managed-by: application-manager
+wayside.dev/runs: {{ . }}
+{{- end -}}
+
+{{/* Where traces go, and more of OpenTelemetry's variables: by name. */}}
+{{- define "wayside.tracing" -}}
+{{- $variables := deepCopy .Values.tracing.variables -}}
+{{- with .Values.tracing.endpoint -}}{{- $_ := set $variables "OTEL_EXPORTER_OTLP_ENDPOINT" . -}}{{- end -}}
+{{- $variables | toJson -}}
+{{- end -}}

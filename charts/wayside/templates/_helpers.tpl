@@ -1,0 +1,125 @@
+{{- define "wayside.name" -}}
+{{- default .Chart.Name .Values.nameOverride | trunc 63 | trimSuffix "-" -}}
+{{- end -}}
+
+{{/* What all names begin with; short enough for what is put behind it. */}}
+{{- define "wayside.fullname" -}}
+{{- default .Release.Name .Values.fullnameOverride | trunc 40 | trimSuffix "-" -}}
+{{- end -}}
+
+{{- define "wayside.selector" -}}
+app.kubernetes.io/name: {{ include "wayside.name" . }}
+app.kubernetes.io/instance: {{ .Release.Name }}
+{{- end -}}
+
+{{- define "wayside.labels" -}}
+{{ include "wayside.selector" . }}
+app.kubernetes.io/part-of: wayside
+app.kubernetes.io/managed-by: {{ .Release.Service }}
+app.kubernetes.io/version: {{ .Chart.AppVersion | quote }}
+helm.sh/chart: {{ printf "%s-%s" .Chart.Name .Chart.Version | replace "+" "_" }}
+{{- with .Values.commonLabels }}
+{{ toYaml . }}
+{{- end }}
+{{- end -}}
+
+{{/* Of pods: without the chart's version, with which each pod would be made anew. */}}
+{{- define "wayside.podLabels" -}}
+{{ include "wayside.selector" . }}
+app.kubernetes.io/part-of: wayside
+{{- with .Values.commonLabels }}
+{{ toYaml . }}
+{{- end }}
+{{- end -}}
+
+{{- define "wayside.managerAccount" -}}
+{{- if .Values.manager.serviceAccount.name -}}
+{{ .Values.manager.serviceAccount.name }}
+{{- else if .Values.manager.serviceAccount.create -}}
+{{ include "wayside.fullname" . }}-manager
+{{- else -}}
+{{ fail "manager.serviceAccount.name is empty, and create is false: name the account that the manager runs with" }}
+{{- end -}}
+{{- end -}}
+
+{{- define "wayside.image" -}}
+{{- if .digest -}}{{ .repository }}@{{ .digest }}{{- else -}}{{ .repository }}:{{ .tag }}{{- end -}}
+{{- end -}}
+
+{{- define "wayside.ownImage" -}}
+{{- include "wayside.image" (dict "repository" .Values.image.repository "digest" .Values.image.digest "tag" (default .Chart.AppVersion .Values.image.tag)) -}}
+{{- end -}}
+
+{{/* The restricted Pod Security Standard, and a root that cannot be written. */}}
+{{- define "wayside.podSecurity" -}}
+runAsNonRoot: true
+runAsUser: 65532
+runAsGroup: 65532
+fsGroup: 65532
+seccompProfile: {type: RuntimeDefault}
+{{- end -}}
+
+{{- define "wayside.containerSecurity" -}}
+allowPrivilegeEscalation: false
+readOnlyRootFilesystem: true
+capabilities: {drop: [ALL]}
+{{- end -}}
+
+{{/* Who the program is: by these it owns its Lease, and takes it again after a restart of the container. */}}
+{{- define "wayside.podEnvironment" -}}
+- name: POD_NAME
+  valueFrom: {fieldRef: {fieldPath: metadata.name}}
+- name: POD_UID
+  valueFrom: {fieldRef: {fieldPath: metadata.uid}}
+- name: POD_NAMESPACE
+  valueFrom: {fieldRef: {fieldPath: metadata.namespace}}
+{{- end -}}
+
+{{- define "wayside.probes" -}}
+startupProbe: {httpGet: {path: /healthz, port: metrics}, periodSeconds: 2, failureThreshold: 60}
+readinessProbe: {httpGet: {path: /readyz, port: metrics}, periodSeconds: 5, timeoutSeconds: 3}
+livenessProbe: {httpGet: {path: /healthz, port: metrics}, periodSeconds: 20, timeoutSeconds: 5, failureThreshold: 3}
+{{- end -}}
+
+{{- define "wayside.webhookSecret" -}}
+{{- if eq .Values.webhook.certificates.from "Secret" -}}
+{{ required "webhook.certificates.secretName is empty: name the Secret with tls.crt, tls.key and ca.crt" .Values.webhook.certificates.secretName }}
+{{- else -}}
+{{ include "wayside.fullname" . }}-webhook-tls
+{{- end -}}
+{{- end -}}
+
+{{- define "wayside.routerSecret" -}}
+{{- if .Values.router.tls.secretName -}}
+{{ .Values.router.tls.secretName }}
+{{- else if .Values.router.tls.issuerRef -}}
+{{ include "wayside.fullname" . }}-router-tls
+{{- else -}}
+{{ fail "router.tls needs a certificate: give router.tls.secretName (tls.crt, tls.key, ca.crt) or router.tls.issuerRef, or set router.tls.enabled to false for a trial" }}
+{{- end -}}
+{{- end -}}
+
+{{/* The Secret with ca.crt, tls.crt and tls.key that the chart made before, or a new one's data: made once a rendering,
+since both the Secret and the webhook need the same. */}}
+{{- define "wayside.madeCertificates" -}}
+{{- if not (hasKey .Values "_made") -}}
+{{- $name := printf "%s-webhook" (include "wayside.fullname" .) -}}
+{{- $secret := lookup "v1" "Secret" .Release.Namespace (include "wayside.webhookSecret" .) -}}
+{{- $data := dict -}}
+{{- if and $secret $secret.data (hasKey $secret.data "ca.crt") (hasKey $secret.data "tls.crt") (hasKey $secret.data "tls.key") -}}
+{{- $data = pick $secret.data "ca.crt" "tls.crt" "tls.key" -}}
+{{- else -}}
+{{- $days := int .Values.webhook.certificates.validityDays -}}
+{{- $ca := genCA (printf "%s authority" $name) $days -}}
+{{- $host := printf "%s.%s" $name .Release.Namespace -}}
+{{- $cert := genSignedCert (printf "%s.svc" $name | trunc 63) nil (list (printf "%s.svc" $host) (printf "%s.svc.cluster.local" $host) $host) $days $ca -}}
+{{- $data = dict "ca.crt" (b64enc $ca.Cert) "tls.crt" (b64enc $cert.Cert) "tls.key" (b64enc $cert.Key) -}}
+{{- end -}}
+{{- $_ := set .Values "_made" $data -}}
+{{- end -}}
+{{- .Values._made | toJson -}}
+{{- end -}}
+
+{{- define "wayside.kind" -}}
+{{- if kindIs "map" . -}}{{ .kind }}{{- else -}}{{ . }}{{- end -}}
+{{- end -}}

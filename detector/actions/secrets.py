@@ -1,0 +1,54 @@
+"""Which Secrets a rule may use: not those with which the detector itself enters networks and databases.
+
+Who writes rules can have what a Secret holds sent anywhere. So a Secret that the Detector names for its own use is no
+rule's, unless the Detector gives it to rules as well, by `pod.secrets`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from wayside.api import Detector, EventRule
+from wayside.rules import RuleProblem
+
+_OWN = frozenset({"tlsSecret", "credentialsSecret", "uriSecret"})
+"""Fields of a Detector, and of the parameters of its sources, that name a Secret."""
+
+_OF_RULES = _OWN | {"secret", "urlSecret"}
+"""Fields of an action that do, by name or as name and key."""
+
+Place = tuple[str | int, ...]
+
+
+def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
+    """The places at which a rule names a Secret of the detector's own."""
+    pod = detector.spec.pod
+    given = set() if pod is None else {*pod.secrets}
+    own = {name for _, name in _named(detector.spec.to_json(), _OWN, ())} - given
+    if not own:
+        return
+    for index, action in enumerate(rule.to_json()["spec"].get("actions", [])):
+        for place, name in _named(action, _OF_RULES, ("spec", "actions", index)):
+            if name in own:
+                yield RuleProblem(
+                    place,
+                    f"the Secret {name} is the Detector's own, for its networks: name another one, or have its "
+                    "spec.pod.secrets give this one to rules",
+                )
+
+
+def _named(value: Any, fields: frozenset[str], place: Place) -> Iterator[tuple[Place, str]]:
+    if isinstance(value, list):
+        for index, each in enumerate(value):
+            yield from _named(each, fields, (*place, index))
+    if not isinstance(value, dict):
+        return
+    for key, child in value.items():
+        at = (*place, key)
+        if key in fields and isinstance(child, str):
+            yield at, child
+        elif key in fields and isinstance(child, dict) and isinstance(child.get("name"), str):
+            yield (*at, "name"), child["name"]
+        else:
+            yield from _named(child, fields, at)

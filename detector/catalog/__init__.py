@@ -1,0 +1,1 @@
+"""`detector catalog`: rules by the dimensions and values of the classification scheme."""

@@ -1,0 +1,124 @@
+"""Rules by the dimensions and values of the scheme. Pure: others read them, and others show them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import PurePath
+
+from wayside.api import EventRule
+from wayside.api.classification import Classification
+from wayside.api.scheme import SCHEME, Dimension, Value
+
+Chosen = Mapping[Dimension, frozenset[Value]]
+"""Of some dimensions, values of which a rule must have one."""
+
+
+class ChoiceError(ValueError):
+    """A dimension or value that the scheme does not have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A rule as the catalog has it; each is one of its own, whatever they have in common."""
+
+    name: str
+    place: str
+    """Where it was found: file and line, or the namespace."""
+    description: str
+    classification: Classification
+    """Without values where the rule says none."""
+
+    @property
+    def classified(self) -> bool:
+        """Whether the rule says where it stands in any dimension."""
+        return bool(self.classification.to_json())
+
+    def values(self, dimension: Dimension) -> tuple[Value, ...]:
+        """Its values in the dimension, in the scheme's order."""
+        given = self.classification.values_of(dimension)
+        return tuple(value for value in dimension.values if value in given)
+
+
+def entry(rule: EventRule, place: str) -> Entry:
+    """The rule as the catalog has it."""
+    return Entry(rule.name, place, rule.spec.description, rule.spec.classification or Classification())
+
+
+@dataclass(frozen=True)
+class Catalog:
+    """Rules, by name and place."""
+
+    entries: tuple[Entry, ...]
+
+    def having(self, value: Value) -> tuple[Entry, ...]:
+        """The rules that have the value; values of two dimensions differ even where they are written alike."""
+        dimension = next(each for each in SCHEME if isinstance(value, each.values))
+        return tuple(each for each in self.entries if value in each.values(dimension))
+
+    def silent(self, dimension: Dimension) -> tuple[Entry, ...]:
+        """The classified rules that say nothing in the dimension."""
+        return tuple(each for each in self.entries if each.classified and not each.values(dimension))
+
+    @property
+    def unclassified(self) -> tuple[Entry, ...]:
+        """The rules without any classification."""
+        return tuple(each for each in self.entries if not each.classified)
+
+    def labels(self) -> Mapping[Entry, str]:
+        """What the rules are called: by name, and with the folder or file where several have the same name."""
+        return dict(_labelled(self.entries))
+
+
+@dataclass(frozen=True)
+class Read:
+    """Rules, and what could not be read."""
+
+    entries: tuple[Entry, ...]
+    unreadable: tuple[str, ...] = ()
+
+
+def catalog(entries: Iterable[Entry], chosen: Chosen | None = None) -> Catalog:
+    """The rules that have, in each chosen dimension, one of the chosen values."""
+    wanted = (chosen or {}).items()
+    kept = (each for each in entries if all(values & set(each.values(dimension)) for dimension, values in wanted))
+    return Catalog(tuple(sorted(kept, key=lambda each: (each.name, each.place))))
+
+
+def choose(texts: Iterable[str]) -> Chosen:
+    """What is asked for as `dimension=value`; several values of a dimension are alternatives.
+
+    Raises:
+        ChoiceError: there is no such dimension or value; the text says which there are.
+    """
+    chosen: dict[Dimension, frozenset[Value]] = {}
+    for text in texts:
+        name, _, written = text.partition("=")
+        dimension = next((each for each in SCHEME if each.name == name), None)
+        if dimension is None:
+            raise ChoiceError(
+                f"{text}: there is no dimension {name!r}; there are {_listed(each.name for each in SCHEME)}"
+            )
+        value = next((each for each in dimension.values if each.value == written), None)
+        if value is None:
+            there = _listed(each.value for each in dimension.values)
+            raise ChoiceError(f"{text}: {name} has no value {written!r}; it has {there}")
+        chosen[dimension] = chosen.get(dimension, frozenset()) | {value}
+    return chosen
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names)
+
+
+def _labelled(entries: Iterable[Entry]) -> Iterator[tuple[Entry, str]]:
+    """By name; where several share one, with their place, without what all these places begin with."""
+    for name, group in groupby(entries, key=lambda each: each.name):
+        same = list(group)
+        if len(same) == 1:
+            yield same[0], name
+            continue
+        paths = [PurePath(each.place).parts for each in same]
+        common = next((i for i, parts in enumerate(zip(*paths, strict=False)) if len(set(parts)) > 1), 0)
+        yield from ((each, f"{name} ({'/'.join(parts[common:])})") for each, parts in zip(same, paths, strict=True))

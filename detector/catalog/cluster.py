@@ -1,0 +1,42 @@
+"""The rules of a cluster, for a catalog."""
+
+from __future__ import annotations
+
+from detector.catalog.catalog import Entry, Read, entry
+from detector.cluster.connection import connect
+from detector.cluster.errors import ApiError, NoClusterError
+from detector.rules.kubernetes import EVENT_RULES
+from wayside.api import API_VERSION, EventRule
+from wayside.api.documents import parse_object
+
+
+async def read_cluster(namespace: str | None) -> Read:
+    """The EventRules of the namespace. Those that cannot be read, such as of a newer version, are told and left out.
+
+    Args:
+        namespace: default: the kubeconfig context's, or the pod's own.
+
+    Raises:
+        NoClusterError: there is neither a kubeconfig nor a pod's account, or the API server does not let us list.
+    """
+    entries: list[Entry] = []
+    unreadable: list[str] = []
+    async with connect(namespace, otherwise="give files or folders with EventRules instead of --cluster") as cluster:
+        try:
+            listed = await cluster.api.list(EVENT_RULES, cluster.namespace, {})
+        except ApiError as error:
+            raise NoClusterError(
+                f"the EventRules of namespace {cluster.namespace} cannot be listed: {error}. Check that KUBECONFIG "
+                "leads to the right cluster, and that its account may list eventrules.wayside.dev there"
+            ) from error
+        for each in listed["items"]:
+            # The status is the manager's business, and a newer manager's may have fields that we do not know.
+            read = {name: value for name, value in each.items() if name != "status"}
+            try:
+                rule = parse_object({"apiVersion": API_VERSION, "kind": EventRule.__name__} | read)
+            except ValueError as error:
+                unreadable.append(f"EventRule {each['metadata']['name']}: {error}")
+                continue
+            assert isinstance(rule, EventRule)  # noqa: S101  the resource says so
+            entries.append(entry(rule, f"namespace {rule.namespace}"))
+    return Read(tuple(entries), tuple(unreadable))

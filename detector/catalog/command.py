@@ -1,0 +1,95 @@
+"""The command `detector catalog`."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from detector.catalog.catalog import Catalog, ChoiceError, Read, catalog, choose
+from detector.catalog.document import json_view
+from detector.catalog.files import read_files
+from detector.catalog.markdown import markdown_view
+from detector.catalog.page import page
+from detector.catalog.terminal import terminal_view
+from wayside.commandline import refuse
+
+_WIDTH = 160
+"""Columns of a table that goes into a pipe or a file."""
+
+
+class Format(StrEnum):
+    """How the catalog is shown."""
+
+    TABLE = "table"
+    MARKDOWN = "markdown"
+    JSON = "json"
+    HTML = "html"
+
+
+_VIEWS: Mapping[Format, Callable[[Catalog], str]] = {
+    Format.MARKDOWN: markdown_view,
+    Format.JSON: json_view,
+    Format.HTML: page,
+}
+"""How it becomes text; a table depends on where it goes."""
+
+
+def command(
+    files: Annotated[list[Path] | None, typer.Argument(help="YAML files or folders with EventRules.")] = None,
+    cluster: Annotated[
+        bool, typer.Option("--cluster", help="Read the EventRules from the API server instead of files.")
+    ] = False,
+    namespace: Annotated[
+        str | None, typer.Option(help="With --cluster: the namespace. Default: the kubeconfig's, or the pod's.")
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="DIMENSION=VALUE",
+            help="Only rules with this value, e.g. typeOfAction=Deployment; repeatable: of one dimension either value, "
+            "of several all.",
+        ),
+    ] = None,
+    form: Annotated[Format, typer.Option("--format", help="Markdown, JSON and HTML are text.")] = Format.TABLE,
+    output: Annotated[Path | None, typer.Option(help="Write into this file. Default: print.")] = None,
+) -> None:
+    """List rules by the dimensions and values of the classification scheme."""
+    if bool(files) == cluster:
+        refuse("give files or folders with EventRules, or --cluster")
+    if namespace is not None and not cluster:
+        refuse("--namespace goes with --cluster; rules in files say their namespaces themselves")
+    try:
+        chosen = choose(only or ())
+    except ChoiceError as error:
+        refuse(f"--only {error}")
+    read = _read_cluster(namespace) if cluster else read_files(files or ())
+    for text in read.unreadable:
+        typer.echo(f"left out, since it cannot be read: {text}", err=True)
+    found = catalog(read.entries, chosen)
+    text = _VIEWS[form](found) if form in _VIEWS else _table(found, into_file=output is not None)
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        output.write_text(text, encoding="utf-8")
+    typer.echo(f"{len(found.entries)} of {len(read.entries)} rules" + (f": {output}" if output else ""), err=True)
+
+
+def _read_cluster(namespace: str | None) -> Read:
+    from detector.catalog.cluster import read_cluster  # noqa: PLC0415  the client library takes half a second to load
+
+    return asyncio.run(read_cluster(namespace))
+
+
+def _table(found: Catalog, *, into_file: bool) -> str:
+    console = Console()
+    if into_file or not console.is_terminal:
+        console = Console(width=_WIDTH, no_color=True)
+    with console.capture() as captured:
+        console.print(terminal_view(found), highlight=False, markup=False)
+    return captured.get()

@@ -1,0 +1,226 @@
+"""Certificates and passwords are taken anew when their files change: a second session takes the first one's place.
+
+What a running session proves itself with cannot be changed, and a router closes the connection when the certificate
+expires. So the new material is tried with a session of its own, beside the first; `inlets` tells how no sample is lost
+between them. Where the new session cannot be had, or nothing is given to it, the first one stays as it is, and that is
+said. A detector that others connect to cannot listen twice: its session is closed and opened anew, with the old
+material again if the new one does not do, and what is sent in between is lost.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import zenoh
+
+from detector.credentials import Material
+from detector.streams.inlets import Inlet
+from detector.streams.liveliness import TokenWatch
+from detector.streams.membership import Membership
+from detector.streams.session import NetworkError, material_of, open_session
+from wayside.api.zenoh import Zenoh, ZenohMode
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY = 10.0
+"""Seconds between two looks at the files; a kubelet takes about a minute to change them."""
+
+_AT_LEAST, _AT_MOST = 1.0, 10.0
+"""Seconds for which both sessions are subscribed: time for the subscription to be known, and for both to be level."""
+
+_LOOK_AT_BOTH = 0.01
+
+_AGAIN = 60.0
+"""Seconds after which material that did not do is tried once more: the other side may have been at fault."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What is known of the material in use."""
+
+    expires: float | None = None
+    """When the first certificate of the own chain expires, seconds since the epoch; None: there is none."""
+    renewals: int = 0
+    problem: str = ""
+    """Why what the files hold now is not used."""
+
+
+class Renewal:
+    """Looks at the files of one network until it is stopped, on a thread of its own."""
+
+    def __init__(
+        self,
+        config: Zenoh,
+        first: Membership,
+        inlets: Sequence[Inlet],
+        tokens: TokenWatch | None,
+        join: Callable[[zenoh.Session, Material], Membership],
+        use: Callable[[Membership], None],
+        *,
+        look_every: float = LOOK_EVERY,
+        on_failure: Callable[[BaseException], None],
+    ) -> None:
+        """`join` subscribes a session; `use` has everything that goes out take a membership from now on."""
+        self._config = config
+        self._member = first
+        self._inlets = inlets
+        self._tokens = tokens
+        self._join = join
+        self._use = use
+        self._look_every = look_every
+        self._on_failure = on_failure
+        self._stop = threading.Event()
+        self.reopening = threading.Event()
+        """Set while there is no session, since another one is just being opened."""
+        self._failed: Material | None = None
+        self._again = 0.0
+        self.standing = Standing(first.material.expires)
+        self._thread = threading.Thread(target=self._run, name="certificates", daemon=True)
+
+    def start(self) -> None:
+        """Look from now on; where there is nothing that can change, nothing is done."""
+        config = self._config
+        if any((config.tls, config.tls_secret, config.credentials, config.credentials_secret)):
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Begin nothing more; an exchange that is under way is ended soon."""
+        self._stop.set()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the thread, at most so many seconds."""
+        if self._thread.is_alive():
+            self._thread.join(timeout)
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.wait(self._look_every):
+                self._look()
+        except Exception as error:  # noqa: BLE001  this thread's edge: certificates would expire unnoticed
+            if not self._stop.is_set():
+                log.critical("certificates are not followed any more: %s", error)
+                self._on_failure(error)
+
+    def _look(self) -> None:
+        try:
+            material = material_of(self._config)
+        except NetworkError as error:
+            self._tell(str(error))
+            return
+        if material == self._member.material:
+            self._failed = None
+            self._tell("")
+        elif material != self._failed or time.monotonic() >= self._again:
+            try:
+                self._exchange(material)
+            except NetworkError as error:
+                self._failed, self._again = material, time.monotonic() + _AGAIN
+                self._tell(str(error))
+
+    def _tell(self, problem: str) -> None:
+        if problem and problem != self.standing.problem and not self._stop.is_set():
+            log.warning("the new certificates or password are not used, the session of before goes on: %s", problem)
+        self.standing = Standing(self._member.material.expires, self.standing.renewals, problem)
+
+    def _exchange(self, material: Material) -> None:
+        """Raises NetworkError where the new material does not do; then all is as before."""
+        listens = bool(self._config.listen) or self._config.mode is ZenohMode.ROUTER
+        before = self._member
+        if listens:
+            self._reopen(material)
+        else:
+            self._take_over(material)
+        if self._member is before or self._stop.is_set():
+            return
+        self.standing = Standing(material.expires, self.standing.renewals + 1)
+        until = "" if material.expires is None else f", until {time.strftime('%FT%TZ', time.gmtime(material.expires))}"
+        log.info("zenoh: the new certificates or password are in use%s", until)
+
+    def _take_over(self, material: Material) -> None:
+        first = self._member
+        session = open_session(self._config, material)
+        for inlet in self._inlets:  # before the second subscription: whatever comes twice is noted
+            inlet.note()
+        second = self._join(session, material)
+        try:
+            self._run_both(first, second)
+        except NetworkError:
+            for inlet in self._inlets:
+                inlet.forget()
+            second.close()
+            raise
+        if self._stop.is_set():
+            second.close()
+            return
+        self._member = second
+        self._use(second)
+        for inlet in self._inlets:
+            inlet.expect()
+            inlet.withdraw()
+        for inlet, subscription in zip(self._inlets, second.subscriptions, strict=True):
+            inlet.follow(subscription)
+        if self._tokens is not None and first.tokens is not None and second.tokens is not None:
+            self._tokens.follow(second.tokens, second.connections)
+            first.tokens.undeclare()  # type: ignore[no-untyped-call]
+        first.retire()
+
+    def _run_both(self, first: Membership, second: Membership) -> None:
+        """Until both sessions are level. Raises NetworkError where nothing is given to the second one."""
+        if first.connections.any and not second.await_somebody(self._stop, _AT_MOST):
+            raise NetworkError(f"zenoh: with them nobody is connected at {[*self._config.connect]}")
+        begin = time.monotonic()
+        pairs = [*zip(self._inlets, second.subscriptions, strict=True)]
+        while not self._stop.wait(_LOOK_AT_BOTH):
+            for inlet, subscription in pairs:
+                inlet.try_second(subscription)
+            elapsed = time.monotonic() - begin
+            if elapsed >= _AT_MOST or any(inlet.full for inlet in self._inlets):
+                break
+            if elapsed >= _AT_LEAST and not any(inlet.waits for inlet in self._inlets):
+                break
+        if not self._stop.is_set() and any(inlet.only_first for inlet in self._inlets):
+            raise NetworkError("zenoh: with them nothing is received: does the router allow the new name to subscribe?")
+
+    def _reopen(self, material: Material) -> None:
+        try:
+            self._close_and_open(material)
+        finally:
+            self.reopening.clear()
+
+    def _close_and_open(self, material: Material) -> None:
+        first, refused = self._member, None
+        for inlet in self._inlets:
+            inlet.expect()
+        if self._tokens is not None:
+            self._tokens.expect()
+        began = time.monotonic()
+        self.reopening.set()
+        first.close()
+        tried = material
+        while not self._stop.is_set():
+            try:
+                second = self._join(open_session(self._config, tried), tried)
+                break
+            except NetworkError as error:
+                refused = refused or error
+                tried = first.material
+                self._stop.wait(0.2)
+        else:
+            return
+        if self._stop.is_set():
+            second.close()
+            return
+        self._member = second
+        self._use(second)
+        for inlet, subscription in zip(self._inlets, second.subscriptions, strict=True):
+            inlet.follow(subscription)
+        if self._tokens is not None and second.tokens is not None:
+            self._tokens.follow(second.tokens, second.connections)
+        lost = "zenoh: the session was opened anew within %.1f s: what was sent meanwhile is lost"
+        log.warning(lost, time.monotonic() - began)
+        if tried is not material and refused is not None:
+            raise refused

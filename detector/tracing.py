@@ -1,0 +1,117 @@
+"""The spans of episodes and of their tasks, where traces are on (see `wayside.tracing`).
+
+An episode's span is told when the episode ends. Its ids follow from the episode's id, so its event and its tasks bear
+them from the start, and a detector that takes the episode up again ends the same span.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+from detector.engine.consequences.consequences import Begun, Consequence, Over
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.events import Event
+from wayside.api import ApplicationTask
+from wayside.api.applicationtask import TRACEPARENT_ANNOTATION
+from wayside.tracecontext import Attribute, Span, TraceContext, episode_context
+from wayside.tracing import Tracing, tracing
+
+
+class EpisodeTraces:
+    """Says where episodes and tasks stand, and tells their spans. From any thread; nothing here waits."""
+
+    def __init__(self, told: Tracing) -> None:
+        self.tracing = told
+
+    def event(self, event: Event) -> Event:
+        """The event, with where its episode stands."""
+        return replace(event, traceparent=str(self._context(event.rule, event.episode)))
+
+    def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:
+        """Likewise, of what actions are told."""
+        return [
+            replace(each, event=self.event(each.event)) if isinstance(each, Begun | Over) else each
+            for each in consequences
+        ]
+
+    def over(self, event: Event) -> None:
+        """An episode ended: tell its span."""
+        if event.end_time is None or event.reason is None:
+            return
+        self.tracing.emit(
+            Span(
+                _name(event.rule),
+                start=event.start_time,
+                end=event.end_time,
+                context=self._context(event.rule, event.episode),
+                attributes={
+                    **_about(event.holder, event.rule, event.subject, event.subjects, event.episode),
+                    "wayside.reason": event.reason.value,
+                },
+            )
+        )
+
+    def task(self, demand: Demand, task: ApplicationTask) -> ApplicationTask:
+        """The demand's task, with where it stands."""
+        annotations = {**task.metadata.annotations, TRACEPARENT_ANNOTATION: str(self._of_demand(demand))}
+        return task.model_copy(update={"metadata": task.metadata.model_copy(update={"annotations": annotations})})
+
+    def created(self, demand: Demand, began: int) -> None:
+        """The demand's task was created, which began at a time in nanoseconds since the epoch: tell its span."""
+        self.tracing.emit(
+            Span(
+                f"create task {demand.action}",
+                start=began,
+                end=time.time_ns(),
+                parent=self._context(demand.rule, demand.episode),
+                context=self._of_demand(demand),
+                attributes={
+                    **_about(demand.holder, demand.rule, demand.subject, demand.subjects, demand.episode),
+                    "wayside.action": demand.action,
+                    "wayside.task": demand.name,
+                    "wayside.template": demand.template,
+                    "wayside.operation": demand.operation.value,
+                    "wayside.priority": demand.priority,
+                },
+            )
+        )
+
+    def _of_demand(self, demand: Demand) -> TraceContext:
+        return self._context(demand.rule, demand.episode).child(demand.name)
+
+    def _context(self, rule: str, episode: str) -> TraceContext:
+        context = episode_context(episode)
+        return replace(context, sampled=self.tracing.sampled(context, _name(rule)))
+
+
+@contextmanager
+def episode_traces(*, export: bool = True) -> Iterator[EpisodeTraces | None]:
+    """Traces where the environment asks for them, else None. On leaving, what waits is sent, for two seconds at most.
+
+    A replay does not `export`: the spans are those of the drive, and were told then.
+    """
+    told = tracing("wayside-detector", export=export)
+    if told is None:
+        yield None
+        return
+    try:
+        yield EpisodeTraces(told)
+    finally:
+        told.close()
+
+
+def _name(rule: str) -> str:
+    return f"episode {rule}"
+
+
+def _about(holder: str, rule: str, subject: str, subjects: Sequence[str], episode: str) -> dict[str, Attribute]:
+    return {
+        "wayside.holder": holder,
+        "wayside.rule": rule,
+        "wayside.subject": subject,
+        "wayside.subjects": list(subjects),
+        "wayside.episode": episode,
+    }

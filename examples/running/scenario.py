@@ -1,0 +1,90 @@
+"""What a use case's `scenario.py` makes: what is sent, and what must come of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from examples.running.playing import Played
+
+SECOND = 1_000_000_000
+"""Nanoseconds."""
+START_NS = int(datetime(2026, 1, 1, tzinfo=UTC).timestamp()) * SECOND
+"""What second 0 of each scenario is called in stamps, nanoseconds since the epoch."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message, sent `after_ns` nanoseconds after second 0 under a Zenoh key."""
+
+    after_ns: int
+    key: str
+    payload: bytes
+    encoding: str = "json"
+    type: str = ""
+    """The ROS 2 message type, of encoding cdr."""
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """An episode that must be found. Seconds into the scenario; `end_s` is None where it is still open at the end."""
+
+    rule: str
+    subject: str
+    start_s: float
+    end_s: float | None = None
+    within_s: float = 1.0
+    """Its start and end are found this much later at most: the rule looks, and samples come, now and then."""
+    reason: str = "Until"
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What must run at a moment at which nothing is about to change."""
+
+    at_s: float
+    runs: Mapping[str, Mapping[str, Any]]
+    """By `<template>/<key>`: what its configuration must say, of the values named here. Nothing else runs."""
+    suspended: Collection[str] = ()
+    """Those of them that must be suspended; the others must not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What happens, and what must come of it; neither knows the detector."""
+
+    title: str
+    seed: int
+    messages: Callable[[], Iterable[Message]]
+    """In any order; the same each time."""
+    episodes: Sequence[Episode]
+    actions: Mapping[str, int]
+    """How many episodes each `<rule>/<action>` deals with; of deploy actions, how many tasks they emit."""
+    picture: Callable[[], str]
+    """An SVG."""
+    picture_file: str = "scenario.svg"
+    real_time: bool = False
+    """Whether it can only be played as fast as it happens, since its messages do not tell the whole time."""
+    moments: Sequence[Moment] = ()
+    """What must run; of a use case with templates."""
+    check: Callable[[Played], Iterable[str]] = field(default=lambda played: ())
+    """What else is not as it must be, a line each: what was recorded, told, or would run."""
+
+
+def as_json(value: Mapping[str, Any]) -> bytes:
+    """A JSON payload; numbers are rounded to six decimals, as senders do."""
+    return json.dumps(_rounded(value), separators=(",", ":")).encode()
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 6)
+    if isinstance(value, Mapping):
+        return {key: _rounded(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(each) for each in value]
+    return value

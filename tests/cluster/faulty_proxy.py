@@ -1,0 +1,169 @@
+"""A proxy before the API server that does to one program what networks and loaded servers do to it.
+
+It speaks plain HTTP on loopback and hands everything on with the program's own credentials, watches included. What it
+shall do wrong is set from the test's thread at any time; what it saw is read from there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import aiohttp
+import yaml
+from aiohttp import web
+
+from tests.cluster.waiting import PATIENCE
+
+_HOP = frozenset({"connection", "content-length", "content-encoding", "host", "keep-alive", "transfer-encoding"})
+
+
+@dataclass
+class Seen:
+    """One request: when it came, by a monotonic clock, and what was answered (0: nothing yet)."""
+
+    method: str
+    path: str
+    at: float
+    status: int = 0
+
+
+@dataclass
+class Proxy:
+    """What it shall do, and what it saw.
+
+    Attributes:
+        cut: nothing gets through: requests are left without an answer, and open watches are broken.
+        refuse: for a request, the status and Retry-After (seconds) to answer it with; None hands it on.
+        seen: all requests.
+        most: requests that were under way at the same time at the most, without watches.
+    """
+
+    url: str = ""
+    cut: bool = False
+    refuse: Callable[[str, str], tuple[int, int] | None] = lambda _method, _path: None
+    seen: list[Seen] = field(default_factory=list)
+    most: int = 0
+    under_way: int = 0
+    slow: float = 0.0  # s by which every answer is late
+
+    def writes(self) -> list[Seen]:
+        """The requests that change anything but a Lease; a question about rights changes nothing."""
+        others = ("/leases", "/selfsubjectaccessreviews")
+        return [each for each in self.seen if each.method != "GET" and not any(other in each.path for other in others)]
+
+
+@contextmanager
+def faulty_proxy(kubeconfig: Path) -> Iterator[tuple[Proxy, Path]]:
+    """Run one in a thread, before the API server of the kubeconfig; yields it, and a kubeconfig that leads there."""
+    written = yaml.safe_load(kubeconfig.read_text())
+    target = written["clusters"][0]["cluster"]["server"]
+    proxy, loop = Proxy(), asyncio.new_event_loop()
+    ready, over = threading.Event(), asyncio.Event()
+    thread = threading.Thread(target=lambda: loop.run_until_complete(_serve(proxy, target, ready, over)), name="proxy")
+    thread.start()
+    try:
+        assert ready.wait(PATIENCE)
+        written["clusters"][0]["cluster"] = {"server": proxy.url}
+        mine = kubeconfig.with_name(f"kubeconfig-proxy-{proxy.url.rpartition(':')[2]}")
+        mine.touch(mode=0o600)
+        mine.write_text(yaml.safe_dump(written))
+        yield proxy, mine
+    finally:
+        loop.call_soon_threadsafe(over.set)
+        thread.join()
+        loop.close()
+
+
+async def _serve(proxy: Proxy, target: str, ready: threading.Event, over: asyncio.Event) -> None:
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    connector = aiohttp.TCPConnector(ssl=context, limit=0)
+    async with aiohttp.ClientSession(connector=connector, auto_decompress=False) as session:
+
+        async def handle(request: web.Request) -> web.StreamResponse:
+            seen = Seen(request.method, request.path_qs, time.monotonic())
+            proxy.seen.append(seen)
+            watches = "watch=true" in request.path_qs
+            proxy.under_way += not watches
+            proxy.most = max(proxy.most, proxy.under_way)
+            try:
+                return await _answer(proxy, session, target, request, seen)
+            finally:
+                proxy.under_way -= not watches
+
+        application = web.Application(client_max_size=2**24)
+        application.router.add_route("*", "/{rest:.*}", handle)
+        runner = web.AppRunner(
+            application, access_log=None, handle_signals=False, shutdown_timeout=0.1, handler_cancellation=True
+        )
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, "127.0.0.1", 0).start()
+            proxy.url = f"http://127.0.0.1:{runner.addresses[0][1]}"
+            ready.set()
+            await over.wait()
+        finally:
+            await runner.cleanup()
+
+
+async def _answer(
+    proxy: Proxy, session: aiohttp.ClientSession, target: str, request: web.Request, seen: Seen
+) -> web.StreamResponse:
+    await _while_cut(proxy)
+    refusal = proxy.refuse(request.method, request.path_qs)
+    if refusal is not None:
+        seen.status, seconds = refusal
+        status = {
+            "kind": "Status",
+            "apiVersion": "v1",
+            "code": seen.status,
+            "message": "too many requests, please wait",
+        }
+        return web.json_response(status, status=seen.status, headers={"Retry-After": str(seconds)})
+    if proxy.slow:
+        await asyncio.sleep(proxy.slow)
+    headers = {key: value for key, value in request.headers.items() if key.lower() not in _HOP}
+    body = await request.read() or None
+    async with session.request(request.method, target + request.path_qs, headers=headers, data=body) as answer:
+        kept = {key: value for key, value in answer.headers.items() if key.lower() not in _HOP | {"content-encoding"}}
+        encoding = answer.headers.get("Content-Encoding")
+        response = web.StreamResponse(
+            status=answer.status, headers=kept | ({"Content-Encoding": encoding} if encoding else {})
+        )
+        await _while_cut(proxy)
+        await response.prepare(request)
+        async for chunk in _chunks(proxy, answer):
+            await response.write(chunk)
+        seen.status = answer.status
+        await response.write_eof()
+        return response
+
+
+async def _chunks(proxy: Proxy, answer: aiohttp.ClientResponse) -> AsyncIterator[bytes]:
+    """The body as it comes; breaks when the network is cut."""
+    reading = asyncio.ensure_future(answer.content.readany())
+    try:
+        while True:
+            await asyncio.wait({reading}, timeout=0.1)
+            if proxy.cut:
+                raise ConnectionResetError("the network is cut")
+            if reading.done():
+                chunk = reading.result()
+                if not chunk:
+                    return
+                yield chunk
+                reading = asyncio.ensure_future(answer.content.readany())
+    finally:
+        reading.cancel()
+
+
+async def _while_cut(proxy: Proxy) -> None:
+    while proxy.cut:  # noqa: ASYNC110  it is set by another thread
+        await asyncio.sleep(0.05)

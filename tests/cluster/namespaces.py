@@ -1,0 +1,28 @@
+"""A fresh namespace for each test."""
+
+from __future__ import annotations
+
+import re
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from tests.cluster.api import Api, ApiError, Unreachable
+
+
+@contextmanager
+def fresh_namespace(api: Api, test: str) -> Iterator[str]:
+    """A namespace named after the test, with its default service account; deleted afterwards without waiting."""
+    readable = re.sub(r"[^a-z0-9]+", "-", test.removeprefix("test_").lower()).strip("-")[:40].rstrip("-")
+    name = f"{readable}-{secrets.token_hex(3)}"
+    api.create({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}})
+    # Admission refuses pods until their account exists.
+    api.wait_for("ServiceAccount", "default", lambda _: True, namespace=name, what=f"{name} has its service account")
+    yield name
+    try:
+        api.delete("Namespace", name)
+    except Unreachable:
+        return  # a test that failed while the API server was away: the session's data goes soon anyway
+    except ApiError as error:
+        if error.code != 404:  # the test may have deleted it
+            raise

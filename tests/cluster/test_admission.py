@@ -1,0 +1,326 @@
+"""The API server asks the manager before it stores a template, rule or detector, and nobody is harmed if it cannot."""
+
+from __future__ import annotations
+
+import copy
+import http.server
+import json
+import os
+import re
+import signal
+import ssl
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from application_manager.core.findings.webhooks import TIMEOUT
+from tests.cluster.api import Api, ApiError, Object
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.managed_world import condition, config, deployment, end, start_manager, task, template
+from tests.cluster.manifests import DETECTOR, EVENT_RULE
+from tests.cluster.processes import Processes
+from tests.cluster.waiting import wait_until
+from tests.cluster.webhook import Webhook, kubectl_apply, printed
+from tests.unit.certificates import Authority
+
+LABELS = {"site": "intersection-a"}
+
+
+@pytest.fixture
+def webhook(api: Api, processes: Processes, tmp_path: Path) -> Webhook:
+    return Webhook(processes, api, tmp_path / "certificates")
+
+
+def detector() -> Object:
+    made = copy.deepcopy(DETECTOR)
+    made["spec"]["streams"] += [
+        {"name": name, "key": f"vehicles/${{client:*}}/{name}", "encoding": "json"} for name in ("points", "odometry")
+    ]
+    return made
+
+
+def rule(name: str = "close", **spec: Any) -> Object:
+    made = copy.deepcopy(EVENT_RULE)
+    made["metadata"] = {"name": name, "labels": LABELS}
+    made["spec"] |= spec
+    return made
+
+
+def told(api: Api, kind: str, name: str) -> Object:
+    """The condition Accepted, once it speaks of the spec as it is."""
+    found = api.wait_for(
+        kind,
+        name,
+        lambda raw: condition(raw, "Accepted").get("observedGeneration") == raw["metadata"]["generation"],
+        what=f"the status of {kind} {name} is that of its spec",
+    )
+    return condition(found, "Accepted")
+
+
+WRONG: list[tuple[Object, Object, list[str]]] = [
+    # a good object, what makes it wrong, and what is said
+    (
+        template("unknown"),
+        {"manifests": [deployment("app:${parameters.version}")]},
+        ["spec.manifests[0]", "image, line 1, column", "`parameters.version` is not known", "region"],
+    ),
+    (template("typed"), {"manifests": [config({"x": "${parameters.region + 1}"})]}, ["data.x", "`+` does not take"]),
+    (
+        template("forbidden"),
+        {"manifests": [{"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "${instance.name}"}}]},
+        ["spec.manifests[0].kind: v1/ServiceAccount is not of the kinds that the administrator allows"],
+    ),
+    (
+        template("elsewhere"),
+        {"manifests": [{**config({}), "metadata": {"name": "${instance.name}", "namespace": "kube-system"}}]},
+        ["spec.manifests[0].metadata.namespace: 'kube-system'", "remove the field"],
+    ),
+    (
+        template("misnamed"),
+        {"manifests": [config({}, name="${instance.name}_A")]},
+        ["spec.manifests[0].metadata.name", "is no name for an object"],
+    ),
+    (
+        template("the-same"),
+        {"manifests": [config({}, name="fixed")]},
+        ["spec.manifests[0].metadata.name: 'fixed'", "must contain ${instance.name}"],
+    ),
+    (
+        template("charted"),
+        {"manifests": None, "helm": {"chart": "/charts/app", "values": {"rate": "${parameters.rate}"}}},
+        ["spec.helm.values.rate", "`parameters.rate` is not known"],
+    ),
+    (
+        template("incoherent"),
+        {"parameters": {"region": {"type": "string", "required": True, "default": "north"}}},
+        ["spec.parameters.region", "a required parameter has no default"],
+    ),
+    (rule("misspelt"), {"when": "distence < 150"}, ["spec.when", "line 1, column 1", "distence", "distance"]),
+    (rule("mistyped"), {"until": "distance + 200"}, ["spec.until", "must be a boolean"]),
+    (
+        rule("streamless"),
+        {"signals": [{"name": "speed", "stream": "odometri", "value": "msg.speed"}]},
+        ["spec.signals[0].stream", "has no stream odometri", "did you mean odometry?"],
+    ),
+    (detector(), {"clientTimeout": "30s", "streams": "msg.t +"}, ["spec.streams[0].stamp", "ends too early"]),
+]
+
+
+def spoilt(good: Object, change: Object) -> Object:
+    """The patch that makes the object wrong."""
+    if isinstance(change.get("streams"), str):  # of a stream's stamp
+        streams = copy.deepcopy(good["spec"]["streams"])
+        streams[0]["stamp"] = change["streams"]
+        change = {**change, "streams": streams}
+    return {"spec": change}
+
+
+def test_what_is_wrong_is_refused_the_old_version_stays_and_a_condition_says_the_same_where_nobody_asks(
+    api: Api, webhook: Webhook
+) -> None:
+    api.create(detector())
+    refusals: dict[str, str] = {}
+    with webhook.asked():
+        for good, change, parts in WRONG:
+            kind, name = good["kind"], good["metadata"]["name"]
+            if kind != "Detector":
+                api.create(good)
+            stored = api.get(kind, name)
+            with pytest.raises(ApiError) as refused:
+                api.patch(kind, name, spoilt(good, change))
+            assert (refused.value.code, refused.value.reason) == (422, "Invalid")
+            assert [part for part in parts if part not in refused.value.message] == [], refused.value.message
+            assert api.get(kind, name)["spec"] == stored["spec"]
+            _, _, refusals[name] = refused.value.message.partition("denied the request: ")
+    webhook.wait_unasked()
+    for good, _, _ in WRONG:
+        kind, name = good["kind"], good["metadata"]["name"]
+        assert told(api, kind, name)["status"] == "True"
+    for good, change, _ in WRONG:
+        kind, name = good["kind"], good["metadata"]["name"]
+        api.patch(kind, name, spoilt(good, change))
+        said = told(api, kind, name)
+        assert (said["status"], said["message"]) == ("False", refusals[name])
+        if kind == "Detector":
+            api.replace({**api.get(kind, name), "spec": good["spec"]})
+
+
+def test_kubectl_prints_what_is_refused_and_what_is_warned_of_as_the_guide_shows(
+    api: Api, control_plane: ControlPlane, webhook: Webhook, namespace: str
+) -> None:
+    optional = {"lane": {"type": "string"}}
+    doubtful = template("doubtful", parameters=optional, manifests=[config({"lane": "on ${parameters.lane}"})])
+    del doubtful["spec"]["key"]
+    guide = Path("docs/admission.md").read_text()
+    written, shown = (re.search(f"```{kind}\n(.*?)```", guide, re.DOTALL) for kind in ("yaml", "console"))
+    assert written is not None
+    assert shown is not None
+    with webhook.asked():
+        _, said = kubectl_apply(control_plane, yaml.safe_load(written[1]), namespace)
+        assert said.replace(namespace, "default") == shown[1].partition("\n")[2]
+        for options in ((), ("--dry-run=server",)):
+            code, said = kubectl_apply(control_plane, rule(when="distence < 150"), namespace, *options)
+            assert code != 0
+            for part in ('EventRule "close" is invalid', "spec.when", "line 1, column 1", "distence"):
+                assert part in said
+        code, said = kubectl_apply(control_plane, rule(), namespace)
+        assert (code, api.get("EventRule", "close")["spec"]["when"]) == (0, "distance < 150")
+        assert f"Warning: no valid Detector in namespace {namespace} selects the rule: create a Detector" in said
+        code, said = kubectl_apply(control_plane, doubtful, namespace)
+        assert code == 0
+        for part in ("Warning: spec.manifests[0].data.lane", "`parameters.lane` is null", "where tasks give no param"):
+            assert part in said
+        code, said = kubectl_apply(control_plane, detector(), namespace)
+        assert (code, said) == (0, "")
+        blind = detector()
+        blind["spec"]["streams"] = [each for each in blind["spec"]["streams"] if each["name"] != "odometry"]
+        code, said = kubectl_apply(control_plane, blind, namespace)
+        assert code == 0
+        assert "Warning: EventRule close, spec.signals[0].stream" in said
+
+
+def test_only_a_new_spec_is_refused(api: Api, webhook: Webhook) -> None:
+    wrong = template("wrong", manifests=[config({}, name="fixed")])
+    api.create(wrong)  # while nobody asks
+    with webhook.asked():
+        api.patch("ApplicationTemplate", "wrong", {"metadata": {"labels": {"a": "b"}, "finalizers": ["test.dev/x"]}})
+        status = {"status": {"instances": 7}}
+        api.patch("ApplicationTemplate", "wrong", status, subresource="status")
+        with pytest.raises(ApiError, match="must contain"):
+            api.patch("ApplicationTemplate", "wrong", {"spec": {"description": "still wrong"}})
+        api.delete("ApplicationTemplate", "wrong")
+        api.patch("ApplicationTemplate", "wrong", {"spec": {"description": "going"}})
+        api.patch("ApplicationTemplate", "wrong", {"metadata": {"finalizers": None}})
+        api.wait_gone("ApplicationTemplate", "wrong")
+
+
+def test_a_rule_may_follow_its_detector_at_once(api: Api, webhook: Webhook) -> None:
+    api.create(detector())
+    with webhook.asked():
+        for number in range(10):
+            stream = {"name": f"s{number}", "key": f"s{number}/${{client:*}}", "encoding": "json"}
+            api.patch("Detector", "intersection-a", [{"op": "add", "path": "/spec/streams/-", "value": stream}])
+            signals = [{"name": "speed", "stream": f"s{number}", "value": "msg.speed"}]
+            api.create(rule(f"rule-{number}", signals=signals))
+
+
+def test_a_manager_that_is_away_or_hangs_prevents_nothing(api: Api, processes: Processes, tmp_path: Path) -> None:
+    webhook = Webhook(processes, api, tmp_path / "certificates", patience=TIMEOUT)
+    api.create(template())
+    with webhook.asked():
+        os.kill(webhook.manager.pid, signal.SIGSTOP)
+        api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [config({}, name="hanging")]}})
+        os.kill(webhook.manager.pid, signal.SIGCONT)
+        webhook.wait_answering()
+        webhook.manager.kill9()
+        api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [config({}, name="away")]}})
+        webhook.manager.start()
+        webhook.wait_answering()
+        assert told(api, "ApplicationTemplate", "app")["reason"] == "TemplateInvalid"
+        assert webhook.manager.terminate() == 0
+
+
+def test_a_renewed_certificate_is_shown_and_one_that_cannot_be_used_is_not(api: Api, webhook: Webhook) -> None:
+    with webhook.asked():
+        key = webhook.folder / "tls.key"
+        old = key.read_bytes()
+        key.write_text("no key")
+        webhook.manager.wait_for_output("are no certificate and key .* the certificate of before stays")
+        webhook.wait_answering()
+        key.write_bytes(old)
+        api.apply(webhook.certified())  # another authority: what it did not sign is not trusted
+        webhook.manager.wait_for_output("the certificate was renewed")
+        webhook.wait_answering()
+
+
+@contextmanager
+def listener(folder: Path) -> Iterator[tuple[int, Path, list[Object]]]:
+    """An HTTPS server that allows everything: its port, its authority's file, and what it is asked."""
+    asked: list[Object] = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_POST(self) -> None:
+            request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))["request"]
+            asked.append(request)
+            answer = {"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview"}
+            body = json.dumps({**answer, "response": {"uid": request["uid"], "allowed": True}}).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    authority = Authority(folder)
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.load_cert_chain(*authority.sign("webhook"))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.socket = context.wrap_socket(server.socket, server_side=True)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield server.server_port, authority.ca, asked
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def test_tasks_instances_statuses_and_deletions_are_never_asked_about(
+    api: Api, processes: Processes, namespace: str, tmp_path: Path
+) -> None:
+    start_manager(processes, namespace)
+    with listener(tmp_path) as (port, authority, asked):
+        url = f"https://127.0.0.1:{port}"
+        name = f"wayside-{namespace}"
+        options = ("--ca-bundle", str(authority), "--namespace", namespace, "--name", name)
+        api.apply(printed("webhooks", "--url", url, *options))
+        try:
+            wait_until(lambda: api.apply(template()) and bool(asked), bool, what="the API server asks about templates")
+            api.create(task("north"))
+            (made,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="an instance is made")
+            end(api, "north")
+            api.wait_gone("ApplicationInstance", made["metadata"]["name"])
+            api.create(detector())
+            api.create(rule())
+            for kind, of in (("ApplicationTemplate", "app"), ("Detector", "intersection-a"), ("EventRule", "close")):
+                told(api, kind, of)
+                api.delete(kind, of)
+            api.delete("ApplicationTask", "north")
+        finally:
+            api.delete("ValidatingWebhookConfiguration", name)
+    found = {(each["kind"]["kind"], each["operation"], each.get("subResource", "")) for each in asked}
+    assert {each[0] for each in found} == {"ApplicationTemplate", "Detector", "EventRule"}
+    assert {each[1:] for each in found} <= {("CREATE", ""), ("UPDATE", "")}
+
+
+def holds_lease(api: Api) -> str:
+    """Who is active."""
+    found = api.wait_for(
+        "Lease",
+        "application-manager",
+        lambda raw: bool(raw["spec"].get("holderIdentity")),
+        what="a manager is active",
+    )
+    return str(found["spec"]["holderIdentity"])
+
+
+def test_a_standby_answers_as_well(api: Api, processes: Processes, namespace: str, tmp_path: Path) -> None:
+    active = start_manager(processes, namespace)
+    holder = holds_lease(api)
+    webhook = Webhook(processes, api, tmp_path / "certificates")
+    with webhook.asked():
+        with pytest.raises(ApiError, match="distence"):
+            api.create(rule(when="distence < 150"))
+        api.create(rule())
+    assert active.alive
+    assert holds_lease(api) == holder
+    assert told(api, "EventRule", "close")["reason"] == "NotSelected"

@@ -1,0 +1,240 @@
+"""The chart installed by a real helm into a cluster that has nothing of Wayside yet."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cluster.api import Api, ApiError, Object
+from tests.cluster.binaries import ensure_binaries
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.manifests import DETECTOR, EVENT_RULE
+from tests.cluster.namespaces import fresh_namespace
+from tests.cluster.processes import Processes
+from tests.cluster.waiting import wait_until
+from tests.cluster.webhook import printed
+from tests.helm import ensure_tools
+from tests.helm.wayside_chart import CHART, Helm, names
+from tests.ports import free_ports
+
+RELEASE = "wayside"
+PODS_ARE_RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
+ALL: dict[str, Any] = {
+    "manager": {"replicas": 2},
+    "detectors": [
+        {"name": "town", "labels": {"a": "b"}, "service": {"ports": [7447]}, "spec": DETECTOR["spec"]},
+    ],
+    "eventRules": [{"name": "one", "labels": {"site": "north"}, "spec": EVENT_RULE["spec"]}],
+    "router": {
+        "enabled": True,
+        "tls": {"secretName": "router-tls"},
+        "accessControl": {"clients": [{"name": "cars", "commonNames": ["car1"], "publish": ["vehicles/**"]}]},
+    },
+    "monitoring": {"dashboard": {"enabled": True}},
+    "networkPolicy": {"egress": {"restrict": True}},
+}
+
+
+@pytest.fixture(scope="module")
+def bare() -> Iterator[ControlPlane]:
+    """A control plane without the CRDs: those are the chart's matter."""
+    with ControlPlane(ensure_binaries()) as running:
+        yield running
+
+
+@pytest.fixture
+def there(bare: ControlPlane, request: pytest.FixtureRequest) -> Iterator[Api]:
+    """An administrator's client for a fresh namespace under the restricted Pod Security Standard."""
+    with fresh_namespace(bare.api(), request.node.name) as name:
+        bare.api().patch("Namespace", name, {"metadata": {"labels": PODS_ARE_RESTRICTED}})
+        yield bare.api(name)
+
+
+@pytest.fixture
+def helm(bare: ControlPlane, there: Api, tmp_path: Any) -> Iterator[Helm]:
+    made = Helm(ensure_tools().helm, tmp_path / "home", bare.kubeconfig)
+    yield made
+    made("uninstall", RELEASE, "--namespace", there.namespace, "--ignore-not-found")
+    for crd in ours(there, "CustomResourceDefinition"):
+        there.delete("CustomResourceDefinition", crd["metadata"]["name"])
+        there.wait_gone("CustomResourceDefinition", crd["metadata"]["name"])
+
+
+def ours(api: Api, *kinds: str) -> list[Object]:
+    return [each for kind in kinds for each in api.list(kind, labels="app.kubernetes.io/part-of=wayside")]
+
+
+def install(helm: Helm, api: Api, values: dict[str, Any], verb: str = "install") -> None:
+    helm(verb, RELEASE, str(CHART), "--namespace", api.namespace, values=values)
+
+
+def pods(api: Api, component: str) -> list[Object]:
+    return api.list("Pod", labels=f"app.kubernetes.io/component={component}")
+
+
+def test_what_is_installed_changes_with_upgrades_and_goes_with_the_release_but_for_the_crds(
+    helm: Helm, there: Api
+) -> None:
+    install(helm, there, ALL)
+    for component, count in (("manager", 2), ("router", 1)):
+        # The restricted standard is enforced, so only pods that meet it come into being.
+        wait_for_pods(there, component, count)
+    town = there.get("Detector", "town")
+    assert town["metadata"]["labels"]["a"] == "b"
+    assert town["spec"]["mode"] == "Standalone"
+    assert there.get("EventRule", "one")["spec"]["when"] == EVENT_RULE["spec"]["when"]
+    secret = there.get("Secret", f"{RELEASE}-webhook-tls")["data"]
+    hook = there.get("ValidatingWebhookConfiguration", f"{RELEASE}-{there.namespace}")
+    assert hook["webhooks"][0]["clientConfig"]["caBundle"] == secret["ca.crt"]
+
+    install(helm, there, ALL | {"manager": {"replicas": 1}}, "upgrade")
+    assert there.get("Secret", f"{RELEASE}-webhook-tls")["data"] == secret, "an upgrade keeps the certificates"
+    assert there.find("PodDisruptionBudget", f"{RELEASE}-manager") is None
+    assert there.get("Detector", "town")["metadata"]["uid"] == town["metadata"]["uid"], (
+        "it is taken over, not made anew"
+    )
+    install(helm, there, ALL | {"eventRules": []}, "upgrade")
+    there.wait_gone("EventRule", "one")
+
+    helm("uninstall", RELEASE, "--namespace", there.namespace)
+    there.wait_gone("Detector", "town")
+    left = sorted(installed_kinds() - {"CustomResourceDefinition"})
+    wait_until(lambda: names(ours(there, *left)), lambda found: not found, what="nothing else of the release is left")
+    assert len(ours(there, "CustomResourceDefinition")) == 5
+    install(helm, there, {})  # and the CRDs that stayed are taken over by the next release
+
+
+def test_what_an_install_made_goes_as_well_where_no_upgrade_came_between(helm: Helm, there: Api) -> None:
+    install(helm, there, ALL | {"crds": {"keep": True}})
+    assert there.find("EventRule", "one") is not None
+    helm("uninstall", RELEASE, "--namespace", there.namespace)
+    there.wait_gone("EventRule", "one")
+    there.wait_gone("Detector", "town")
+
+
+def test_crds_that_are_not_kept_go_too(helm: Helm, there: Api) -> None:
+    install(helm, there, {"crds": {"keep": False}})
+    helm("uninstall", RELEASE, "--namespace", there.namespace)
+    there.wait_gone("CustomResourceDefinition", "eventrules.wayside.dev")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        ALL,
+        {"manager": {"namespaces": ["default", "kube-public"], "allowedKinds": ["apps/v1/Deployment"]}},
+        {"webhook": {"enabled": False}, "admissionPolicy": {"enabled": False}, "networkPolicy": {"enabled": False}},
+        {"router": {"enabled": True, "tls": {"enabled": False}, "accessControl": {"enabled": False}}},
+    ],
+)
+def test_the_api_server_takes_all_that_is_rendered(helm: Helm, there: Api, values: dict[str, Any]) -> None:
+    rendered = helm.rendered(values, namespace=there.namespace).manifests
+    for each in rendered:
+        if each["apiVersion"] == "wayside.dev/v1alpha1":
+            continue  # their kinds are among what is rendered; that they are taken, the installation shows
+        where = {"namespace": there.namespace} if not each["metadata"].get("namespace") else {}
+        each["metadata"] |= where if each["kind"] not in CLUSTER_WIDE else {}
+        there.apply(each, dry_run=True)
+
+
+CLUSTER_WIDE = {
+    "ClusterRole",
+    "ClusterRoleBinding",
+    "CustomResourceDefinition",
+    "ValidatingAdmissionPolicy",
+    "ValidatingAdmissionPolicyBinding",
+    "ValidatingWebhookConfiguration",
+}
+
+
+def installed_kinds() -> set[str]:
+    """What a release may consist of, beside what other programs' kinds are."""
+    return CLUSTER_WIDE | {
+        "ConfigMap", "Deployment", "Lease", "NetworkPolicy", "Pod", "PodDisruptionBudget", "Role", "RoleBinding",
+        "Secret", "Service", "ServiceAccount",
+    }  # fmt: skip
+
+
+def wait_for_pods(api: Api, component: str, count: int) -> None:
+    api.wait_list(
+        "Pod",
+        lambda found: len(found) == count,
+        labels=f"app.kubernetes.io/component={component}",
+        what=f"{count} pods of the {component}",
+    )
+
+
+def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_that_it_answers(
+    helm: Helm, there: Api, bare: ControlPlane, tmp_path: Path
+) -> None:
+    install(helm, there, {"manager": {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"]}})
+    container = there.get("Deployment", f"{RELEASE}-manager")["spec"]["template"]["spec"]["containers"][0]
+    metrics, webhook = free_ports(2)
+    certificates = tmp_path / "certificates"
+    printed("webhooks", "--url", f"https://127.0.0.1:{webhook}", "--make-certificates", str(certificates))
+    here = {
+        "--metrics-port": str(metrics),
+        "--admission-port": str(webhook),
+        "--admission-certificates": str(certificates),
+    }
+    options = [word.split("=", 1) for word in container["args"][1:]]
+    arguments = [f"{option}={here.get(option, value)}" for option, value in options]
+    (logs := tmp_path / "logs").mkdir()
+    account = bare.kubeconfig_of_service_account(there.namespace, f"{RELEASE}-manager")
+    processes = Processes(logs, {"KUBECONFIG": str(account)})
+    try:
+        manager = processes.start(*container["command"], container["args"][0], *arguments)
+        manager.wait_for_output("active: holds the Lease")  # the chart's, which is empty at first
+        (pod,) = helm.rendered({"manager": {"namespaces": [there.namespace]}}).of("Pod")
+        script, *where = pod["spec"]["containers"][0]["args"]
+        assert [each.partition(":")[0] for each in where] == ["http", "https", "/authority/ca.crt", there.namespace]
+        where[:3] = [f"http://127.0.0.1:{metrics}", f"https://127.0.0.1:{webhook}", str(certificates / "ca.crt")]
+        done = subprocess.run([sys.executable, "-c", script, *where], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "the manager is ready" in done.stdout
+        assert "the webhook refuses what is wrong" in done.stdout
+        assert manager.terminate() == 0
+        assert "may not" not in manager.output()
+    finally:
+        processes.kill_all()
+
+
+def test_the_test_pod_is_taken_too(helm: Helm, there: Api) -> None:
+    (pod,) = helm.rendered({}, namespace=there.namespace).of("Pod")
+    created = there.create(pod)
+    assert created["metadata"]["annotations"]["helm.sh/hook"] == "test"
+    privileged = pod | {"metadata": {"name": "privileged"}}
+    privileged["spec"]["securityContext"] = {}
+    with pytest.raises(ApiError, match="violates PodSecurity"):
+        there.create(privileged)
+
+
+def test_people_may_with_our_kinds_what_they_may_with_others(helm: Helm, there: Api) -> None:
+    install(helm, there, {})
+    rbac = "rbac.authorization.k8s.io"
+    for role in ("view", "edit"):
+        subject = {"apiGroup": rbac, "kind": "User", "name": f"with-{role}"}
+        reference = {"apiGroup": rbac, "kind": "ClusterRole", "name": role}
+        named = {"apiVersion": f"{rbac}/v1", "kind": "RoleBinding", "metadata": {"name": role}}
+        there.apply(named | {"roleRef": reference, "subjects": [subject]})
+
+    def may(role: str, verb: str) -> bool:
+        about = {"group": "wayside.dev", "resource": "eventrules", "verb": verb, "namespace": there.namespace}
+        review = {"apiVersion": "authorization.k8s.io/v1", "kind": "SubjectAccessReview", "metadata": {}}
+        return bool(
+            there.create(review | {"spec": {"user": f"with-{role}", "resourceAttributes": about}})["status"]["allowed"]
+        )
+
+    wanted = {"view": ["list"], "edit": ["list", "create", "delete"]}
+    verbs = ("list", "create", "delete", "hold")
+    wait_until(
+        lambda: {role: [verb for verb in verbs if may(role, verb)] for role in wanted},
+        lambda found: found == wanted,
+        what="Kubernetes' own roles have ours",
+    )

@@ -1,0 +1,328 @@
+"""What the chart renders is what the programs say of themselves: roles, webhook, options."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from application_manager.core.objects.detectors import detector_objects
+from application_manager.core.objects.poddefaults import PodDefaults, parse_environment
+from application_manager.core.objects.sidecars import SIDECAR_LABEL, addition
+from tests.cluster.processes import BIN
+from tests.helm import ensure_tools
+from tests.helm.wayside_chart import CHART, Helm, HelmError, Rendered, Values
+from wayside.api import Detector
+from wayside.api.__main__ import crd_files
+
+Object = dict[str, Any]
+EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
+
+
+DETECTOR: Object = {
+    "name": "town",
+    "spec": {"streams": [{"name": "a", "key": "a/*", "encoding": "json", "client": "a"}]},
+}
+
+
+@pytest.fixture(scope="module")
+def helm(tmp_path_factory: pytest.TempPathFactory) -> Helm:
+    return Helm(ensure_tools().helm, tmp_path_factory.mktemp("helm") / "home")
+
+
+def printed(command: str, *arguments: str) -> list[Object]:
+    done = subprocess.run(
+        [str(BIN / "application-manager"), command, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"KUBECONFIG": "/nonexistent"},
+    )
+    return list(yaml.safe_load_all(done.stdout))
+
+
+def granted(manifests: list[Object]) -> dict[tuple[str, str, str], set[tuple[str, str, str, str]]]:
+    """Kind, namespace and name of each role: group, resource, verb and the name that it is limited to."""
+    return {
+        (each["kind"], each["metadata"].get("namespace", ""), each["metadata"]["name"]): {
+            (group, resource, verb, name)
+            for rule in each["rules"]
+            for group in rule["apiGroups"]
+            for resource in rule["resources"]
+            for verb in rule["verbs"]
+            for name in rule.get("resourceNames", [""])
+        }
+        for each in manifests
+        if "rules" in each and each["kind"] in ("Role", "ClusterRole")
+    }
+
+
+def bound(manifests: list[Object]) -> list[tuple[Any, ...]]:
+    """Kind, namespace, role and subjects of each binding."""
+    return sorted(
+        (
+            each["kind"],
+            each["metadata"].get("namespace", ""),
+            each["roleRef"]["kind"],
+            each["roleRef"]["name"],
+            str(sorted(sorted(subject.items()) for subject in each["subjects"])),
+        )
+        for each in manifests
+        if each["kind"] in ("RoleBinding", "ClusterRoleBinding")
+    )
+
+
+@pytest.mark.parametrize(
+    ("namespaces", "kinds", "detectors"),
+    [
+        ([], [], True),
+        (["north"], ["v1/ConfigMap", "v1/Pod"], False),
+        (["north", "south"], ["v1/Service", "v1/Secret", "apps/v1/StatefulSet"], True),
+    ],
+)
+def test_the_managers_roles_are_those_that_it_prints(
+    helm: Helm, namespaces: list[str], kinds: list[str], detectors: bool
+) -> None:
+    manager = {"namespaces": namespaces, "allowedKinds": kinds, "detectors": {"run": detectors}}
+    rendered = helm.rendered({"manager": manager, "userRoles": {"create": False}})
+    options = ["--account", "town/wayside-manager", "--name", "wayside-manager", *(["--detectors"] * detectors)]
+    options += [word for each in kinds for word in ("--allowed-kinds", each)]
+    options += [word for each in namespaces for word in ("--namespace", each)]
+    wanted = printed("rbac", *options)
+    assert granted(rendered.manifests) == granted(wanted)
+    assert bound(rendered.manifests) == bound(wanted)
+    args = rendered.one("Deployment", "wayside-manager")["spec"]["template"]["spec"]["containers"][0]["args"]
+    assert [f"--namespace={each}" for each in namespaces] == [each for each in args if each.startswith("--namespace")]
+    assert [f"--allowed-kinds={each}" for each in kinds] == [each for each in args if each.startswith("--allowed-k")]
+
+
+def test_a_kind_that_only_the_cluster_knows_needs_its_plural(helm: Helm) -> None:
+    kind = {"kind": "argoproj.io/v1alpha1/Rollout", "plural": "rollouts"}
+    given = {"manager": {"allowedKinds": ["v1/Pod", kind]}, "userRoles": {"create": False}}
+    rendered = helm.rendered(given)
+    (rights,) = (each for key, each in granted(rendered.manifests).items() if key[0] == "ClusterRole")
+    assert {verb for group, resource, verb, _ in rights if (group, resource) == ("argoproj.io", "rollouts")} == {
+        "get", "list", "watch", "create", "patch", "delete"
+    }  # fmt: skip
+    with pytest.raises(HelmError, match=r"manager.allowedKinds: .*argoproj.io/v1alpha1/Rollout.*plural"):
+        helm.rendered({"manager": {"allowedKinds": [kind["kind"]]}})
+
+
+@pytest.mark.parametrize("namespaces", [[], ["south", "north"]])
+def test_the_webhook_is_the_one_that_the_manager_prints(helm: Helm, namespaces: list[str], tmp_path: Path) -> None:
+    rendered = helm.rendered({"manager": {"namespaces": namespaces}})
+    authority = rendered.one("Secret", "wayside-webhook-tls")["data"]["ca.crt"]
+    (bundle := tmp_path / "ca.crt").write_bytes(base64.b64decode(authority))
+    wanted = printed(
+        "webhooks", "--service", "town/wayside-webhook", "--ca-bundle", str(bundle), "--name", "wayside-town",
+        *(word for each in namespaces for word in ("--namespace", each)), "--detectors",
+    )  # fmt: skip
+    assert [each["kind"] for each in wanted] == ["ValidatingWebhookConfiguration", "MutatingWebhookConfiguration"]
+    for each in wanted:
+        found = rendered.one(each["kind"])
+        assert found["webhooks"] == each["webhooks"]
+        assert found["metadata"]["name"] == each["metadata"]["name"]
+    without = helm.rendered({"webhook": {"sidecars": False}})
+    assert not without.of("MutatingWebhookConfiguration")
+    assert without.of("ValidatingWebhookConfiguration")
+
+
+def test_cert_manager_or_somebody_else_can_make_the_webhooks_certificate(helm: Helm) -> None:
+    issuer = {"name": "authority", "kind": "ClusterIssuer"}
+    rendered = helm.rendered({"webhook": {"certificates": {"from": "CertManager", "issuerRef": issuer}}})
+    certificate, hook = rendered.one("Certificate"), rendered.one("ValidatingWebhookConfiguration")
+    assert certificate["spec"]["issuerRef"] == issuer
+    for each in (hook, rendered.one("MutatingWebhookConfiguration")):
+        assert each["metadata"]["annotations"] == {"cert-manager.io/inject-ca-from": "town/wayside-webhook"}
+        assert "caBundle" not in each["webhooks"][0]["clientConfig"]
+    assert not rendered.of("Secret")
+    assert mounted(rendered) == certificate["spec"]["secretName"]
+    given = {"from": "Secret", "secretName": "mine", "caBundle": "YWJj"}
+    rendered = helm.rendered({"webhook": {"certificates": given}})
+    assert mounted(rendered) == "mine"
+    for kind in ("ValidatingWebhookConfiguration", "MutatingWebhookConfiguration"):
+        assert rendered.one(kind)["webhooks"][0]["clientConfig"]["caBundle"] == "YWJj"
+    with pytest.raises(HelmError, match=r"webhook\.certificates\.secretName is empty"):
+        helm.rendered({"webhook": {"certificates": {"from": "Secret"}}})
+
+
+def mounted(rendered: Rendered) -> str:
+    """The Secret of the manager's certificates."""
+    volumes = rendered.one("Deployment", "wayside-manager")["spec"]["template"]["spec"]["volumes"]
+    (found,) = (each["secret"]["secretName"] for each in volumes if each["name"] == "certificates")
+    return str(found)
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_the_crds_are_whole_and_kept_where_that_is_wanted(helm: Helm, keep: bool) -> None:
+    rendered = helm.rendered({"crds": {"keep": keep}}).of("CustomResourceDefinition")
+    wanted = {text["metadata"]["name"]: text["spec"] for text in map(yaml.safe_load, crd_files().values())}
+    assert {each["metadata"]["name"]: each["spec"] for each in rendered} == wanted
+    policies = {each["metadata"].get("annotations", {}).get("helm.sh/resource-policy") for each in rendered}
+    assert policies == {"keep" if keep else None}
+    assert not helm.rendered({"crds": {"install": False}}).of("CustomResourceDefinition")
+
+
+@pytest.mark.parametrize(("replicas", "budgets"), [(1, 0), (2, 1)])
+def test_a_disruption_budget_is_there_only_for_several_managers(helm: Helm, replicas: int, budgets: int) -> None:
+    rendered = helm.rendered({"manager": {"replicas": replicas}})
+    assert len(rendered.of("PodDisruptionBudget")) == budgets
+
+
+def test_the_linter_finds_nothing(helm: Helm) -> None:
+    assert "0 chart(s) failed" in helm("lint", "--strict", str(CHART))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"manager": {"replica": 2}}, "replica"),
+        ({"manager": {"replicas": 0}}, "replicas"),
+        ({"manager": {"resync": "60"}}, "resync"),
+        ({"manager": {"resync": "1d"}}, "resync"),
+        ({"commonLabels": {"team": 7}}, "team"),
+        ({"webhook": {"certificates": {"from": "Nowhere"}}}, "from"),
+        ({"manager": {"lease": "wayside-manager"}}, "lease"),
+        ({"detectors": [{"name": "Town", "spec": {}}]}, "name"),
+        ({"image": {"digest": "latest"}}, "digest"),
+        ({"tracing": {"variables": {"PATH": "/bin"}}}, "PATH"),
+        (
+            {"detectors": [DETECTOR], "manager": {"detectors": {"run": False}}},
+            "town is of mode Standalone, but manager.detectors.run is false",
+        ),
+        (
+            {"detectors": [DETECTOR], "manager": {"namespaces": ["north", "south"]}},
+            r"Detector town is in namespace town, which .* does not look after: .*\(north, south\)",
+        ),
+    ],
+)
+def test_a_value_that_is_none_is_refused_by_its_name(helm: Helm, values: Values, message: str) -> None:
+    with pytest.raises(HelmError, match=message):
+        helm.rendered(values)
+
+
+def test_more_can_be_mounted_into_the_manager(helm: Helm) -> None:
+    volume, mount = {"name": "tools", "emptyDir": {}}, {"name": "tools", "mountPath": "/tools"}
+    given = {"volumes": [volume], "volumeMounts": [mount], "extraArgs": ["--helm=/tools/helm"]}
+    pod = helm.rendered({"manager": given}).one("Deployment", "wayside-manager")["spec"]["template"]["spec"]
+    assert volume in pod["volumes"]
+    assert mount in pod["containers"][0]["volumeMounts"]
+    assert pod["containers"][0]["args"][-1] == "--helm=/tools/helm"
+
+
+def manager_arguments(rendered: Rendered) -> list[str]:
+    (container,) = rendered.one("Deployment", "wayside-manager")["spec"]["template"]["spec"]["containers"]
+    return list(container["args"])
+
+
+def test_a_detector_of_the_values_is_run_by_the_manager_unless_that_is_not_wanted(helm: Helm) -> None:
+    mine = [DETECTOR, DETECTOR | {"name": "van", "run": False}, {"name": "own", "spec": {"mode": "Standalone"}}]
+    rendered = helm.rendered({"detectors": mine}, "--api-versions", "wayside.dev/v1alpha1/Detector")
+    assert {each["metadata"]["name"]: each["spec"].get("mode") for each in rendered.of("Detector")} == {
+        "town": "Standalone",
+        "van": None,
+        "own": "Standalone",
+    }
+    assert {each["metadata"]["name"] for each in rendered.of("NetworkPolicy")} == {
+        "wayside-manager",
+        "wayside-detector-town",
+        "wayside-detector-own",
+    }
+    assert {each["metadata"]["name"] for each in rendered.of("Deployment")} == {"wayside-manager"}
+    off = helm.rendered({"manager": {"detectors": {"run": False}}})
+    assert not [each for each in manager_arguments(off) if "detector" in each]
+
+
+def test_detectors_are_pulled_like_the_manager_and_found_by_what_the_manager_labels_them_with(helm: Helm) -> None:
+    values: Values = {
+        "image": {"repository": "registry.test/wayside", "tag": "7", "pullPolicy": "Always"},
+        "imagePullSecrets": [{"name": "registry"}],
+        "manager": {"namespaces": ["north"]},
+        "detectors": [DETECTOR | {"namespace": "north", "service": {"ports": [7447], "type": "NodePort"}}],
+        "monitoring": {"podMonitor": {"enabled": True}},
+    }
+    rendered = helm.rendered(values)
+    assert manager_arguments(rendered)[-3:] == [
+        "--detector-image=registry.test/wayside:7",
+        "--detector-pull-policy=Always",
+        "--detector-pull-secret=registry",
+    ]
+    metadata = {"name": "town", "namespace": "north", "uid": "u"}
+    town = Detector.model_validate({"kind": "Detector", "metadata": metadata, "spec": DETECTOR["spec"]})
+    *_, deployment = detector_objects(town, PodDefaults("wayside:1"))
+    labels = deployment["spec"]["template"]["metadata"]["labels"]
+    service, policy = (
+        rendered.one("Service", "wayside-detector-town"),
+        rendered.one("NetworkPolicy", "wayside-detector-town"),
+    )
+    monitor = rendered.one("PodMonitor", "wayside-detectors")["spec"]
+    selectors = [service["spec"]["selector"], policy["spec"]["podSelector"]["matchLabels"]]
+    for selector in (*selectors, monitor["selector"]["matchLabels"]):
+        assert selector.items() <= labels.items()
+    assert service["metadata"]["namespace"] == policy["metadata"]["namespace"] == "north"
+    assert monitor["namespaceSelector"] == {"matchNames": ["north"]}
+    (container,) = deployment["spec"]["template"]["spec"]["containers"]
+    (monitored,) = monitor["podMetricsEndpoints"]
+    assert monitored["port"] in {each["name"] for each in container["ports"]}
+
+
+def test_sidecars_are_scraped_by_the_port_that_they_have(helm: Helm) -> None:
+    monitor = helm.rendered({"monitoring": {"podMonitor": {"enabled": True}}}).one("PodMonitor", "wayside-sidecars")
+    assert monitor["spec"]["selector"]["matchExpressions"] == [{"key": SIDECAR_LABEL, "operator": "Exists"}]
+    stream = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json"}
+    spec = {"mode": "Sidecar", "streams": [stream]}
+    of = Detector.model_validate({"kind": "Detector", "metadata": {"name": "van"}, "spec": spec})
+    made = addition({}, of, PodDefaults("wayside:1"))
+    assert made is not None
+    (container,) = made.items["initContainers"]
+    assert [each["port"] for each in monitor["spec"]["podMetricsEndpoints"]] == [container["ports"][0]["name"]]
+
+
+def test_traces_go_where_it_says_from_both_programs(helm: Helm) -> None:
+    endpoint, variables = "http://collector:4318", {"OTEL_TRACES_SAMPLER": "always_on"}
+    rendered = helm.rendered({"tracing": {"endpoint": endpoint, "variables": variables}})
+    wanted = {"OTEL_EXPORTER_OTLP_ENDPOINT": endpoint, **variables}
+    (container,) = rendered.one("Deployment", "wayside-manager")["spec"]["template"]["spec"]["containers"]
+    assert wanted.items() <= {each["name"]: each.get("value") for each in container["env"]}.items()
+    handed_on = [each.partition("=")[2] for each in container["args"] if each.startswith("--detector-env=")]
+    assert parse_environment(handed_on) == wanted
+
+
+def test_the_examples_values_are_its_detector_where_vehicles_reach_it(helm: Helm) -> None:
+    desk = yaml.safe_load((EXAMPLE / "detector.yaml").read_text())["spec"]
+    values = yaml.safe_load((EXAMPLE / "helm" / "values.yaml").read_text())
+    rendered = helm.rendered(values, "--api-versions", "wayside.dev/v1alpha1/Detector")
+    spec = rendered.one("Detector", "town")["spec"]
+    assert spec.pop("mode") == "Standalone"
+    assert spec.pop("zenoh") == {"mode": "peer", "listen": ["tcp/0.0.0.0:7447"]}
+    assert spec == {key: value for key, value in desk.items() if key != "zenoh"}
+    ports = rendered.one("Service", "wayside-detector-town")["spec"]["ports"]
+    assert [each["targetPort"] for each in ports] == [7447]
+
+
+def test_a_new_version_of_the_chart_alone_makes_no_pod_anew(helm: Helm, tmp_path: Path) -> None:
+    newer = tmp_path / "wayside"
+    shutil.copytree(CHART, newer)
+    described = (newer / "Chart.yaml").read_text()
+    (newer / "Chart.yaml").write_text(re.sub(r"(?m)^version: .*$", "version: 9.9.9", described))
+    values = {"router": {"enabled": True, "tls": {"enabled": False}, "accessControl": {"enabled": False}}}
+    before = list(helm.rendered(values).of("Deployment"))
+    text = helm("template", "wayside", str(newer), "--namespace", "town", values=values)
+    after = [each for each in yaml.safe_load_all(text) if each and each["kind"] == "Deployment"]
+    assert [each["spec"]["template"] for each in after] == [each["spec"]["template"] for each in before]
+    assert "9.9.9" in text
+
+
+def test_common_labels_are_on_every_object_and_every_pod(helm: Helm) -> None:
+    rendered = helm.rendered({"commonLabels": {"team": "mobility"}, "detectors": [DETECTOR]})
+    assert {each["metadata"]["labels"].get("team") for each in rendered.manifests if each["kind"] != "Pod"} == {
+        "mobility"
+    }
+    assert rendered.one("Deployment")["spec"]["template"]["metadata"]["labels"]["team"] == "mobility"

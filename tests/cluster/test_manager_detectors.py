@@ -1,0 +1,252 @@
+"""The manager runs Detectors of mode Standalone: their objects come, change and go, and the status says how it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from application_manager.core.objects.detectors import detector_objects, detector_roles, object_name
+from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.rights import detector_rights
+from tests.cluster.api import Api, Object
+from tests.cluster.chain import CARS, FAR, HOLDER, NEAR, Vehicles
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.faulty_proxy import faulty_proxy
+from tests.cluster.managed_world import condition, start_manager
+from tests.cluster.processes import Process, Processes
+from tests.cluster.test_manager_rbac import ALLOWED, granted, printed, put, used, without
+from tests.cluster.waiting import wait_until
+from tests.ports import free_endpoint
+from wayside.api import Detector
+
+NAME = object_name("town")
+KINDS = ("ServiceAccount", "Role", "RoleBinding", "Deployment")
+RUNS = ("--detector-image", "wayside:1")
+
+
+def detector(**spec: Any) -> Object:
+    stream = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json"}
+    return {
+        "apiVersion": "wayside.dev/v1alpha1",
+        "kind": "Detector",
+        "metadata": {"name": HOLDER},
+        "spec": {"streams": [stream], "clientTimeout": "60s", **spec},
+    }
+
+
+def close_vehicles() -> Object:
+    deploy = {"template": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}}
+    return {
+        "apiVersion": "wayside.dev/v1alpha1",
+        "kind": "EventRule",
+        "metadata": {"name": "close"},
+        "spec": {
+            "scope": {"pairs": {"position": {"stream": "pose", "x": "msg.x", "y": "msg.y"}, "within": 1000}},
+            "evaluation": {"every": "100ms"},
+            "when": "distance < 150",
+            "until": "distance > 200",
+            "actions": [{"name": "record", "deploy": deploy}],
+        },
+    }
+
+
+def says(api: Api, status: str, reason: str) -> Object:
+    def holds(raw: Object) -> bool:
+        said = condition(raw, "Running")
+        return (said.get("status"), said.get("reason")) == (status, reason)
+
+    found = api.wait_for("Detector", HOLDER, holds, what=f"Running is {status}, {reason}")
+    return condition(found, "Running")
+
+
+def same(wanted: Any, live: Any) -> bool:
+    """Whether the live object has all that the manifest says; it may have more."""
+    if isinstance(wanted, dict):
+        return isinstance(live, dict) and all(same(value, live.get(key)) for key, value in wanted.items())
+    if isinstance(wanted, list):
+        return len(wanted) == len(live) and all(map(same, wanted, live))
+    return bool(wanted == live)
+
+
+def is_made(api: Api) -> None:
+    """Wait until all objects are as the pure function says of the Detector as it is."""
+
+    def unlike() -> list[str]:
+        wanted = detector_objects(Detector.model_validate(api.get("Detector", HOLDER)), PodDefaults("wayside:1"))
+        return [each["kind"] for each in wanted if not same(each, api.find(each["kind"], NAME))]
+
+    wait_until(unlike, lambda found: not found, what="its objects are as the Detector says")
+
+
+def test_its_objects_come_change_and_go_with_it(api: Api, processes: Processes, namespace: str, kubelet: None) -> None:
+    start_manager(processes, namespace, *RUNS)
+    api.create(detector(mode="Standalone"))
+    is_made(api)
+    says(api, "True", "Running")
+    first = api.get("Deployment", NAME)
+
+    api.patch("Detector", HOLDER, {"spec": {"clientTimeout": "30s", "state": {"path": "/state"}}})
+    is_made(api)
+    generation = api.get("Deployment", NAME)["metadata"]["generation"]
+    assert generation > first["metadata"]["generation"]
+    says(api, "True", "Running")
+    changed = api.patch("Detector", HOLDER, {"spec": {"clientTimeout": "20s"}})
+    api.wait_for(
+        "Detector",
+        HOLDER,
+        lambda raw: raw["status"]["observedGeneration"] == changed["metadata"]["generation"],
+        what="the change was looked at",
+    )
+    assert api.get("Deployment", NAME)["metadata"]["generation"] == generation
+
+    api.delete("Role", NAME)
+    api.patch("Deployment", NAME, {"spec": {"replicas": 0}})
+    is_made(api)
+    assert api.get("Deployment", NAME)["metadata"]["uid"] == first["metadata"]["uid"]
+
+    api.patch("Detector", HOLDER, {"spec": {"mode": None}})
+    for kind in KINDS:
+        api.wait_gone(kind, NAME)
+    api.wait_for("Detector", HOLDER, lambda raw: not condition(raw, "Running"), what="nothing is said of running")
+    api.patch("Detector", HOLDER, {"spec": {"mode": "Standalone"}})
+    is_made(api)
+    api.delete("Detector", HOLDER)
+    for kind in KINDS:
+        api.wait_gone(kind, NAME)
+
+
+def test_the_status_says_why_it_does_not_run(api: Api, processes: Processes, namespace: str) -> None:
+    other = {"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": NAME}}
+    foreign = api.create(other)
+    manager = start_manager(processes, namespace)
+    api.create(detector(mode="Standalone"))
+    assert "--detector-image" in says(api, "False", "NotRun")["message"]
+    assert api.find("Deployment", NAME) is None
+    manager.terminate()
+
+    start_manager(processes, namespace, *RUNS)
+    assert f"ServiceAccount {NAME} exists already" in says(api, "False", "ObjectExists")["message"]
+    assert api.get("ServiceAccount", NAME)["metadata"]["uid"] == foreign["metadata"]["uid"]
+    assert api.find("Deployment", NAME) is None
+    api.delete("ServiceAccount", NAME)
+    is_made(api)
+    says(api, "False", "NotReady")
+    (pod,) = api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
+    waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
+    state = {"name": "detector", "image": "wayside:1", "imageID": "", "ready": False, "restartCount": 0}
+    status = {"phase": "Pending", "containerStatuses": [{**state, "state": waiting}]}
+    api.patch("Pod", pod["metadata"]["name"], {"status": status}, subresource="status")
+    assert "image wayside:1 cannot be pulled: not found" in says(api, "False", "ImagePullFailed")["message"]
+
+
+def test_the_pod_passes_the_restricted_standard(
+    api: Api, control_plane: ControlPlane, processes: Processes, namespace: str
+) -> None:
+    labels = {
+        "pod-security.kubernetes.io/enforce": "restricted",
+        "pod-security.kubernetes.io/enforce-version": "latest",
+    }
+    control_plane.api().patch("Namespace", namespace, {"metadata": {"labels": labels}})
+    start_manager(processes, namespace, *RUNS)
+    paths = {"state": {"path": "/state"}, "recordings": {"path": "/data/recordings"}}
+    volumes = [{"path": "/data", "claim": "town"}]
+    pod = {"volumes": volumes, "secrets": ["pager"]}
+    api.create(detector(mode="Standalone", pod=pod, **paths))
+    api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
+
+
+def test_the_manager_runs_it_with_the_rights_that_are_printed(
+    api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, kubelet: None
+) -> None:
+    api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
+    account = control_plane.kubeconfig_of_service_account(namespace, "manager")
+    put(api, printed("--namespace", namespace, "--account", f"{namespace}/manager", "--detectors", *ALLOWED))
+    manager = start_manager(processes, namespace, *RUNS, *ALLOWED, kubeconfig=account)
+    api.create(detector(mode="Standalone"))
+    is_made(api)
+    says(api, "True", "Running")
+    api.patch("Detector", HOLDER, {"spec": {"mode": None}})
+    for kind in KINDS:
+        api.wait_gone(kind, NAME)
+    assert manager.terminate() == 0
+    assert "orbidden" not in manager.output()
+    assert "may not" not in manager.output()
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+def run_detector(processes: Processes, namespace: str, kubeconfig: Path) -> Process:
+    environment = {"KUBECONFIG": str(kubeconfig)}
+    started = processes.start("detector", "run", "--name", HOLDER, "--namespace", namespace, environment=environment)
+    started.wait_for_output(f"Detector {HOLDER} runs with 1 rules")
+    return started
+
+
+def live(found: list[Object]) -> list[Object]:
+    return [each for each in found if "endTime" not in each["spec"]]
+
+
+def test_a_detector_needs_all_the_rights_that_its_role_gives_and_no_more(
+    api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, endpoint: str
+) -> None:
+    roles = detector_roles(namespace, HOLDER)
+    put(api, roles)
+    account = control_plane.kubeconfig_of_service_account(namespace, NAME)
+    api.create(detector(zenoh={"mode": "peer", "listen": [endpoint]}))
+    api.create(close_vehicles())
+    with faulty_proxy(account) as (proxy, kubeconfig):
+        running = run_detector(processes, namespace, kubeconfig)
+        with Vehicles(endpoint) as vehicles:
+            vehicles.place(CARS, NEAR)
+            (task,) = api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="there is a task")
+            api.delete("ApplicationTask", task["metadata"]["name"])
+            api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="the task is there again")
+            vehicles.place(CARS, FAR)
+            api.wait_list("ApplicationTask", lambda found: bool(found) and not live(found), what="the task has ended")
+        renewed = api.get("Lease", f"wayside-{HOLDER}")["spec"]["renewTime"]
+        api.wait_for(
+            "Lease", f"wayside-{HOLDER}", lambda raw: raw["spec"]["renewTime"] != renewed, what="its Lease is renewed"
+        )
+        assert running.terminate() == 0
+        asked = set(used(proxy.seen, namespace))
+    assert asked <= granted(roles)
+    # `hold` is asked of the API server by the chart's policy; a task is read and deleted after a crash within a write.
+    seldom = {("applicationtasks", "get"), ("applicationtasks", "delete"), ("detectors", "hold")}
+    assert {(resource, verb) for _, resource, verb in granted(roles) - asked} <= seldom
+    assert "orbidden" not in running.output()
+
+
+def test_each_verb_of_its_own_role_is_granted_and_for_one_fewer_it_is_refused(
+    api: Api, namespace: str, control_plane: ControlPlane
+) -> None:
+    roles = detector_roles(namespace, HOLDER)
+    put(api, roles)
+    account = Api(control_plane.kubeconfig_of_service_account(namespace, NAME), namespace)
+
+    def lacks() -> list[tuple[str, str, str]]:
+        return sorted(
+            (right.group, right.resource, verb)
+            for right in detector_rights(HOLDER)
+            for verb in right.verbs
+            if not may(account, namespace, right.group, right.resource, verb, right.name)
+        )
+
+    wait_until(lacks, lambda found: not found, what="nothing lacks")
+    assert not may(account, namespace, "coordination.k8s.io", "leases", "update", "wayside-other")
+    assert not may(account, namespace, "wayside.dev", "detectors", "hold", "other")
+    for verb in sorted(granted(roles)):
+        put(api, without(roles, *verb))
+        wait_until(lacks, lambda found, verb=verb: found == [verb], what=f"{verb} lacks, and nothing else")
+
+
+def may(account: Api, namespace: str, group: str, resource: str, verb: str, name: str) -> bool:
+    about = {"group": group, "resource": resource, "verb": verb, "name": name, "namespace": namespace}
+    api_version = "authorization.k8s.io/v1"
+    kind = "SelfSubjectAccessReview"
+    asked = {"apiVersion": api_version, "kind": kind, "metadata": {}, "spec": {"resourceAttributes": about}}
+    return bool(account.create(asked)["status"]["allowed"])

@@ -1,0 +1,108 @@
+"""What does not become ready in time, on a real control plane: it is said, and the fallback serves until then."""
+
+from __future__ import annotations
+
+from application_manager.core.claims.claims import instance_name
+from tests.cluster.api import Api, Object
+from tests.cluster.managed_world import condition, end, start_manager, task, template, wait_settled
+from tests.cluster.pods import mark_pods_ready
+from tests.cluster.processes import Processes
+
+FULL, LITE = instance_name("app", "north"), instance_name("lite", "north")
+IN_TIME = {"linger": "1s", "readyTimeout": "2s"}
+
+
+def wait_accepted(api: Api, name: str, reason: str) -> Object:
+    return api.wait_for(
+        "ApplicationTask",
+        name,
+        lambda raw: condition(raw, "Accepted").get("reason") == reason,
+        what=f"Accepted of {name} has the reason {reason}",
+    )
+
+
+def wait_condition(api: Api, instance: str, type_: str, status: str) -> Object:
+    found = api.wait_for(
+        "ApplicationInstance",
+        instance,
+        lambda raw: condition(raw, type_).get("status") == status,
+        what=f"{type_} of {instance} is {status}",
+    )
+    return condition(found, type_)
+
+
+def become_ready(api: Api, instance: str) -> None:
+    api.wait_list("Pod", bool, labels=f"app={instance}", what=f"{instance} has a pod")
+    mark_pods_ready(api, f"app={instance}")
+
+
+def test_what_is_not_ready_in_time_says_so(api: Api, processes: Processes, namespace: str) -> None:
+    start_manager(processes, namespace)
+    api.create(template(lifecycle=IN_TIME))
+    api.create(task("north"))
+    told = api.wait_for(
+        "ApplicationTask",
+        "north",
+        lambda raw: condition(raw, "Ready").get("reason") == "ReadyTimeout",
+        what="the task says that its application was not ready in time",
+    )
+    assert f"instance {FULL} was not ready for 2s" in told["status"]["message"]
+    instance = api.get("ApplicationInstance", FULL)
+    assert "not ready for 2s: Deployment" in condition(instance, "Ready")["message"]
+    assert "not ready for 2s" in instance["status"]["message"]
+    become_ready(api, FULL)
+    api.wait_for(
+        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="it is served after all"
+    )
+    assert wait_condition(api, FULL, "TimedOut", "False")["reason"] == "InTime"
+
+
+def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    manager = start_manager(processes, namespace)
+    api.create(template("lite", lifecycle={"linger": "0s"}))
+    api.create(template(lifecycle={**IN_TIME, "fallback": {"template": "lite"}}))
+    api.create(task("north"))
+    fallen = wait_accepted(api, "north", "FallenBack")
+    assert fallen["status"]["instance"] == LITE
+    assert f"instance {FULL} is not ready: instance {LITE} of template lite serves" in fallen["status"]["message"]
+    become_ready(api, LITE)
+    api.wait_for("ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="the fallback serves")
+    assert LITE in wait_condition(api, FULL, "TimedOut", "True")["message"]
+    assert FULL in wait_condition(api, LITE, "StandsIn", "True")["message"]
+    wait_settled(api)
+
+    uid = api.get("ApplicationInstance", LITE)["metadata"]["uid"]
+    manager.kill9()
+    manager.start()
+    manager.wait_for_output("watching")
+    api.create(task("second", region="north"))
+    wait_accepted(api, "second", "FallenBack")
+    wait_settled(api)
+    assert api.get("ApplicationInstance", LITE)["metadata"]["uid"] == uid  # though it lingers for no time at all
+
+    become_ready(api, FULL)
+    manager.kill9()
+    manager.start()
+    assert wait_accepted(api, "north", "Accepted")["status"]["instance"] == FULL
+    wait_accepted(api, "second", "Accepted")
+    api.wait_gone("ApplicationInstance", LITE)
+    wait_settled(api)
+    end(api, "north")
+    end(api, "second")
+    api.wait_gone("ApplicationInstance", FULL)
+
+
+def test_a_fallback_that_cannot_serve_is_told_and_used_once_it_can(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    start_manager(processes, namespace)
+    api.create(template(lifecycle={**IN_TIME, "fallback": {"template": "lite"}}))
+    api.create(task("north"))
+    failed = wait_accepted(api, "north", "FallbackFailed")
+    assert "there is no ApplicationTemplate 'lite': create it" in failed["status"]["message"]
+    assert failed["status"]["instance"] == FULL
+    api.create(template("lite"))
+    assert wait_accepted(api, "north", "FallenBack")["status"]["instance"] == LITE
+    wait_settled(api)

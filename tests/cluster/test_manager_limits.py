@@ -1,0 +1,275 @@
+"""Limits on a real control plane: who runs, who waits, who gives way, and what each task is told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from application_manager.core.claims.claims import instance_name
+from tests.cluster.api import Api, Object
+from tests.cluster.managed_world import condition, end, start_manager, task, template, wait_settled
+from tests.cluster.processes import Processes
+from tests.cluster.repeating import repeated
+
+LOW, HIGH = (instance_name("app", each) for each in ("low", "high"))
+
+
+def wanting(name: str, priority: int = 0, **more: Any) -> Object:
+    made = task(name, **more)
+    made["spec"]["priority"] = priority
+    return made
+
+
+def limited(count: int, **lifecycle: str) -> Object:
+    return template(maxInstances=count, lifecycle={"linger": "1s", **lifecycle})
+
+
+def wait_task(api: Api, name: str, phase: str, reason: str = "Accepted") -> Object:
+    """Wait until the task has the phase, and Accepted the reason; return it."""
+    return api.wait_for(
+        "ApplicationTask",
+        name,
+        lambda raw: raw.get("status", {}).get("phase") == phase and condition(raw, "Accepted").get("reason") == reason,
+        what=f"{name} is {phase}, {reason}",
+    )
+
+
+@contextmanager
+def never_more_than(api: Api, count: int) -> Iterator[None]:
+    """Look all the time how many instances there are; fail in the end if there were ever more."""
+    most = 0
+
+    def look() -> None:
+        nonlocal most
+        most = max(most, len(api.list("ApplicationInstance")))
+
+    with repeated("counting", look, 0.02):
+        yield
+    assert 0 < most <= count
+
+
+def test_a_higher_priority_gets_the_place_of_a_lower_one_and_gives_it_back(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    manager = start_manager(processes, namespace)
+    api.create(limited(1))
+    api.create(wanting("low"))
+    wait_task(api, "low", "Active")
+    api.create(wanting("other"))
+    waiting = wait_task(api, "other", "Waiting", "LimitReached")
+    assert "template app is at its limit of 1 instance (spec.maxInstances)" in waiting["status"]["message"]
+    manager.kill9()
+    api.create(wanting("high", 5))
+    manager.start()
+    with never_more_than(api, 1):
+        gave = wait_task(api, "low", "Waiting", "Preempted")
+        assert f"gave way to instance {HIGH} (task high, priority 5)" in gave["status"]["message"]
+        got = wait_task(api, "high", "Active")
+        assert f"in place of instance {LOW} (task low, priority 0)" in condition(got, "Accepted")["message"]
+        wait_settled(api)
+        assert [each["metadata"]["name"] for each in api.list("ApplicationInstance")] == [HIGH]
+        manager.kill9()
+        manager.start()
+        end(api, "high")
+        wait_task(api, "low", "Active")
+        wait_settled(api)
+    assert condition(api.get("ApplicationTask", "other"), "Accepted")["reason"] == "LimitReached"
+    reasons = {each["reason"] for each in api.list("Event")}
+    assert {"Preempted", "LimitReached"} <= reasons
+
+
+def test_the_namespace_has_a_limit_over_all_templates(api: Api, processes: Processes, namespace: str) -> None:
+    start_manager(processes, namespace, "--max-instances", "2")
+    api.create(template())
+    api.create(template("map"))
+    with never_more_than(api, 2):
+        api.create(wanting("a"))
+        api.create(wanting("b", of="map"))
+        wait_task(api, "a", "Active")
+        wait_task(api, "b", "Active")
+        api.create(wanting("c", of="map"))
+        waiting = wait_task(api, "c", "Waiting", "LimitReached")
+        assert "the namespace is at its limit of 2 instances" in waiting["status"]["message"]
+        end(api, "a")  # of another template; what lingers yields
+        wait_task(api, "c", "Active")
+        wait_settled(api, limit=2)
+
+
+def test_nothing_is_preempted_before_its_minimum_uptime(api: Api, processes: Processes, namespace: str) -> None:
+    manager = start_manager(processes, namespace)
+    api.create(limited(1, minimumUptime="6h"))
+    api.create(wanting("low"))
+    wait_task(api, "low", "Active")
+    api.create(wanting("high", 5))
+    wait_task(api, "high", "Waiting", "LimitReached")
+    manager.kill9()
+    manager.start()
+    uid = api.get("ApplicationInstance", LOW)["metadata"]["uid"]
+    end(api, "low")  # nor is it released
+    released = api.wait_for(
+        "ApplicationInstance", LOW, lambda raw: "releaseTime" in raw["status"], what="it says when it goes"
+    )
+    assert released["metadata"]["uid"] == uid
+    wait_settled(api)
+    api.patch("ApplicationTemplate", "app", {"spec": {"lifecycle": {"minimumUptime": "0s"}}})
+    wait_task(api, "high", "Active")
+    wait_settled(api)
+
+
+def quota(hard: dict[str, str]) -> Object:
+    return {"apiVersion": "v1", "kind": "ResourceQuota", "metadata": {"name": "few"}, "spec": {"hard": hard}}
+
+
+def wait_enforced(api: Api) -> None:
+    api.wait_for("ResourceQuota", "few", lambda raw: bool(raw.get("status", {}).get("hard")), what="the quota holds")
+
+
+def test_an_object_beyond_the_quota_is_said_and_made_once_there_is_room(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    api.create(quota({"count/deployments.apps": "1"}))
+    wait_enforced(api)
+    manager = start_manager(processes, namespace)
+    api.create(template())
+    api.create(task("low"))
+    wait_task(api, "low", "Active")
+    api.create(task("high"))
+    told = api.wait_for(
+        "ApplicationTask",
+        "high",
+        lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
+        what="the task says that the quota is exceeded",
+    )
+    assert told["status"]["phase"] == "Pending"
+    assert f"Deployment {HIGH}" in told["status"]["message"]
+    assert "raise the ResourceQuota" in told["status"]["message"]
+    instance = api.get("ApplicationInstance", HIGH)
+    assert (condition(instance, "Applied")["reason"], instance["status"]["phase"]) == ("QuotaExceeded", "Failed")
+    api.patch("ResourceQuota", "few", {"spec": {"hard": {"count/deployments.apps": "2"}}})
+    wait_task(api, "high", "Active")
+    wait_settled(api)
+    assert manager.alive
+
+
+def test_an_instance_beyond_the_quota_is_told_to_its_tasks(api: Api, processes: Processes, namespace: str) -> None:
+    api.create(quota({"count/applicationinstances.wayside.dev": "1"}))
+    wait_enforced(api)
+    start_manager(processes, namespace)
+    api.create(template())
+    api.create(task("low"))
+    wait_task(api, "low", "Active")
+    api.create(task("high"))
+    told = api.wait_for(
+        "ApplicationTask",
+        "high",
+        lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
+        what="the task says that the quota is exceeded",
+    )
+    assert f"instance {HIGH} cannot be made" in told["status"]["message"]
+    assert told["status"]["phase"] == "Pending"
+    api.patch("ResourceQuota", "few", {"spec": {"hard": {"count/applicationinstances.wayside.dev": "2"}}})
+    wait_task(api, "high", "Active")
+    wait_settled(api)
+
+
+def test_pods_beyond_the_quota_are_told_to_the_tasks(api: Api, processes: Processes, namespace: str) -> None:
+    api.create(quota({"pods": "0"}))
+    wait_enforced(api)
+    start_manager(processes, namespace)
+    api.create(template())
+    api.create(task("low"))
+    told = api.wait_for(
+        "ApplicationTask",
+        "low",
+        lambda raw: condition(raw, "Ready").get("reason") == "QuotaExceeded",
+        what="the task's Ready says that pods are beyond the quota",
+    )
+    assert "pods are refused: forbidden: exceeded quota: few" in told["status"]["message"]
+    assert condition(api.get("ApplicationInstance", LOW), "Ready")["reason"] == "QuotaExceeded"
+
+
+def test_what_a_limit_range_refuses_is_told_as_well(api: Api, processes: Processes, namespace: str) -> None:
+    most = {"type": "PersistentVolumeClaim", "max": {"storage": "1Gi"}}
+    spec = {"limits": [most]}
+    api.create({"apiVersion": "v1", "kind": "LimitRange", "metadata": {"name": "small"}, "spec": spec})
+    start_manager(processes, namespace)
+    claim = {
+        "apiVersion": "v1",
+        "kind": "PersistentVolumeClaim",
+        "metadata": {"name": "${instance.name}"},
+        "spec": {"accessModes": ["ReadWriteOnce"], "resources": {"requests": {"storage": "2Gi"}}},
+    }
+    api.create(template(manifests=[claim]))
+    api.create(task("low"))
+    told = api.wait_for(
+        "ApplicationInstance",
+        LOW,
+        lambda raw: condition(raw, "Applied").get("reason") == "AdmissionRefused",
+        what="the instance says that the claim is not admitted",
+    )
+    assert "maximum storage usage per PersistentVolumeClaim is 1Gi" in told["status"]["message"]
+    api.patch("LimitRange", "small", {"spec": {"limits": [{**most, "max": {"storage": "2Gi"}}]}})
+    api.wait_for("PersistentVolumeClaim", LOW, lambda raw: True, what="the claim is made")
+
+
+def test_a_limit_that_is_lowered_and_raised_stops_and_starts_the_last(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    start_manager(processes, namespace)
+    api.create(limited(3))
+    for priority, name in enumerate(("low", "other", "high")):
+        api.create(wanting(name, priority))
+        wait_task(api, name, "Active")
+    api.patch("ApplicationTemplate", "app", {"spec": {"maxInstances": 2}})
+    wait_task(api, "low", "Waiting", "Preempted")
+    api.wait_gone("ApplicationInstance", LOW)
+    wait_settled(api)
+    api.patch("ApplicationTemplate", "app", {"spec": {"maxInstances": None}})
+    wait_task(api, "low", "Active")
+    wait_settled(api)
+
+
+@pytest.mark.parametrize("kind", ["StatefulSet", "Job"])
+def test_pods_that_only_events_tell_are_refused_are_said_and_made_once_there_is_room(
+    kind: str, api: Api, processes: Processes, namespace: str
+) -> None:
+    api.create(quota({"pods": "0"}))
+    wait_enforced(api)
+    start_manager(processes, namespace)
+    api.create(template(manifests=[workload(kind)]))
+    api.create(task("low"))
+    told = api.wait_for(
+        "ApplicationTask",
+        "low",
+        lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
+        what="the task says that the quota is exceeded",
+    )
+    assert told["status"]["phase"] == "Active"
+    ready = condition(api.get("ApplicationInstance", LOW), "Ready")
+    assert (ready["status"], ready["reason"]) == ("False", "QuotaExceeded")
+    assert 'pods "' not in ready["message"]  # the name is another one each time
+    api.patch("ResourceQuota", "few", {"spec": {"hard": {"pods": "2"}}})
+    api.patch(kind, LOW, {"metadata": {"annotations": {"looked-at": "again"}}})  # a controller looks at what changes
+    api.wait_for(
+        "ApplicationInstance",
+        LOW,
+        lambda raw: condition(raw, "Ready")["reason"] != "QuotaExceeded",
+        what="it is not said any more",
+    )
+    assert api.list("Pod") != []
+
+
+def workload(kind: str) -> Object:
+    """One of that kind, with one pod."""
+    pod: Object = {"spec": {"containers": [{"name": "main", "image": "app:1"}]}}
+    made: Object = {"kind": kind, "metadata": {"name": "${instance.name}"}}
+    if kind == "Job":
+        pod["spec"]["restartPolicy"] = "Never"
+        return {"apiVersion": "batch/v1", **made, "spec": {"template": pod}}
+    labels = {"app": "${instance.name}"}
+    pod["metadata"] = {"labels": labels}
+    spec = {"serviceName": "none", "selector": {"matchLabels": labels}, "template": pod}
+    return {"apiVersion": "apps/v1", **made, "spec": spec}

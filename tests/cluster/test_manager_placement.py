@@ -1,0 +1,136 @@
+"""Applications bound to nodes by their parameters, with a real scheduler; the nodes are objects without a kubelet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from application_manager.core.claims.claims import instance_name
+from tests.cluster.api import Api, Object
+from tests.cluster.binaries import ensure_binaries
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.managed_world import condition, deployment, start_manager, task, template, wait_settled
+from tests.cluster.processes import Processes
+
+SCHEDULER = "wayside-test"  # that of these tests only: no other pod is bound to their nodes
+CONFIGURATION = """
+apiVersion: kubescheduler.config.k8s.io/v1
+kind: KubeSchedulerConfiguration
+leaderElection: {leaderElect: false}
+clientConnection: {kubeconfig: "%s"}
+profiles: [{schedulerName: %s}]
+"""
+
+
+@pytest.fixture
+def scheduler(control_plane: ControlPlane, processes: Processes) -> None:
+    """A real kube-scheduler, for pods that ask for it by name."""
+    file = processes.folder / "scheduler.yaml"
+    file.write_text(CONFIGURATION % (control_plane.kubeconfig, SCHEDULER))
+    program = str(ensure_binaries().kube_scheduler)
+    processes.start(program, f"--config={file}", "--secure-port=0")
+
+
+@pytest.fixture
+def nodes(api: Api) -> Iterator[list[str]]:
+    """The nodes of two roadside units; the second takes only what tolerates it."""
+    names = [f"{each}-{api.namespace}"[:63] for each in ("rsu-1", "rsu-2")]
+    for name, site in zip(names, ("north", "south"), strict=True):
+        node(api, name, site, taints=[{"key": "edge", "effect": "NoSchedule"}] if site == "south" else [])
+    yield names
+    for name in names:
+        api.delete("Node", name)
+
+
+def node(api: Api, name: str, site: str, taints: list[Object]) -> None:
+    labels = {"kubernetes.io/hostname": name, f"site-{api.namespace}": site}
+    api.create(
+        {"apiVersion": "v1", "kind": "Node", "metadata": {"name": name, "labels": labels}, "spec": {"taints": taints}}
+    )
+    api.patch("Node", name, {"spec": {"taints": taints}})  # without the one that each new node gets: it is not ready
+    room = {"cpu": "4", "memory": "8Gi", "pods": "50"}
+    api.patch("Node", name, {"status": {"capacity": room, "allocatable": room}}, subresource="status")
+
+
+def placed(**pod: object) -> Object:
+    """A template whose pods go where the parameters say."""
+    made = deployment()
+    made["spec"]["template"]["spec"] |= {"schedulerName": SCHEDULER, **pod}
+    parameters = {
+        "region": {"type": "string", "required": True},
+        "node": {"type": "string"},
+        "tolerate": {"type": "string", "default": "nothing", "merge": "HighestPriority"},
+    }
+    return template(parameters=parameters, manifests=[made])
+
+
+def wait_bound(api: Api, region: str, node_name: str) -> None:
+    api.wait_list(
+        "Pod",
+        lambda found: node_name in [each["spec"].get("nodeName") for each in found],
+        labels=f"app={instance_name('app', region)}",
+        what=f"a pod of {region} is on {node_name}",
+    )
+
+
+def wait_told(api: Api, name: str, *parts: str) -> Object:
+    return api.wait_for(
+        "ApplicationTask",
+        name,
+        lambda raw: (
+            condition(raw, "Ready").get("reason") == "Unschedulable"
+            and all(part in raw["status"].get("message", "") for part in parts)
+        ),
+        what=f"{name} says {parts}",
+    )
+
+
+@pytest.mark.usefixtures("scheduler")
+def test_the_node_that_a_task_names_gets_the_application_and_one_that_is_not_there_is_told(
+    api: Api, processes: Processes, namespace: str, nodes: list[str]
+) -> None:
+    start_manager(processes, namespace)
+    api.create(placed(nodeSelector={"kubernetes.io/hostname": "${parameters.node}"}))
+    api.create(task("north", node=nodes[0]))
+    wait_bound(api, "north", nodes[0])
+    api.create(task("west", node="rsu-9"))
+    named = "fits no node: nodeSelector: no node has the label kubernetes.io/hostname=rsu-9"
+    told = wait_told(api, "west", named, "no node takes the pod")
+    assert nodes[0] in told["status"]["message"]  # what there is instead
+    instance = api.get("ApplicationInstance", instance_name("app", "west"))
+    assert condition(instance, "Ready")["reason"] == "Unschedulable"
+    api.patch("ApplicationTask", "west", {"spec": {"parameters": {"node": nodes[0]}}})
+    wait_bound(api, "west", nodes[0])
+    wait_settled(api)
+
+
+@pytest.mark.usefixtures("scheduler")
+def test_affinity_and_tolerations_come_from_parameters_too(
+    api: Api, processes: Processes, namespace: str, nodes: list[str]
+) -> None:
+    start_manager(processes, namespace)
+    at_site = {"key": f"site-{namespace}", "operator": "In", "values": ["${parameters.region}"]}
+    required = {"nodeSelectorTerms": [{"matchExpressions": [at_site]}]}
+    affinity = {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": required}}
+    api.create(placed(affinity=affinity, tolerations=[{"key": "${parameters.tolerate}", "operator": "Exists"}]))
+    api.create(task("south"))
+    wait_told(api, "south", "no node takes the pod", "untolerated taint")  # of what fits, the scheduler speaks
+    api.create(task("more", region="south", tolerate="edge"))
+    wait_bound(api, "south", nodes[1])
+    api.create(task("west"))
+    wait_told(api, "west", f"no node has the label site-{namespace}=west (there are north, south)")
+    node(api, f"rsu-3-{namespace}"[:63], "west", taints=[])
+    try:
+        wait_bound(api, "west", f"rsu-3-{namespace}"[:63])
+    finally:
+        api.delete("Node", f"rsu-3-{namespace}"[:63])
+
+
+def test_a_node_name_that_is_not_there_is_told_though_no_scheduler_looks(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    start_manager(processes, namespace)
+    api.create(placed(nodeName="${parameters.node}"))
+    api.create(task("north", node="rsu-9"))
+    wait_told(api, "north", "nodeName: there is no node rsu-9")

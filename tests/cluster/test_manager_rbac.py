@@ -1,0 +1,261 @@
+"""The manager lives on exactly the rights that `application-manager rbac` prints, and says which one it lacks."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import os
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+import yaml
+
+from application_manager.cluster.client import Client
+from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.entitlement import lacking
+from application_manager.core.claims.claims import instance_name
+from application_manager.core.objects.policy import DEFAULT_PLURALS, Policy
+from application_manager.core.objects.rights import lease_rights, rights, roles
+from tests.cluster.api import Api, Object
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.faulty_proxy import Seen, faulty_proxy
+from tests.cluster.managed_world import condition, config, deployment, end, start_manager, task, template, wait_settled
+from tests.cluster.manifests import DETECTOR, EVENT_RULE
+from tests.cluster.processes import BIN, Processes
+from tests.cluster.waiting import wait_until
+
+KINDS = ("apps/v1/Deployment", "v1/ConfigMap")
+ALLOWED = [word for each in KINDS for word in ("--allowed-kinds", each)]
+PLURALS = {key: DEFAULT_PLURALS[key] for key in Policy.parse(list(KINDS), None).kinds}
+NORTH = instance_name("app", "north")
+
+Verb = tuple[str, str, str]
+"""Group, resource and verb."""
+
+
+def printed(*arguments: str) -> list[Object]:
+    """What the command prints, without any cluster at hand."""
+    command = [str(BIN / "application-manager"), "rbac", *arguments]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, env=os.environ | {"KUBECONFIG": "/nonexistent"}
+    )
+    return list(yaml.safe_load_all(done.stdout))
+
+
+@pytest.fixture
+def account(api: Api, namespace: str, control_plane: ControlPlane) -> Path:
+    """A kubeconfig for an account without any rights of its own."""
+    api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
+    return control_plane.kubeconfig_of_service_account(namespace, "manager")
+
+
+def without(manifests: list[Object], group: str, resource: str, verb: str) -> list[Object]:
+    """The same roles, with one verb on one resource fewer, in all of them."""
+    found = copy.deepcopy(manifests)
+    for role in found:
+        split = []
+        for rule in role.get("rules", []):
+            if group in rule["apiGroups"] and resource in rule["resources"] and verb in rule["verbs"]:
+                rest = [each for each in rule["resources"] if each != resource]
+                fewer = [each for each in rule["verbs"] if each != verb]
+                split += [rule | {"resources": rest}] if rest else []
+                split += [rule | {"resources": [resource], "verbs": fewer}] if fewer else []
+            else:
+                split.append(rule)
+        if "rules" in role:
+            role["rules"] = split
+    return found
+
+
+def put(api: Api, manifests: list[Object]) -> None:
+    for each in manifests:
+        api.apply(each)
+
+
+def used(seen: list[Seen], namespace: str) -> Iterator[Verb]:
+    """What the requests of a manager asked for, in RBAC's words."""
+    for each in seen:
+        parts = urlsplit(each.path)
+        found = re.fullmatch(
+            rf"/apis?/(?:(.+)/)?v\w+/namespaces/{namespace}/([^/]+)(?:/([^/]+)(?:/([^/]+))?)?", parts.path
+        )
+        if found is None:
+            continue
+        group, resource, name, subresource = found[1] or "", found[2], found[3], found[4]
+        looking = "watch" if "watch=true" in parts.query else "get" if name else "list"
+        verb = {"GET": looking, "POST": "create", "PUT": "update", "PATCH": "patch", "DELETE": "delete"}[each.method]
+        yield group, f"{resource}/{subresource}" if subresource else resource, verb
+
+
+def granted(manifests: list[Object]) -> set[Verb]:
+    return {
+        (group, resource, verb)
+        for role in manifests
+        for rule in role.get("rules", [])
+        for group in rule["apiGroups"]
+        for resource in rule["resources"]
+        for verb in rule["verbs"]
+    }
+
+
+def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
+    api: Api, processes: Processes, namespace: str, account: Path, kubelet: None
+) -> None:
+    manifests = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
+    put(api, manifests)
+    with faulty_proxy(account) as (proxy, kubeconfig):
+        manager = start_manager(
+            processes, namespace, *ALLOWED, "--ttl-after-finished", "2s", "--resync", "2s", kubeconfig=kubeconfig
+        )
+        api.create(
+            template(
+                linger="1s",
+                configuration={"app.json": {"x": "${parameters.region}"}},
+                manifests=[mounted(), config({"a": "b"}), deployment(name="${instance.name}-extra")],
+            )
+        )
+        api.create(task("held", region="north", holder="town"))
+        api.create(task("north"))
+        api.create(task("wrong", of="nowhere"))
+        api.wait_for("Deployment", NORTH, lambda raw: raw.get("status", {}).get("readyReplicas") == 1, what="it runs")
+        wait_settled(api)
+        pods = api.list("Pod")
+        assert pods
+        stop = task("stop", region="north")
+        api.create(stop | {"spec": stop["spec"] | {"operation": "Suspend"}})
+        api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 0, what="it is suspended")
+        end(api, "stop")
+        api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is resumed")
+        api.patch("ApplicationTemplate", "app", {"spec": {"configuration": {"app.json": {"x": "new"}}}})
+        wait_until(
+            lambda: [each["metadata"].get("annotations", {}) for each in api.list("Pod")],
+            lambda found: any("wayside.dev/configuration" in each for each in found),
+            what="a pod is told of its configuration",
+        )
+        api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [mounted()]}})
+        api.wait_gone("ConfigMap", f"{NORTH}-config")
+        api.wait_gone("Deployment", f"{NORTH}-extra")
+        for each in (DETECTOR, EVENT_RULE):
+            api.create(each)
+            judged = each["metadata"]["name"]
+            api.wait_for(each["kind"], judged, lambda raw: bool(raw.get("status")), what=f"{judged} is judged")
+        for name in ("held", "north", "wrong"):
+            end(api, name)
+        api.wait_gone("Deployment", NORTH)
+        api.wait_list("ApplicationTask", lambda found: not found, what="finished tasks are deleted")
+        wait_until(
+            lambda: set(used(proxy.seen, namespace)),
+            lambda found: ("events.k8s.io", "events", "create") in found,
+            what="what happened is told",
+        )
+        assert manager.terminate() == 0
+    assert "orbidden" not in manager.output()
+    assert "may not" not in manager.output()
+    asked = set(used(proxy.seen, namespace))
+    for group, resource, verb in [*asked]:
+        if verb == "patch" and resource in ("applicationinstances", "deployments", "configmaps"):
+            asked.add((group, resource, "create"))  # an apply of what is not there yet needs both
+    never = {("coordination.k8s.io", "leases", "get")} if "/leases/wayside-" not in str(proxy.seen) else set()
+    instance_after_a_failure = {("wayside.dev", "applicationinstances", "get")}
+    assert granted(manifests) - asked - never <= instance_after_a_failure
+    assert asked <= granted(manifests)
+
+
+def test_it_lives_on_a_cluster_role(
+    api: Api, processes: Processes, namespace: str, account: Path, control_plane: ControlPlane
+) -> None:
+    manifests = printed("--account", f"{namespace}/manager", "--name", namespace, *ALLOWED)
+    put(api, manifests)
+    try:
+        lease = ["--lease", f"{namespace}/application-manager"]
+        manager = start_manager(processes, None, *ALLOWED, *lease, kubeconfig=account)
+        manager.wait_for_output("active: holds the Lease")
+        api.create(template())
+        api.create(task("north"))
+        api.wait_for("Deployment", NORTH, lambda _: True, what="it is served")
+        wait_settled(api)
+        assert manager.terminate() == 0
+        assert "orbidden" not in manager.output()
+    finally:
+        for kind in ("ClusterRoleBinding", "ClusterRole"):
+            api.delete(kind, namespace)
+
+
+def test_each_verb_that_lacks_is_noticed(
+    api: Api, namespace: str, account: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("KUBECONFIG", str(account))
+    needed = rights(PLURALS)
+    whole = roles(PLURALS, [namespace], (namespace, "application-manager"), (namespace, "manager"))
+
+    def lacks() -> list[Verb]:
+        async def ask() -> list[Verb]:
+            client = Client(await load_configuration())
+            try:
+                found = await lacking(client, needed, [namespace])
+                found += await lacking(client, lease_rights("application-manager"), [namespace])
+            finally:
+                await client.close()
+            return sorted({(right.group, right.resource, verb) for right, verb, _ in found})
+
+        return asyncio.run(ask())
+
+    put(api, whole)
+    wait_until(lacks, lambda found: not found, what="nothing lacks")
+    for verb in sorted(granted(whole)):
+        put(api, without(whole, *verb))
+        wait_until(lacks, lambda found, verb=verb: found == [verb], what=f"{verb} lacks, and nothing else")
+
+
+def test_what_nothing_works_without_ends_the_start_with_one_line(
+    api: Api, processes: Processes, namespace: str, account: Path
+) -> None:
+    whole = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
+    put(api, without(whole, "wayside.dev", "applicationtasks", "watch"))
+    environment = {"KUBECONFIG": str(account)}
+    manager = processes.start("application-manager", "run", "--namespace", namespace, *ALLOWED, environment=environment)
+    assert manager.wait() == 2
+    said = f"its account may not watch applicationtasks of wayside.dev in namespace {namespace}: nothing can be decided"
+    assert said in manager.output()
+    assert "grant what `application-manager rbac` prints" in manager.output()
+
+
+def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
+    api: Api, processes: Processes, namespace: str, account: Path
+) -> None:
+    whole = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
+    put(api, without(whole, "", "configmaps", "patch"))
+    manager = start_manager(processes, namespace, *ALLOWED, kubeconfig=account)
+    assert (
+        f"its account may not patch configmaps in namespace {namespace}: no ConfigMap of a template" in manager.output()
+    )
+    api.create(template("other"))
+    api.create(template(manifests=[deployment(), config({"a": "b"})]))
+    api.create(task("north"))
+    api.create(task("south", of="other"))
+    told = api.wait_for(
+        "ApplicationInstance",
+        NORTH,
+        lambda raw: condition(raw, "Applied").get("reason") == "ApplyRefused",
+        what="the instance says what lacks",
+    )
+    message = condition(told, "Applied")["message"]
+    assert 'cannot patch resource "configmaps"' in message
+    assert "grant what `application-manager rbac` prints" in message
+    api.wait_for("Deployment", instance_name("other", "south"), lambda _: True, what="others are served")
+    put(api, whole)
+    api.wait_for("ConfigMap", f"{NORTH}-config", lambda _: True, what="with the right it is made")
+    wait_settled(api)
+
+
+def mounted() -> Object:
+    """A Deployment that mounts its configuration."""
+    made = deployment()
+    pod = made["spec"]["template"]["spec"]
+    pod["volumes"] = [{"name": "configuration", "configMap": {"name": "${instance.configMap}"}}]
+    pod["containers"][0]["volumeMounts"] = [{"name": "configuration", "mountPath": "/configuration"}]
+    return made

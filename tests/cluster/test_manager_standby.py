@@ -1,0 +1,213 @@
+"""Of two managers one acts, and the other takes over only once the first has stopped, however it stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from application_manager.core.claims.claims import instance_name
+from tests.cluster.api import Api
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.faulty_proxy import Proxy, faulty_proxy
+from tests.cluster.managed_world import end, start_manager, task, template, wait_settled
+from tests.cluster.processes import Process, Processes
+from tests.cluster.test_manager_metrics import get, scraped
+from tests.cluster.waiting import wait_until
+from tests.ports import free_ports
+
+ACTIVE = r"active: holds the Lease"
+REGIONS = [f"r{index}" for index in range(30)]
+WAITING = {"232", "281", "22"}
+"""The numbers of epoll_wait and epoll_pwait (x86-64), and epoll_pwait (arm64)."""
+
+
+@dataclass
+class Pair:
+    """An active manager and its standby, each with a network of its own and a port for its pages."""
+
+    active: Process
+    standby: Process
+    old: Proxy
+    new: Proxy
+    ports: list[int]
+
+    def taken_over(self) -> None:
+        """Wait until the standby acts."""
+        self.standby.wait_for_output(ACTIVE)
+
+    def never_both(self) -> None:
+        """The new one began to write only after the last write of the old one was sent."""
+        began = min(each.at for each in self.new.writes())
+        assert [each for each in self.old.writes() if each.at >= began] == []
+
+
+@pytest.fixture
+def pair(processes: Processes, namespace: str, control_plane: ControlPlane) -> Iterator[Pair]:
+    ports = free_ports(2)
+    with ExitStack() as stack:
+        (old, first), (new, second) = (stack.enter_context(faulty_proxy(control_plane.kubeconfig)) for _ in range(2))
+        active = start_manager(processes, namespace, "--metrics-port", str(ports[0]), kubeconfig=first)
+        active.wait_for_output(ACTIVE)
+        standby = start_manager(processes, namespace, "--metrics-port", str(ports[1]), kubeconfig=second)
+        standby.wait_for_output("standby: manager_")
+        yield Pair(active, standby, old, new, ports)
+        processes.kill_all()
+
+
+def demanded(api: Api) -> None:
+    """Give the active manager work, and return while it is at it."""
+    api.create(template())
+    for region in REGIONS:
+        api.create(task(region))
+    api.wait_list("Deployment", lambda found: len(found) >= 5, what="the manager is in the middle of it")
+
+
+def uids(api: Api) -> dict[str, str]:
+    return {each["metadata"]["name"]: each["metadata"]["uid"] for each in api.list("Deployment")}
+
+
+def killed(pair: Pair) -> None:
+    pair.active.kill9()
+
+
+def stopped(pair: Pair) -> None:
+    """Stop the active one while its requests are under way and it waits for answers.
+
+    Between its last look at whether it may still write and the system call that writes, nothing can hold it back (it is
+    said in application_manager/cluster/fence.py): a stop within these microseconds would show nothing but that.
+    """
+    wait_until(lambda: stopped_in(pair.active.pid), lambda call: call in WAITING, what="it is stopped while it waits")
+
+
+def stopped_in(pid: int) -> str:
+    """Stop the process: the number of the system call that it is in, or -1. In no waiting one, it goes on for now."""
+    os.kill(pid, signal.SIGSTOP)
+    status = Path(f"/proc/{pid}/status")
+    wait_until(status.read_text, lambda text: "State:\tT" in text, what="the process is stopped")
+    call = Path(f"/proc/{pid}/syscall").read_text().split()[0]
+    if call not in WAITING:
+        os.kill(pid, signal.SIGCONT)
+    return call
+
+
+def cut_off(pair: Pair) -> None:
+    pair.old.cut = True
+
+
+def terminated(pair: Pair) -> None:
+    assert pair.active.terminate() == 0
+
+
+@pytest.mark.parametrize("how", [killed, stopped, cut_off, terminated])
+def test_the_standby_takes_over_what_the_other_was_doing(how: Callable[[Pair], None], api: Api, pair: Pair) -> None:
+    demanded(api)
+    how(pair)
+    before = uids(api)
+    api.create(task("late"))
+    end(api, REGIONS[0])
+    pair.taken_over()
+    wait_settled(api)
+    api.wait_list("Deployment", lambda found: len(found) == len(REGIONS), what="what is demanded runs, and no more")
+    after = uids(api)
+    assert {name: uid for name, uid in before.items() if after.get(name, uid) != uid} == {}, "nothing was made twice"
+    pair.never_both()
+    how_often = api.get("Lease", "application-manager")["spec"]["leaseTransitions"]
+    assert how_often == 1
+
+
+def test_one_that_stood_still_writes_nothing_when_it_goes_on(api: Api, pair: Pair) -> None:
+    demanded(api)
+    stopped(pair)
+    pair.taken_over()
+    for region in REGIONS:
+        end(api, region)
+    os.kill(pair.active.pid, signal.SIGCONT)
+    pair.active.wait_for_output("not active any more|standby: manager_")
+    api.wait_list("Deployment", lambda found: not found, what="nothing runs that nobody demands")
+    wait_settled(api)
+    wait_until(
+        lambda: get(pair.ports[0], "/readyz")[1], lambda said: said.startswith("ok, standby: "), what="a standby"
+    )
+    pair.never_both()
+    # And it can take over in turn, with what it has seen meanwhile.
+    api.create(task("late"))
+    api.wait_list("Deployment", lambda found: len(found) == 1, what="the other serves it")
+    pair.standby.kill9()
+    end(api, "late")
+    api.create(task("later"))
+    pair.active.wait_for_output(rf"(?s)(not active any more|standby: ).*{ACTIVE}")
+    only = [instance_name("app", "later")]
+    api.wait_list("Deployment", lambda found: [each["metadata"]["name"] for each in found] == only, what="only later")
+    wait_settled(api)
+
+
+def test_one_that_was_cut_off_comes_back_as_a_standby(api: Api, pair: Pair) -> None:
+    demanded(api)
+    pair.old.cut = True
+    pair.taken_over()
+    pair.active.wait_for_output("not active any more")
+    pair.old.cut = False
+    pair.active.wait_for_output("standby: manager_")
+    api.create(task("late"))
+    wait_settled(api)
+    pair.never_both()
+
+
+def test_one_that_is_cut_off_ends_when_it_is_told_to(api: Api, pair: Pair) -> None:
+    demanded(api)
+    pair.old.cut = True
+    assert pair.active.terminate() == 0
+    pair.taken_over()
+    wait_settled(api)
+    pair.never_both()
+
+
+def test_who_is_active_shows(api: Api, pair: Pair) -> None:
+    holder = api.get("Lease", "application-manager")["spec"]["holderIdentity"]
+    assert [scraped(port)["active",] for port in pair.ports] == [1, 0]
+    wait_until(lambda: get(pair.ports[0], "/readyz"), lambda found: found == (200, "ok\n"), what="one is active")
+    said = (200, f"ok, standby: {holder} is active\n")
+    wait_until(lambda: get(pair.ports[1], "/readyz"), lambda found: found == said, what="the other stands by")
+
+
+def test_a_manager_that_ends_releases_the_lease(api: Api, processes: Processes, namespace: str) -> None:
+    manager = start_manager(processes, namespace)
+    manager.wait_for_output(ACTIVE)
+    assert manager.terminate() == 0
+    assert "holderIdentity" not in api.get("Lease", "application-manager")["spec"]
+
+
+def test_a_standby_that_ends_leaves_the_lease_alone(api: Api, pair: Pair) -> None:
+    before = api.get("Lease", "application-manager")["spec"]["holderIdentity"]
+    assert pair.standby.terminate() == 0
+    assert api.get("Lease", "application-manager")["spec"]["holderIdentity"] == before
+
+
+def test_a_lease_deleted_by_hand_comes_back(api: Api, processes: Processes, namespace: str) -> None:
+    manager = start_manager(processes, namespace)
+    manager.wait_for_output(ACTIVE)
+    uid = api.get("Lease", "application-manager")["metadata"]["uid"]
+    api.delete("Lease", "application-manager")
+    api.wait_for("Lease", "application-manager", lambda raw: raw["metadata"]["uid"] != uid, what="it is there again")
+    api.create(template())
+    api.create(task("north"))
+    wait_settled(api)
+
+
+def test_what_is_under_way_at_the_end_is_finished_or_made_good(api: Api, pair: Pair) -> None:
+    pair.old.slow = 0.3
+    demanded(api)
+    began = time.monotonic()
+    assert pair.active.terminate(patience=60) == 0
+    late = [each for each in pair.old.writes() if each.at > began and not each.status]
+    assert late == [], "every write that was sent after the signal was answered"
+    pair.taken_over()
+    wait_settled(api)
+    pair.never_both()

@@ -1,0 +1,96 @@
+"""A loaded API server gets no more than it can take: few requests at once, and none while it wants to be left alone."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from application_manager.cluster.pacing import AT_ONCE
+from tests.cluster.api import Api
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.faulty_proxy import Seen, faulty_proxy
+from tests.cluster.managed_world import start_manager, task, template, wait_settled
+from tests.cluster.processes import Processes
+from tests.cluster.waiting import wait_until
+
+WATCHERS = 8  # requests of watches that (re)list, and those about the Lease: apart from the bound
+
+
+def test_a_burst_of_a_thousand_tasks_is_worked_off_with_few_requests_at_once(
+    api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
+) -> None:
+    with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
+        start_manager(processes, namespace, kubeconfig=kubeconfig)
+        api.create(template())
+        proxy.most, proxy.slow = 0, 0.02  # slow enough that all that may run at once does
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(api.create, (task(f"t{index}", region=f"r{index % 20}") for index in range(1000))))
+        accepted = wait_until(
+            lambda: [each for each in api.list("ApplicationTask") if each.get("status", {}).get("phase")],
+            lambda found: len(found) == 1000,
+            timeout=300,
+            what="all tasks are answered",
+        )
+        assert {each["status"]["phase"] for each in accepted} == {"Active"}
+        assert proxy.most <= AT_ONCE + WATCHERS
+        proxy.slow = 0
+        wait_settled(api)
+
+
+@pytest.mark.parametrize("code", [429, 503])
+def test_nothing_is_asked_before_the_time_that_the_api_server_gave_is_over(
+    code: int, api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
+) -> None:
+    with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
+        manager = start_manager(processes, namespace, kubeconfig=kubeconfig)
+        manager.wait_for_output("active: holds the Lease")
+        api.create(template())
+        once = itertools.count()
+
+        def refuse(method: str, path: str) -> tuple[int, int] | None:
+            return (code, 3) if method == "PATCH" and "/deployments/" in path and next(once) == 0 else None
+
+        proxy.refuse = refuse
+        for index in range(10):
+            api.create(task(f"t{index}"))
+        api.wait_list("Deployment", lambda found: len(found) == 10, what="all is served in the end")
+        wait_settled(api)
+        (refused,) = (each for each in proxy.seen if each.status == code)
+        under_way = 0.5  # s: what was sent before the answer had arrived
+        own = [each for each in proxy.seen if "/leases" not in each.path and not watches(each)]
+        early = [each for each in own if refused.at + under_way < each.at < refused.at + 3]
+        assert early == []
+        assert [each for each in own if each.at >= refused.at + 3]
+        assert "Traceback" not in manager.output()
+
+
+def test_an_api_server_that_refuses_everything_for_a_while_is_waited_for(
+    api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
+) -> None:
+    with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
+        manager = start_manager(processes, namespace, kubeconfig=kubeconfig)
+        manager.wait_for_output("active: holds the Lease")
+        api.create(template())
+        api.create(task("north"))
+        wait_settled(api)
+        proxy.refuse = lambda method, path: (429, 1) if "/leases" not in path else None
+        began = time.monotonic()
+        for index in range(20):
+            api.create(task(f"t{index}"))
+        wait_until(
+            lambda: [each for each in proxy.seen if each.status == 429], lambda found: len(found) > 3, what="refused"
+        )
+        asked = [each for each in proxy.seen if each.at > began and each.status == 429]
+        proxy.refuse = lambda method, path: None
+        assert len(asked) < 200, "it does not storm"
+        api.wait_list("Deployment", lambda found: len(found) == 21, what="all is served in the end")
+        wait_settled(api)
+        assert manager.alive
+
+
+def watches(seen: Seen) -> bool:
+    """Whether the request is kopf's: a watch, or the list before it, which it begins anew when it likes."""
+    return "watch=true" in seen.path or "/namespaces/" not in seen.path

@@ -1,0 +1,22 @@
+"""What docs/tutorial.md shows is what a run prints: names that chance gives, times and ages made uniform."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from tests.cluster.api import Api
+from tests.cluster.controlplane import ControlPlane
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "cooperative-recording"))
+
+from tutorial import GUIDE, blocks, play, staged
+
+
+def test_the_tutorial_shows_what_a_run_prints(control_plane: ControlPlane, api: Api, tmp_path: Path) -> None:
+    shown = blocks(GUIDE.read_text(encoding="utf-8"))
+    with staged(api, control_plane.binaries.kubectl, tmp_path) as stage:
+        printed = play(stage)
+    assert len(printed) == len(shown)
+    for step, (expected, found) in enumerate(zip(shown, printed, strict=True)):
+        assert found == expected, f"step {step}: write it anew with examples/cooperative-recording/tutorial.py --write"

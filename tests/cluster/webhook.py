@@ -1,0 +1,125 @@
+"""The webhook in tests: a manager with a certificate, and an API server that asks it about one namespace."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from application_manager.admission.authority import make_certificates
+from application_manager.core.findings.webhooks import Place, injection_configuration, webhook_configuration
+from tests.cluster.api import Api, ApiError, Object
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.managed_world import config, start_manager, template
+from tests.cluster.processes import BIN, Process, Processes
+from tests.cluster.waiting import wait_until
+from tests.ports import free_port
+
+
+class Webhook:
+    """Started with its certificate, and not asked yet.
+
+    Attributes:
+        port: of the manager.
+        folder: with ca.crt, tls.crt and tls.key.
+        manager: the process.
+    """
+
+    def __init__(
+        self,
+        processes: Processes,
+        api: Api,
+        folder: Path,
+        patience: int = 30,
+        options: Sequence[str] = (),
+        kubeconfig: Path | None = None,
+    ) -> None:
+        """Start.
+
+        Args:
+            processes: start the manager.
+            api: for the namespace.
+            folder: for the certificates.
+            patience: seconds that the API server waits; by default so long that a slow machine is no test's fault.
+            options: more of the manager; with --detector-image the API server also asks about pods.
+            kubeconfig: the manager's account; by default the administrator's.
+        """
+        self._patience = patience
+        self._sidecars = "--detector-image" in options
+        self.port = free_port()
+        self.folder = folder
+        self.name = f"wayside-{secrets.token_hex(3)}"
+        self._api = api
+        self.configuration = self.certified()
+        self.options = (*options, "--admission-port", str(self.port), "--admission-certificates", str(folder))
+        self.manager: Process = start_manager(processes, api.namespace, *self.options, kubeconfig=kubeconfig)
+
+    def certified(self) -> Object:
+        """Make new certificates, and return the configuration that trusts them."""
+        place = Place.of_url(f"https://127.0.0.1:{self.port}")
+        authority = make_certificates(self.folder, place.hosts)
+        self.injection = injection_configuration(place, authority, [self._api.namespace], self.name)
+        made = webhook_configuration(place, authority, [self._api.namespace], self.name)
+        for each in (made, self.injection):
+            each["webhooks"][0]["timeoutSeconds"] = self._patience
+        return made
+
+    @contextmanager
+    def asked(self) -> Iterator[None]:
+        """Have the API server ask the manager during the block."""
+        applied = [self.configuration, *([self.injection] if self._sidecars else [])]
+        for each in applied:
+            self._api.apply(each)
+        try:
+            self.wait_answering()
+            yield
+        finally:
+            for each in applied:
+                self._api.delete(each["kind"], self.name)
+
+    def wait_answering(self) -> None:
+        """Wait until what is wrong is refused."""
+        wait_until(self._refuses, bool, what="the API server asks, and the manager refuses")
+
+    def wait_unasked(self) -> None:
+        """Wait until what is wrong is stored."""
+        wait_until(self._refuses, lambda refused: not refused, what="the API server does not ask any more")
+
+    def _refuses(self) -> bool:
+        probe = template(f"probe-{secrets.token_hex(3)}", manifests=[config({}, name="the-same-for-all")])
+        try:
+            self._api.create(probe)
+        except ApiError as error:
+            if error.code != 422:
+                raise
+            return True
+        self._api.delete("ApplicationTemplate", probe["metadata"]["name"])
+        return False
+
+
+def printed(*arguments: str) -> Object:
+    """The object that `application-manager` prints."""
+    command = [str(BIN / "application-manager"), *arguments]
+    done: Any = yaml.safe_load(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert isinstance(done, dict)
+    return done
+
+
+def kubectl_apply(control_plane: ControlPlane, manifest: Object, namespace: str, *options: str) -> tuple[int, str]:
+    """`kubectl apply` of a manifest: the exit code, and what was written to stderr."""
+    command = [str(control_plane.binaries.kubectl), f"--kubeconfig={control_plane.kubeconfig}", "apply"]
+    done = subprocess.run(
+        [*command, "--namespace", namespace, "-f", "-", *options],
+        input=json.dumps(manifest),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    return done.returncode, done.stderr

@@ -1,0 +1,37 @@
+"""Everything that a cluster has, so that what something leaves behind is seen."""
+
+from __future__ import annotations
+
+from tests.cluster.waiting import wait_until
+from tests.e2e.node import Node
+
+Found = tuple[str, str, str]  # kind, namespace, name
+
+_TEMPLATE = '{range .items[*]}{.kind}{" "}{.metadata.namespace}{"/"}{.metadata.name}{"\\n"}{end}'
+_NOT_COUNTED = {"APIService", "Event"}
+"""What the API server makes and removes by itself for each group of CRDs; what tells of the past, and lapses."""
+
+
+def inventory(node: Node) -> set[Found]:
+    """All objects of all kinds that can be listed, in all namespaces."""
+    served = node.plane.kubectl("api-resources", "--verbs=list", "--output=name").split()
+    listed = node.plane.kubectl(
+        "get", ",".join(sorted(served)), "--all-namespaces", "--ignore-not-found", f"--output=jsonpath={_TEMPLATE}"
+    )
+    found = set()
+    for line in listed.splitlines():
+        kind, _, place = line.partition(" ")
+        namespace, _, name = place.partition("/")
+        if kind not in _NOT_COUNTED:
+            found.add((kind, namespace, name))
+    return found
+
+
+def wait_left(node: Node, before: set[Found], kinds: set[str], timeout: float) -> set[Found]:
+    """Wait until nothing is new since `before` but objects of `kinds`; return those. Raises TimeoutError with all."""
+    return wait_until(
+        lambda: inventory(node) - before,
+        lambda new: {kind for kind, _, _ in new} <= kinds,
+        timeout=timeout,
+        what=f"nothing new is left but {', '.join(sorted(kinds)) or 'nothing'}",
+    )

@@ -1,0 +1,205 @@
+"""The namespaces that a node lives in: mounts, network and processes of its own.
+
+Everything that a node does to a machine (network interfaces, iptables rules, mounts, daemons that outlive their parent)
+happens inside, so it neither meets what else runs on the machine nor stays: the kernel removes it all when the first
+process inside ends, also where the test run was killed (`tests.cluster.reaper`). Only cgroups live outside. They bear
+the number of the test run in their name, and those of runs that are no more are removed before the next one.
+
+Outside and inside are joined by one pair of interfaces, on addresses of RFC 2544 that are nobody's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from tests.cluster.children import Child
+from tests.cluster.waiting import wait_until
+
+CGROUPS = Path("/sys/fs/cgroup")
+CGROUP_PREFIX = "wayside-e2e-"
+INIT = Path(__file__).with_name("init.py")
+_numbers = itertools.count()
+ATTEMPTS = 100  # at 0.05 s: a cgroup is busy until the kernel has cleared up the last process
+
+
+class Enclosure:
+    """One set of namespaces.
+
+    Attributes:
+        folder: for what is kept by those inside; it exists, and is the caller's to remove.
+        outside: the machine's address of the pair, as seen from inside.
+        inside: the node's address.
+        cgroup: below which the node's containers are, `/wayside-e2e-<pid of the test run>-<number>`.
+        interface: the machine's end of the pair.
+    """
+
+    def __init__(self, folder: Path):
+        """Prepare; nothing is made yet."""
+        self.folder = folder
+        number = next(_numbers)
+        self.cgroup = f"/{CGROUP_PREFIX}{os.getpid()}-{number}"
+        self.interface = f"we2e{os.getpid()}.{number}"
+        network = _free_network()
+        self.outside, self.inside = f"{network}.1", f"{network}.2"
+        self._anchor: Child | None = None
+        self._target = 0
+
+    @property
+    def enter(self) -> tuple[str, ...]:
+        """What to put before a command line, so that it runs inside."""
+        assert self._target, "the enclosure is not open"
+        return ("nsenter", f"--target={self._target}", "--mount", "--net", "--pid", "--")
+
+    def open(self) -> None:
+        """Make the namespaces and join them to the outside. Raises TimeoutError with the log of the first process."""
+        remove_stale_cgroups()
+        for root in cgroup_roots():
+            (root / self.cgroup[1:]).mkdir(exist_ok=True)
+            _inherit_cpuset(root / self.cgroup[1:])
+        namespaces = ["--mount", "--net", "--pid", "--propagation=private", "--fork", "--kill-child"]
+        first = [sys.executable, str(INIT), str(self.folder), self.inside, self.outside]
+        log = self.folder / "init.log"
+        anchor = self._anchor = Child("init", ["unshare", *namespaces, *first], log)
+        children = Path(f"/proc/{anchor.pid}/task/{anchor.pid}/children")
+        found = wait_until(
+            lambda: children.read_text().split() if anchor.alive else [],
+            bool,
+            what="the namespaces exist",
+            diagnose=anchor.tail,
+        )
+        self._target = int(found[0])
+        self._join()
+
+    def run(self, *command: str, path: str, timeout: float = 300) -> str:
+        """Run a command inside to its end and return its stdout; RuntimeError with its stderr if it fails."""
+        done = subprocess.run(
+            [*self.enter, *command],
+            env=os.environ | {"PATH": path},
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+        )
+        if done.returncode:
+            raise RuntimeError(f"{' '.join(command)}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+        return done.stdout
+
+    def start(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> Child:
+        """Start a program inside; its log is `<folder>/<name>.log`."""
+        return Child(name, [*self.enter, *command], self.folder / f"{name}.log", {**os.environ, **environment})
+
+    def kill(self, name: str) -> None:
+        """Kill the programs inside whose name begins so, and all in the node's cgroups; returns when all are gone."""
+
+        def left() -> list[int]:
+            found = [*self._named(name), *_pids(self.cgroup[1:])]
+            for pid in found:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            return found
+
+        wait_until(left, lambda found: not found, what=f"nothing of {name} and the node's cgroups runs")
+
+    def _named(self, name: str) -> Iterator[int]:
+        own = _namespace(self._target)
+        for path in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if _namespace(int(path.name)) == own and (path / "comm").read_text().startswith(name):
+                    yield int(path.name)
+
+    def close(self) -> None:
+        """End everything inside, and remove the cgroups."""
+        if self._anchor is not None:
+            # The kernel would remove it too, some time after the last process inside.
+            subprocess.run(["ip", "link", "delete", self.interface], capture_output=True, check=False)
+            self._anchor.kill9()
+        self._anchor, self._target = None, 0
+        _remove_cgroups(self.cgroup[1:])
+
+    def _join(self) -> None:
+        """Make the pair of interfaces; the first process inside waits for its end."""
+        name = self.interface
+        _ip("link", "add", name, "type", "veth", "peer", "name", "uplink", "netns", str(self._target))
+        _ip("address", "add", f"{self.outside}/30", "dev", name)
+        _ip("link", "set", name, "up")
+        anchor = self._anchor
+        assert anchor is not None
+
+        def ready() -> bool:
+            if not anchor.alive:
+                raise RuntimeError(f"the first process of the enclosure ended\n{anchor.tail()}")
+            return (self.folder / "enclosed").exists()
+
+        wait_until(ready, bool, what="the enclosure has its mounts and addresses", diagnose=anchor.tail)
+
+
+def remove_stale_cgroups() -> None:
+    """Remove what test runs left that are no more."""
+    for name in {path.name for root in cgroup_roots() for path in root.glob(f"{CGROUP_PREFIX}*")}:
+        if not Path(f"/proc/{name.removeprefix(CGROUP_PREFIX).partition('-')[0]}").exists():
+            _remove_cgroups(name)
+
+
+def _namespace(pid: int) -> str:
+    return os.readlink(f"/proc/{pid}/ns/pid")
+
+
+def _pids(cgroup: str) -> set[int]:
+    files = [file for root in cgroup_roots() for file in (root / cgroup).rglob("cgroup.procs")]
+    found: set[int] = set()
+    for file in files:
+        with contextlib.suppress(OSError):  # gone meanwhile
+            found.update(map(int, file.read_text().split()))
+    return found
+
+
+def _remove_cgroups(name: str) -> None:
+    for root in cgroup_roots():
+        for path, _, _ in os.walk(root / name, topdown=False):
+            for attempt in range(ATTEMPTS):
+                try:
+                    os.rmdir(path)
+                except FileNotFoundError:
+                    break
+                except OSError:
+                    if attempt == ATTEMPTS - 1:
+                        raise
+                    time.sleep(0.05)
+                else:
+                    break
+
+
+def cgroup_roots() -> list[Path]:
+    """The mounted hierarchies: one with version 2, several with version 1."""
+    mounts = (line.split() for line in Path("/proc/mounts").read_text().splitlines())
+    found = sorted({Path(where) for _, where, kind, *_ in mounts if kind in ("cgroup", "cgroup2")})
+    return [root for root in found if root.is_relative_to(CGROUPS)]
+
+
+def _inherit_cpuset(cgroup: Path) -> None:
+    """Version 1 makes a cgroup without processors, in which nothing can run."""
+    for name in ("cpuset.cpus", "cpuset.mems"):
+        if (cgroup / name).exists() and (cgroup.parent / "cgroup.clone_children").exists():
+            (cgroup / name).write_text((cgroup.parent / name).read_text())
+
+
+def _free_network() -> str:
+    """Return the first three numbers of a network to which no route leads yet."""
+    routes = subprocess.run(["ip", "-4", "route"], capture_output=True, text=True, check=True).stdout
+    free = [f"198.18.{third}" for third in range(256) if f"198.18.{third}." not in routes]
+    return random.SystemRandom().choice(free)
+
+
+def _ip(*arguments: str) -> None:
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"`ip {' '.join(arguments)}` failed: {done.stderr.strip()}")

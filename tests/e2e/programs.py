@@ -1,0 +1,126 @@
+"""The programs of a node: Debian's where it packages them, the others built from pinned source.
+
+`python -m tests.e2e.programs` installs and builds what is missing. The control plane's are not among them: they have
+their own cache (`tests.cluster.binaries`), which the tests without a node fill.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from tests.cluster.binaries import BinariesUnavailableError, ensure_binaries
+from tests.gobuild import KUBERNETES, BuildError, GoModule
+
+MODULES = Path(__file__).parent / "modules"
+CONTAINERD = "github.com/containerd/containerd/v2/cmd"
+PLUGINS = "github.com/containernetworking/plugins/plugins"
+
+CONTAINERS = GoModule(
+    "containers",
+    MODULES / "containers",
+    {
+        "bridge": f"{PLUGINS}/main/bridge",
+        "loopback": f"{PLUGINS}/main/loopback",
+        "host-local": f"{PLUGINS}/ipam/host-local",
+        "containerd-shim-runc-v2": f"{CONTAINERD}/containerd-shim-runc-v2",
+        "ctr": f"{CONTAINERD}/ctr",
+        "containerd": f"{CONTAINERD}/containerd",
+    },
+)
+NODE = GoModule(
+    "node",
+    MODULES / "kubernetes",
+    {name: f"k8s.io/kubernetes/cmd/{name}" for name in ("kube-scheduler", "kube-proxy", "kubelet")},
+    KUBERNETES,
+)
+COREDNS = GoModule("coredns", MODULES / "coredns", {"coredns": "."})
+PAUSE = GoModule("pause", MODULES / "pause", {"pause": "."})
+
+PACKAGES = {
+    "runc": "runc",
+    "iptables": "iptables",
+    "conntrack": "conntrack",
+    "debootstrap": "debootstrap",
+    "ip": "iproute2",
+}
+"""The Debian package of each program."""
+SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+
+
+class ProgramsUnavailableError(Exception):
+    """A program of the node is missing and cannot be had; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Programs:
+    """Where the programs are: folders of those that we build; Debian's are on the PATH of the system."""
+
+    containers: Path
+    node: Path
+    coredns: Path
+    pause: Path
+
+    @property
+    def path(self) -> str:
+        """A PATH with all of them."""
+        return f"{self.containers}:{self.node}:{SYSTEM_PATH}"
+
+
+def ensure_programs(console: Console | None = None) -> Programs:
+    """Find, install and build what is missing.
+
+    Raises:
+        ProgramsUnavailableError: something cannot be had, with the remedy.
+    """
+    console = console or Console(stderr=True)
+    _install(console)
+    try:
+        folders = [module.ensure(console) for module in (CONTAINERS, NODE, COREDNS, PAUSE)]
+    except BuildError as error:
+        raise ProgramsUnavailableError(str(error)) from error
+    return Programs(*folders[:2], folders[2] / "coredns", folders[3] / "pause")
+
+
+def _install(console: Console) -> None:
+    missing = sorted(package for name, package in PACKAGES.items() if shutil.which(name, path=SYSTEM_PATH) is None)
+    if not missing:
+        return
+    told = f"the node needs {', '.join(missing)}: apt-get install {' '.join(missing)} as root, or your system's own way"
+    if os.geteuid() != 0 or shutil.which("apt-get") is None:
+        raise ProgramsUnavailableError(told)
+    console.print(f"installing {', '.join(missing)} with apt-get", highlight=False)
+    environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
+    for command in (["update"], ["install", "--yes", "--no-install-recommends", *missing]):
+        done = subprocess.run(
+            ["apt-get", "--quiet", *command], env=environment, capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            output = (done.stdout + done.stderr)[-3000:]
+            raise ProgramsUnavailableError(f"{told}\n`apt-get {' '.join(command)}` failed:\n{output}")
+
+
+def main() -> int:
+    """Provide all that `make e2e` runs; nothing where there can be no node."""
+    from tests.e2e.privileges import why_no_node  # which looks at the node's enclosure, and that is above us
+
+    if (reason := why_no_node()) is not None:
+        print(f"nothing is built for the tests on a real node, which are skipped: {reason}")
+        return 0
+    try:
+        ensure_binaries()
+        print(ensure_programs().containers.parent.parent)
+    except (BinariesUnavailableError, ProgramsUnavailableError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,167 @@
+"""The chart on a node that knows nothing of Wayside: what helm installs serves vehicles, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.cluster.api import Api, ApiError, Object, Objects
+from tests.cluster.crds import apply_crds
+from tests.cluster.waiting import wait_until
+from tests.e2e.inventory import inventory, wait_left
+from tests.e2e.node import Node
+from tests.e2e.released import (
+    DETECTOR,
+    MANAGER,
+    PATIENCE,
+    RELEASE,
+    ROUTER,
+    apply_certificates,
+    available,
+    outside,
+    values,
+    vehicle,
+    wait_installed,
+)
+from tests.e2e.test_cooperative_recording import TELL, applications, ready, wait_pods
+from tests.e2e.wayside_in_cluster import EXAMPLE, example_documents
+from tests.helm.wayside_chart import CHART, Helm
+from tests.unit.certificates import Authority
+
+sys.path.insert(0, str(EXAMPLE))
+
+from cooperative_recording.standing import Standing
+from cooperative_recording.vehicles import LIDAR_VEHICLES
+
+DETECTOR_SPEC = yaml.safe_load((EXAMPLE / "detector.yaml").read_text(encoding="utf-8"))["spec"]
+OURS = {f"{plural}.wayside.dev" for plural in (
+    "applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"
+)}  # fmt: skip
+WRONG: Object = {
+    "apiVersion": "wayside.dev/v1alpha1",
+    "kind": "ApplicationTemplate",
+    "metadata": {"name": "wrong"},
+    "spec": {"manifests": [{"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "${there.is.none}"}}]},
+}
+
+
+@pytest.fixture
+def bare(node: Node, api: Api) -> Iterator[Api]:
+    """The test's namespace, under the restricted Pod Security Standard, on a node that does not know our kinds."""
+    remove_crds(api)
+    api.patch(
+        "Namespace", api.namespace, {"metadata": {"labels": {"pod-security.kubernetes.io/enforce": "restricted"}}}
+    )
+    api.wait_for("ConfigMap", "kube-root-ca.crt", lambda _: True, what="the namespace has all that each one gets")
+    yield node.api(api.namespace)
+    remove_crds(api)
+    apply_crds(api)
+
+
+def remove_crds(api: Api) -> None:
+    for name in OURS:
+        if api.find("CustomResourceDefinition", name) is not None:
+            api.delete("CustomResourceDefinition", name)
+    for name in OURS:
+        api.wait_gone("CustomResourceDefinition", name, timeout=PATIENCE)
+
+
+def of(api: Api, name: str) -> Objects:
+    """The pods of a Deployment of the release, or of the detector."""
+    label = f"wayside.dev/runs={name.removeprefix('detector-')}" if name == DETECTOR else (
+        f"app.kubernetes.io/component={name.removeprefix(f'{RELEASE}-')}"
+    )  # fmt: skip
+    return api.list("Pod", labels=label)
+
+
+def lives(pods: Objects) -> list[tuple[str, int]]:
+    """Of each pod, which one it is, and how often its containers were restarted."""
+    return [
+        (pod["metadata"]["uid"], sum(each["restartCount"] for each in pod["status"].get("containerStatuses", [])))
+        for pod in pods
+    ]
+
+
+def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing_is_left(
+    node: Node, bare: Api, image: str, helm: Helm, tmp_path: Path
+) -> None:
+    api, authority = bare, Authority(tmp_path)
+    before = inventory(node)
+    apply_certificates(api, authority)
+    given = copy.deepcopy(values(api.namespace, image, DETECTOR_SPEC))
+    given["manager"]["ttlAfterFinished"] = "1s"
+    first, second = (each.name for each in LIDAR_VEHICLES[:2])
+    given["router"]["accessControl"]["clients"][0]["commonNames"] = [first, second]
+    where = ("--namespace", api.namespace)
+    helm("install", RELEASE, str(CHART), *where, values=given)
+    wait_installed(api)
+    helm("test", RELEASE, *where, "--timeout", "5m")
+    with pytest.raises(ApiError, match=r"not declared|there"):
+        api.create(WRONG)
+
+    example = [each for each in example_documents(image, ["python3", "-c", TELL]) if each["kind"] != "Detector"]
+    for document in example:
+        api.apply(document)
+    one, other = (Standing(vehicle(outside(node, api), authority.ca, authority.sign(name))) for name in (first, second))
+    with one, other:  # each may send its own data only
+        one.put(first, 0)
+        other.put(second, 100)
+        (recorder,) = wait_pods(api, "scene-recorder", ready, "the recorder of the two runs")
+        (fusion,) = wait_pods(api, "scene-fusion", ready, "the fusion of their scene runs")
+        assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in said(node, recorder)
+        assert said(node, fusion).count(first) == 1, "it was told its configuration, once"
+
+        running = lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")])
+        serving = lives([*of(api, DETECTOR), *of(api, ROUTER)])
+        changed = copy.deepcopy(given)
+        changed["manager"] |= {"replicas": 2, "podAnnotations": {"example.com/changed": "yes"}}
+        helm("upgrade", RELEASE, str(CHART), *where, values=changed)
+        api.wait_for(
+            "Deployment",
+            MANAGER,
+            lambda found: available(found) and found["status"].get("readyReplicas") == 2,
+            timeout=PATIENCE,
+            what="two managers of the new version are ready",
+        )
+        assert lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")]) == running
+        assert lives([*of(api, DETECTOR), *of(api, ROUTER)]) == serving
+
+        other.put(second, 1000)  # which the new manager acts on
+        wait_pods(api, "scene-recorder", lambda pods: not pods, "the recorder is gone")
+        wait_pods(api, "scene-fusion", lambda pods: not pods, "the fusion is gone")
+    api.wait_list("ApplicationTask", lambda found: not found, timeout=PATIENCE, what="the tasks are over and gone")
+
+    for document in example:
+        api.delete(document["kind"], document["metadata"]["name"])
+    for name in ("router-tls", "town-tls"):
+        api.delete("Secret", name)
+    helm("uninstall", RELEASE, *where)
+    left = wait_left(node, before, {"CustomResourceDefinition"}, PATIENCE)
+    assert {name for _, _, name in left} == OURS, "the CRDs are kept"
+
+
+def said(node: Node, pod: Object) -> str:
+    """What the pod has written; it waits until that is something."""
+    metadata = pod["metadata"]
+    log = ("--namespace", metadata["namespace"], "logs", metadata["name"])
+    return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {metadata['name']} has written")
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_a_release_that_was_never_upgraded_leaves_no_detector_behind(
+    node: Node, bare: Api, image: str, helm: Helm, tmp_path: Path, keep: bool
+) -> None:
+    before = inventory(node)
+    apply_certificates(bare, Authority(tmp_path))
+    given = values(bare.namespace, image, DETECTOR_SPEC) | {"crds": {"keep": keep}}
+    helm("install", RELEASE, str(CHART), "--namespace", bare.namespace, values=given)
+    wait_installed(bare)
+    helm("uninstall", RELEASE, "--namespace", bare.namespace)
+    for name in ("router-tls", "town-tls"):
+        bare.delete("Secret", name)
+    wait_left(node, before, {"CustomResourceDefinition"} if keep else set(), PATIENCE)

@@ -1,0 +1,109 @@
+"""The cooperative-recording example on a real node: both programs are pods, and so is what they deploy."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import yaml
+
+from tests.cluster.api import Api, Objects
+from tests.cluster.managed_world import condition
+from tests.cluster.waiting import wait_until
+from tests.e2e.node import Node
+from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, apply_manager, expose_detector
+from tests.e2e.workloads import wait_available
+
+sys.path.insert(0, str(EXAMPLE))
+
+from cooperative_recording.standing import Standing
+from cooperative_recording.vehicles import LIDAR_VEHICLES
+
+PATIENCE = 300.0
+TELL = """
+import pathlib, sys, time
+print("#", *sys.argv[1:], flush=True)
+paths = [pathlib.Path(a.split("=", 1)[1]) for a in sys.argv if a.startswith("--configuration=")]
+told = None
+while True:
+    text = "".join(path.read_text() for path in paths)
+    if text != told:
+        print("---", text, sep="\\n", flush=True)
+        told = text
+    time.sleep(0.1)
+"""
+"""What each application does: it says how it was started, and its configuration whenever that is another."""
+
+
+def applications(api: Api, name: str) -> Objects:
+    return api.list("Pod", labels=f"app.kubernetes.io/name={name}")
+
+
+def ready(pods: Objects) -> bool:
+    conditions = [{each["type"]: each["status"] for each in pod["status"].get("conditions", [])} for pod in pods]
+    return len(pods) == 1 and all(each.get("Ready") == "True" for each in conditions)
+
+
+def wait_pods(api: Api, name: str, holds: Callable[[Objects], bool], what: str) -> Objects:
+    return wait_until(lambda: applications(api, name), holds, timeout=PATIENCE, what=what)
+
+
+def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_are_gone_after(
+    node: Node, api: Api, image: str
+) -> None:
+    first, second, third = (vehicle.name for vehicle in LIDAR_VEHICLES[:3])
+    apply_example(api, image, ["python3", "-c", TELL])
+    apply_manager(api, image)
+    port = expose_detector(api, "town")
+    wait_available(api, "application-manager")
+    api.wait_for(
+        "Detector",
+        "town",
+        lambda raw: condition(raw, "Running").get("status") == "True",
+        timeout=PATIENCE,
+        what="the manager runs the detector",
+    )
+    with Standing([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
+        vehicles.put(first, 0)
+        vehicles.put(second, 100)
+
+        (recorder,) = wait_pods(api, "scene-recorder", ready, "the recorder of the two runs")
+        (fusion,) = wait_pods(api, "scene-fusion", ready, "the fusion of their scene runs")
+
+        def said(pod: str) -> str:
+            log = ("--namespace", api.namespace, "logs", pod)
+            return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {pod} has written")
+
+        def configurations() -> list[list[str]]:
+            """The sources that the fusion has been told, one after the other."""
+            documents = yaml.safe_load_all(said(fusion["metadata"]["name"]))
+            return [yaml.safe_load(str(each["sources"])) for each in documents if each]
+
+        told = said(recorder["metadata"]["name"])
+        assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in told
+        assert configurations() == [sorted([first, second])]
+        tasks = api.wait_list(
+            "ApplicationTask",
+            lambda found: len(found) == 2 and all(each.get("status", {}).get("phase") == "Ready" for each in found),
+            what="both tasks are Ready",
+        )
+        assert {task["spec"]["requester"]["holder"] for task in tasks} == {"town"}
+
+        vehicles.put(third, 200)
+
+        everybody = sorted([first, second, third])
+        wait_until(configurations, lambda found: found[-1] == everybody, timeout=PATIENCE, what="the fusion is told")
+        (same,) = applications(api, "scene-fusion")
+        assert same["metadata"]["uid"] == fusion["metadata"]["uid"]
+        assert same["status"]["containerStatuses"][0]["restartCount"] == 0
+
+        vehicles.put(third, 2000)
+        vehicles.put(second, 1000)
+
+        wait_pods(api, "scene-recorder", lambda pods: not pods, "the recorder is gone")
+        wait_pods(api, "scene-fusion", lambda pods: not pods, "the fusion is gone")
+    pods = [
+        pod for each in ("app=application-manager", "wayside.dev/runs=town") for pod in api.list("Pod", labels=each)
+    ]
+    restarts = [status["restartCount"] for pod in pods for status in pod["status"]["containerStatuses"]]
+    assert restarts == [0, 0]

@@ -1,0 +1,93 @@
+"""Both programs as pods: what the tests of the whole chain apply."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tests.cluster.api import Api, Object
+from tests.e2e.workloads import deployment, service
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
+ZENOH_PORT, METRICS_PORT = 7447, 9100
+RESTRICTED = {  # the Pod Security Standard of this name
+    "allowPrivilegeEscalation": False,
+    "capabilities": {"drop": ["ALL"]},
+    "readOnlyRootFilesystem": True,
+    "runAsNonRoot": True,
+    "seccompProfile": {"type": "RuntimeDefault"},
+}
+
+
+def apply_manager(api: Api, image: str) -> None:
+    """The manager of this namespace, with the rights that it prints itself."""
+    api.apply({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "application-manager"}})
+    account = f"--account={api.namespace}/application-manager"
+    rbac = [
+        sys.executable,
+        "-m",
+        "application_manager.cli",
+        "rbac",
+        f"--namespace={api.namespace}",
+        account,
+        "--detectors",
+    ]
+    for role in yaml.safe_load_all(subprocess.run(rbac, capture_output=True, text=True, check=True).stdout):
+        api.apply(role)
+    options = (f"--metrics-port={METRICS_PORT}", f"--detector-image={image}")
+    command = ("application-manager", "run", "--namespace", api.namespace, *options)
+    api.apply(_program("application-manager", image, command))
+
+
+def expose_detector(api: Api, name: str) -> int:
+    """Lead to the Zenoh of the detector of this name, which the manager runs; returns the port of the node."""
+    applied = api.apply(service("detector", ZENOH_PORT, type="NodePort", selector={"wayside.dev/runs": name}))
+    return int(applied["spec"]["ports"][0]["nodePort"])
+
+
+def apply_example(api: Api, image: str, command: list[str]) -> None:
+    """The cooperative-recording example, with a detector that the manager runs and that vehicles reach."""
+    for document in example_documents(image, command):
+        if document["kind"] == "Detector":
+            document["spec"]["mode"] = "Standalone"
+            document["spec"]["zenoh"]["listen"] = [f"tcp/0.0.0.0:{ZENOH_PORT}"]
+        api.apply(document)
+
+
+def example_documents(image: str, command: list[str]) -> Iterator[Object]:
+    """The example's own files, but for the images and the namespace."""
+    for file in ("templates.yaml", "rules.yaml", "detector.yaml"):
+        for document in yaml.safe_load_all((EXAMPLE / file).read_text(encoding="utf-8")):
+            document["metadata"].pop("namespace", None)
+            for manifest in document["spec"].get("manifests", []):
+                if manifest["kind"] == "Deployment":
+                    (container,) = manifest["spec"]["template"]["spec"]["containers"]
+                    container |= {"image": image, "imagePullPolicy": "Never", "command": command}
+                    manifest["spec"]["template"]["spec"]["terminationGracePeriodSeconds"] = 1
+            yield document
+
+
+def _program(name: str, image: str, command: tuple[str, ...]) -> Object:
+    field = {"fieldRef": {"fieldPath": "metadata.name"}}, {"fieldRef": {"fieldPath": "metadata.uid"}}
+    container: dict[str, Any] = {
+        "env": [{"name": "POD_NAME", "valueFrom": field[0]}, {"name": "POD_UID", "valueFrom": field[1]}],
+        "ports": [{"containerPort": METRICS_PORT}],
+        "readinessProbe": {"httpGet": {"path": "/readyz", "port": METRICS_PORT}, "periodSeconds": 1},
+        "livenessProbe": {"httpGet": {"path": "/healthz", "port": METRICS_PORT}, "initialDelaySeconds": 30},
+        "securityContext": RESTRICTED,
+        "volumeMounts": [{"name": "scratch", "mountPath": "/tmp"}],
+    }
+    return deployment(
+        name,
+        image,
+        command,
+        container=container,
+        serviceAccountName=name,
+        volumes=[{"name": "scratch", "emptyDir": {}}],
+        terminationGracePeriodSeconds=30,
+    )

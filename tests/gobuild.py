@@ -1,0 +1,137 @@
+"""Programs built from a pinned Go module into a cache outside the tree.
+
+A program appears in the cache by an atomic rename: an interrupted build leaves nothing that looks finished. A folder
+has a hash of all that decides what comes out as its name, so another pin is another folder; a lock keeps builds apart.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from tests.cluster.toolchain import GoUnavailableError, find_go
+
+STRIPPED = "-s -w"
+KUBERNETES = " ".join(  # a plain `go build` calls itself v0.0.0, which clients and CRD conversion then believe
+    (
+        STRIPPED,
+        "-X k8s.io/component-base/version.gitVersion=v1.36.3",
+        "-X k8s.io/component-base/version.gitMajor=1",
+        "-X k8s.io/component-base/version.gitMinor=36",
+    )
+)
+
+
+class BuildError(Exception):
+    """A program cannot be built; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class GoModule:
+    """A folder with go.mod and go.sum, and what is built from it.
+
+    Attributes:
+        name: of its part of the cache.
+        source: the folder.
+        packages: the Go package of each program.
+        ldflags: for the linker.
+    """
+
+    name: str
+    source: Path
+    packages: Mapping[str, str]
+    ldflags: str = STRIPPED
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What `go build` gets."""
+        return ("-trimpath", "-buildvcs=false", "-ldflags", self.ldflags)
+
+    def folder(self, environment: Mapping[str, str] = os.environ) -> Path:
+        """Return the folder of what is built from the present pins, programs of our own, flags and platform."""
+        digest = hashlib.sha256()
+        sources = [self.source / "go.mod", self.source / "go.sum", *sorted(self.source.glob("*.go"))]
+        pins = [path.read_bytes() for path in sources if path.exists()]
+        for part in (*pins, "\0".join(self.flags).encode(), f"{platform.system()}/{platform.machine()}".encode()):
+            digest.update(len(part).to_bytes(8, "big") + part)
+        return cache(environment) / self.name / digest.hexdigest()[:16]
+
+    def ensure(self, console: Console, names: tuple[str, ...] = ()) -> Path:
+        """Build those of `names` (default: all) that are missing; return the folder. Raises BuildError."""
+        folder = self.folder()
+        folder.mkdir(parents=True, exist_ok=True)
+        with locked(folder / ".lock"):
+            missing = [name for name in names or self.packages if not (folder / name).is_file()]
+            for number, name in enumerate(missing, start=1):
+                self._build(name, folder, f"{number} of {len(missing)}", console)
+        return folder
+
+    def _build(self, name: str, folder: Path, which: str, console: Console) -> None:
+        try:
+            go = find_go(cache() / "controlplane" / "go", console)
+        except GoUnavailableError as error:
+            raise BuildError(f"{name} has to be built, which needs Go: {error}") from error
+        unfinished = folder / f".{name}.{os.getpid()}"
+        command = [str(go), "build", *self.flags, "-o", str(unfinished), self.packages[name]]
+        environment = os.environ | {"CGO_ENABLED": "0", "GOTOOLCHAIN": "local", "GOWORK": "off"}
+        began = time.monotonic()
+        try:
+            with (
+                _progress(f"building {name} ({which}, once; the largest takes minutes)", console),
+                subprocess.Popen(
+                    command,
+                    cwd=self.source,
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                ) as build,
+            ):
+                output, _ = build.communicate()
+            if build.returncode != 0:
+                raise BuildError(
+                    f"building {name} failed (exit code {build.returncode}; needs the Go module proxy or a filled "
+                    f"module cache, about 2 GB of memory and 4 GB of disk):\n{output.strip()[-4000:]}"
+                )
+            unfinished.rename(folder / name)
+        finally:
+            unfinished.unlink(missing_ok=True)
+        console.print(f"built {name} ({which}) in {time.monotonic() - began:.0f} s", highlight=False)
+
+
+def cache(environment: Mapping[str, str] = os.environ) -> Path:
+    """Return the folder of all that tests build once: `${XDG_CACHE_HOME:-~/.cache}/wayside`."""
+    return Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wayside"
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Keep others out of a folder."""
+    with path.open("w") as handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+
+
+@contextmanager
+def _progress(what: str, console: Console) -> Iterator[None]:
+    """Show a spinner with the seconds so far on a terminal; a pipe gets one line at the start."""
+    if not console.is_terminal:
+        console.print(what, highlight=False)
+        yield
+        return
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        progress.add_task(what, total=None)
+        yield

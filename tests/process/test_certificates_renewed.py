@@ -1,0 +1,295 @@
+"""Certificates are renewed under a running detector: no sample is lost, none comes twice, and what fails is said."""
+
+from __future__ import annotations
+
+import datetime
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from detector.engine.samples.liveliness import LIVELINESS, Token
+from detector.streams.session import open_session
+from detector.streams.zenoh import Network
+from tests.networks import PATIENCE, Arrivals, router, stream, wait_for
+from tests.ports import free_endpoint
+from tests.unit.certificates import Authority
+from wayside.api.zenoh import Zenoh
+
+LOOK_EVERY = 0.05
+CARS = ("car1", "car2", "car3")
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path)
+
+
+@pytest.fixture
+def mounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
+    return tmp_path / "own"
+
+
+@pytest.fixture
+def at() -> str:
+    return free_endpoint().replace("tcp/127.0.0.1", "tls/localhost")
+
+
+@pytest.fixture
+def arrivals() -> Arrivals:
+    return Arrivals()
+
+
+@contextmanager
+def guarded_router(at: str, authority: Authority, **more: Any) -> Iterator[zenoh.Session]:
+    certificate, key = authority.sign("router")
+    tls = {
+        "listen_certificate": str(certificate),
+        "listen_private_key": str(key),
+        "root_ca_certificate": str(authority.ca),
+        "enable_mtls": True,
+        "close_link_on_expiration": True,
+    }
+    with router(listen__endpoints=[at], transport__link__tls=tls, **more) as session:
+        yield session
+
+
+@contextmanager
+def network(arrivals: Arrivals, *streams: Any, **config: Any) -> Iterator[Network]:
+    running = Network(
+        Zenoh.model_validate({"tlsSecret": "own", **config}),
+        streams or [stream()],
+        arrivals.putter,
+        look_every=LOOK_EVERY,
+    )
+    running.start()
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+class Traffic:
+    """Vehicles that number what they send."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._stop = threading.Event()
+        self.sent = 0
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Traffic:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.001):
+            for car in CARS:
+                self._session.put(
+                    f"vehicles/{car}/pose", str(self.sent), congestion_control=zenoh.CongestionControl.BLOCK
+                )
+            self.sent += 1
+
+
+def numbers(arrivals: Arrivals, car: str) -> list[int]:
+    return [int(payload) for _, key, payload in arrivals.seen if key == f"vehicles/{car}/pose"]
+
+
+def certificate_of(authority: Authority, name: str) -> dict[str, Any]:
+    certificate, key = authority.sign(name)
+    return {"ca": str(authority.ca), "certificate": str(certificate), "key": str(key)}
+
+
+def client(at: str, authority: Authority, name: str) -> zenoh.Session:
+    return open_session(
+        Zenoh.model_validate({"mode": "client", "connect": [at], "tls": certificate_of(authority, name)})
+    )
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_ten_renewals_under_load_lose_nothing_and_give_nothing_twice(
+    mode: str, at: str, authority: Authority, mounted: Path, arrivals: Arrivals
+) -> None:
+    authority.mount(mounted, "detector")
+    with (
+        guarded_router(at, authority),
+        network(arrivals, mode=mode, connect=[at]) as running,
+        client(at, authority, "cars") as vehicles,
+    ):
+        wait_for(lambda: running.connected)
+        subscriber_known = lambda: bool(arrivals.seen)  # noqa: E731
+        with Traffic(vehicles) as traffic:
+            wait_for(subscriber_known)
+            for renewal in range(1, 11):
+                authority.mount(mounted, "detector")
+                wait_for(lambda renewal=renewal: running.standing.renewals == renewal)
+            before = len(arrivals.seen)
+            wait_for(lambda: len(arrivals.seen) > before + 300)
+        arrivals.wait_for(lambda _: all(numbers(arrivals, car)[-1:] == [traffic.sent - 1] for car in CARS))
+        for car in CARS:
+            came = numbers(arrivals, car)
+            assert came == list(range(came[0], traffic.sent)), f"{car}: each once, in order"
+        assert running.standing.problem == ""
+        assert running.dead is None
+
+
+def test_a_certificate_that_the_router_does_not_take_leaves_the_session_alone(
+    at: str,
+    authority: Authority,
+    mounted: Path,
+    arrivals: Arrivals,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    authority.mount(mounted, "detector")
+    with (
+        guarded_router(at, authority),
+        network(arrivals, mode="client", connect=[at]) as running,
+        client(at, authority, "cars") as vehicles,
+        Traffic(vehicles),
+    ):
+        wait_for(lambda: bool(arrivals.seen))
+        stranger = Authority(tmp_path, "stranger").sign("detector")
+        foreign = {"tls.crt": stranger[0].read_bytes(), "tls.key": stranger[1].read_bytes()}
+        authority.change(mounted, foreign)
+        wait_for(lambda: "no session as client" in running.standing.problem)
+        authority.change(mounted, {"tls.crt": b"nonsense", "tls.key": foreign["tls.key"]})
+        wait_for(lambda: "are no certificate and key" in running.standing.problem)
+        authority.change(mounted, foreign | {"tls.key": authority.sign("other")[1].read_bytes()})
+        wait_for(lambda: "is not the key of" in running.standing.problem)
+        authority.mount(mounted, "detector", lasting=datetime.timedelta(seconds=-60))
+        wait_for(lambda: "expired" in running.standing.problem)
+        assert running.standing.renewals == 0
+        before = len(arrivals.seen)
+        wait_for(lambda: len(arrivals.seen) > before + 10)
+        assert "the session of before goes on" in caplog.text
+        assert "PRIVATE KEY" not in caplog.text
+        authority.mount(mounted, "detector", lasting=datetime.timedelta(days=30))
+        wait_for(lambda: running.standing.renewals == 1)
+        assert running.standing.problem == ""
+        assert (running.standing.expires or 0) > time.time() + 20 * 86400
+    for car in CARS:
+        came = numbers(arrivals, car)
+        assert came == list(range(came[0], came[-1] + 1))
+
+
+def test_a_certificate_to_which_the_router_gives_nothing_leaves_the_session_alone(
+    at: str, authority: Authority, mounted: Path, arrivals: Arrivals
+) -> None:
+    everything = ["put", "declare_subscriber"]
+    allowed = {"id": "all", "permission": "allow", "messages": everything, "key_exprs": ["**"]}
+    rules = {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [allowed],
+        "subjects": [{"id": "known", "cert_common_names": ["detector", "cars"]}],
+        "policies": [{"rules": ["all"], "subjects": ["known"]}],
+    }
+    authority.mount(mounted, "detector")
+    with (
+        guarded_router(at, authority, access_control=rules),
+        network(arrivals, mode="client", connect=[at]) as running,
+        client(at, authority, "cars") as vehicles,
+        Traffic(vehicles),
+    ):
+        wait_for(lambda: bool(arrivals.seen))
+        authority.mount(mounted, "renamed")
+        wait_for(lambda: "nothing is received" in running.standing.problem)
+        before = len(arrivals.seen)
+        wait_for(lambda: len(arrivals.seen) > before + 10)
+    for car in CARS:
+        came = numbers(arrivals, car)
+        assert came == list(range(came[0], came[-1] + 1))
+
+
+def test_tokens_and_latched_samples_are_told_of_once(
+    at: str, authority: Authority, mounted: Path, arrivals: Arrivals
+) -> None:
+    latched = stream("map", "maps/${client:*}", history={"samples": 1})
+    authority.mount(mounted, "detector")
+    with (
+        guarded_router(at, authority, timestamping__enabled=True) as source,
+        network(arrivals, latched, mode="client", connect=[at], liveliness="alive/${client:*}") as running,
+    ):
+        publisher = zenoh.ext.declare_advanced_publisher(
+            source, "maps/car1", cache=zenoh.ext.CacheConfig(max_samples=1), publisher_detection=True
+        )
+        publisher.put("first")
+        stays = source.liveliness().declare_token("alive/car1")
+        goes = source.liveliness().declare_token("alive/car2")
+        arrivals.wait_for(lambda seen: len(seen) >= 3)
+        authority.mount(mounted, "detector")
+        wait_for(lambda: running.standing.renewals == 1)
+        goes.undeclare()
+        arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car2", Token.DROPPED.value) in seen)
+        publisher.put("second")
+        arrivals.wait_for(lambda seen: ("map", "maps/car1", b"second") in seen)
+        assert sorted(arrivals.seen) == sorted(
+            [
+                ("map", "maps/car1", b"first"),
+                (LIVELINESS, "alive/car1", Token.DECLARED.value),
+                (LIVELINESS, "alive/car2", Token.DECLARED.value),
+                (LIVELINESS, "alive/car2", Token.DROPPED.value),
+                ("map", "maps/car1", b"second"),
+            ]
+        )
+        stays.undeclare()
+
+
+def test_a_detector_that_listens_opens_its_session_anew_and_stays_as_it_was_with_bad_files(
+    at: str, authority: Authority, mounted: Path, arrivals: Arrivals, caplog: pytest.LogCaptureFixture
+) -> None:
+    authority.mount(mounted, "localhost")
+    with network(arrivals, mode="peer", listen=[at]) as running, client(at, authority, "cars") as vehicles:
+        with Traffic(vehicles):
+            wait_for(lambda: bool(arrivals.seen))
+            authority.mount(mounted, "localhost")
+
+            def is_renewed() -> bool:
+                running.publish("wayside/events/d/r/s", b"{}")
+                return running.standing.renewals == 1
+
+            wait_for(is_renewed)
+            before = len(arrivals.seen)
+            wait_for(lambda: len(arrivals.seen) > before + 10)
+            assert "what was sent meanwhile is lost" in caplog.text
+            authority.change(mounted, {"tls.crt": b"nonsense", "tls.key": b"nonsense"})
+            wait_for(lambda: "are no certificate and key" in running.standing.problem)
+            before = len(arrivals.seen)
+            wait_for(lambda: len(arrivals.seen) > before + 10)
+        for car in CARS:
+            came = numbers(arrivals, car)
+            assert came == sorted(set(came)), "none twice, none overtaken"
+    assert running.dropped_events == 0
+
+
+def test_a_router_that_is_away_does_not_keep_a_renewal_from_coming_later(
+    at: str, authority: Authority, mounted: Path, arrivals: Arrivals
+) -> None:
+    authority.mount(mounted, "detector")
+    with network(arrivals, mode="client", connect=[at]) as running:
+        with guarded_router(at, authority):
+            wait_for(lambda: running.connected)
+        wait_for(lambda: not running.connected)
+        authority.mount(mounted, "detector")
+        wait_for(lambda: "no session as client" in running.standing.problem)
+        assert running.dead is None
+        with guarded_router(at, authority) as source:
+
+            def arrived() -> bool:
+                source.put("vehicles/car1/pose", "1")
+                return bool(arrivals.seen)
+
+            wait_for(arrived)
+            authority.mount(mounted, "detector")
+            wait_for(lambda: running.standing.renewals == 1, PATIENCE * 2)

@@ -1,0 +1,147 @@
+"""The database is away for a minute under load: events and recordings go on, and what it then lacks is counted."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.mongodb import MongoServer
+from tests.mongodb.way import Way
+from tests.process.database_desk import wait_until
+from tests.process.running import PATIENCE, Process
+from tests.unit.driving import a_rule, a_stream
+from tests.unit.recording_bench import mcap_files, read_with_mcap
+
+AWAY = 60.0
+"""Seconds, and at 100 Hz from two clients more than the memory has room for beside the smaller spool."""
+
+CLIENTS = ("car1", "car2")
+PADDING = "x" * 12_000
+
+
+class Detecting(Process):
+    """A detector that writes each bout to a database and to a recording."""
+
+    def __init__(self, folder: Path, database: Any, spool: str) -> None:
+        folder.mkdir()
+        super().__init__(folder)
+        self.database = database
+        window = {"before": "50ms", "after": "50ms"}
+        rule = a_rule(
+            "bout",
+            signals=[{"name": "v", "stream": "speed", "value": "msg.v"}],
+            when="v > 10",
+            evaluation={"every": "100ms"},
+            actions=[
+                {"name": "bag", "record": window},
+                {"name": "keep", "database": {"database": database.name, **window}},
+            ],
+        )
+        self.write(
+            rule,
+            streams=(a_stream("speed"),),
+            database={"uriVariable": "TEST_MONGODB_URI", "spool": {"path": "spool", "bytes": spool}},
+            recordings={"path": "recordings", "reserve": "0"},
+        )
+        self.start()
+
+    def episodes(self, kind: str) -> list[str]:
+        """Ids of those that have begun or ended."""
+        events = [json.loads(line) for line in (self.folder / "out" / "events.jsonl").read_text().splitlines()]
+        return [each["data"]["episode"] for each in events if each["type"].endswith(kind)]
+
+    def scenarios(self) -> list[dict[str, Any]]:
+        return list(self.database["Scenarios"].find())
+
+    def recorded(self) -> dict[str, list[tuple[str, float]]]:
+        """Keys and numbers of what the recordings have, by episode."""
+        found = {}
+        for told in self.folder.glob("recordings/*/[!.]*/recording.json"):
+            messages = [each for file in mcap_files(told.parent) for each in read_with_mcap(file)]
+            numbers = [(each.topic.lstrip("/"), float(json.loads(each.payload)["n"])) for each in messages]
+            found[json.loads(told.read_text())["episode"]] = sorted(numbers)
+        return found
+
+    def stored(self) -> dict[str, list[tuple[str, float]]]:
+        """The same of the documents, by scenario; read in one go, since the server reads all for each query."""
+        found: dict[str, list[tuple[str, float]]] = {}
+        for each in self.database["json/speed"].find({}, {"scenario": 1, "key": 1, "msg.n": 1}):
+            found.setdefault(each["scenario"], []).append((each["key"], each["msg"]["n"]))
+        return {scenario: sorted(numbers) for scenario, numbers in found.items()}
+
+
+@pytest.fixture
+def pair(
+    tmp_path: Path, way: Way, mongodb: MongoServer, database: Any, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Detecting, Detecting]]:
+    """One with room for everything on its disk, one with little."""
+    monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
+    client = database.client
+    ample = Detecting(tmp_path / "ample", client[f"{database.name}a"], "2Gi")
+    tight = Detecting(tmp_path / "tight", client[f"{database.name}t"], "4Mi")
+    yield ample, tight
+    for each in (ample, tight):
+        assert each.stop() == 0
+        client.drop_database(each.database.name)
+
+
+def drive(detectors: tuple[Detecting, Detecting], seconds: float) -> None:
+    """Each client's speed passes the threshold twice a second, for most of the time; then all stand."""
+    begin = time.monotonic()
+    for number in range(int(seconds * 100)):
+        time.sleep(max(0.0, begin + number / 100 - time.monotonic()))
+        value = {"v": 0 if number % 50 >= 40 else 20, "n": number, "pad": PADDING}
+        for process in detectors:
+            for client in CLIENTS:
+                process.send(client, value)
+    for process in detectors:
+        for client in CLIENTS:
+            process.send(client, {"v": 0, "n": -1})
+
+
+def test_a_minute_without_the_database_costs_neither_events_nor_recordings_and_every_loss_is_counted(
+    pair: tuple[Detecting, Detecting], way: Way
+) -> None:
+    drive(pair, 3)
+    for each in pair:
+        wait_until(lambda each=each: any(one["complete"] for one in each.scenarios()), PATIENCE)
+    before = [len(each.episodes("started")) for each in pair]
+    way.cut()
+    drive(pair, AWAY)
+    for each, earlier in zip(pair, before, strict=True):
+        wait_until(lambda each=each: len(each.episodes("ended")) == len(each.episodes("started")), PATIENCE)
+        begun = each.episodes("started")
+        assert len(begun) - earlier > AWAY  # two clients, and a bout lasts half a second
+        wait_until(lambda each=each, begun=begun: each.recorded().keys() == set(begun), PATIENCE, pause=1.0)
+        assert not {one["episode"] for one in each.scenarios()} & set(begun[earlier:])
+    way.restore()
+    for each in pair:
+        begun = each.episodes("started")
+
+        def settled(each: Detecting = each, begun: list[str] = begun) -> bool:
+            there = each.scenarios()
+            return {one["episode"] for one in there} == set(begun) and all(one["state"] != "Open" for one in there)
+
+        wait_until(settled, 3 * PATIENCE, pause=1.0)
+    ample, tight = pair
+    recorded, stored = ample.recorded(), ample.stored()
+    assert sum(len(numbers) for numbers in recorded.values()) > AWAY * 100
+    for scenario in ample.scenarios():
+        assert scenario["state"] == "Complete"
+        assert stored[scenario["_id"]] == recorded[scenario["episode"]]
+    recorded, stored, missing = tight.recorded(), tight.stored(), 0
+    for scenario in tight.scenarios():
+        wanted, found = recorded[scenario["episode"]], stored.get(scenario["_id"], [])
+        assert len(set(found)) == len(found)
+        assert set(found) <= set(wanted)
+        assert scenario["complete"] == (found == wanted)
+        assert scenario.get("missing", 0) == len(wanted) - len(found)
+        missing += len(wanted) - len(found)
+    assert missing > 0
+    told = {key[1]: value for key, value in tight.metrics().items() if key[0] == "action_missing_total"}
+    assert told == {"bag": 0, "keep": missing}

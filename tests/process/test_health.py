@@ -1,0 +1,129 @@
+"""What a detector says of its health, of real processes in which something is made to fail."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import urllib.error
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.networks import router_process, wait_for
+from tests.ports import free_endpoint
+from tests.process.running import PATIENCE, Process
+from tests.unit.driving import a_rule, a_stream
+
+ALWAYS = a_rule("r", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 10")
+
+FAULTS = """
+import asyncio, os, sys, threading, time
+import detector.answers
+from detector import cli
+from detector.engine.engine import Engine
+from detector.running import Running
+
+detector.answers._SILENT = 1.0
+
+def until_gone(path):
+    while os.path.exists(path):
+        time.sleep(0.01)
+
+advance = Engine.advance
+def stalled(self, *args):
+    until_gone("stall-evaluation")
+    return advance(self, *args)
+Engine.advance = stalled
+
+enter = Running.__enter__
+def entered(self):
+    async def hang():
+        while True:
+            until_gone("stall-loop")
+            await asyncio.sleep(0.01)
+    self.hanging = asyncio.get_running_loop().create_task(hang())
+    return enter(self)
+Running.__enter__ = entered
+sys.exit(cli.main())
+"""
+"""A detector that stands still while a file is there. No product would have this in it."""
+
+
+class Faulty(Process):
+    """`detector run` in which faults can be made."""
+
+    def start(self, *options: str) -> None:
+        (self.folder / "faulty.py").write_text(FAULTS)
+        files = [*options, "--detector", "detector.yaml", "--rules", "rules.yaml", "--metrics-port", str(self.port)]
+        log = (self.folder / "log").open("w")
+        self.process = subprocess.Popen(
+            [sys.executable, "faulty.py", "run", *files], cwd=self.folder, stdout=log, stderr=log
+        )
+
+    def health(self, page: str) -> tuple[int, str]:
+        try:
+            return 200, self.page(page)
+        except urllib.error.HTTPError as error:
+            return error.code, error.read().decode()
+        except OSError:  # it is just starting
+            return 0, ""
+
+
+@pytest.fixture
+def faulty(tmp_path: Path) -> Iterator[Faulty]:
+    process = Faulty(tmp_path)
+    yield process
+    process.process.kill()
+    process.process.wait(PATIENCE)
+
+
+def has(faulty: Faulty, page: str, code: int, text: str) -> Callable[[], bool]:
+    def holds() -> bool:
+        found = faulty.health(page)
+        return found[0] == code and text in found[1]
+
+    return holds
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [("stall-evaluation", "the evaluation looked"), ("stall-loop", "the event loop has not run for")],
+)
+def test_what_stands_still_is_not_live_and_live_again_once_it_goes_on(faulty: Faulty, fault: str, says: str) -> None:
+    faulty.write(ALWAYS, streams=(a_stream("speed"),))
+    faulty.start()
+    wait_for(has(faulty, "/readyz", 200, "looked"))
+    (faulty.folder / fault).touch()
+    wait_for(has(faulty, "/healthz", 503, says))
+    assert has(faulty, "/readyz", 503, says)()
+    (faulty.folder / fault).unlink()
+    wait_for(has(faulty, "/healthz", 200, "looked"))
+
+
+def test_a_router_that_is_away_makes_it_unready_and_leaves_it_live_with_its_buffer(
+    faulty: Faulty, tmp_path: Path
+) -> None:
+    endpoint = free_endpoint()
+    faulty.endpoint = endpoint
+    faulty.write(ALWAYS, streams=(a_stream("speed"),))
+    document = json.loads((tmp_path / "detector.yaml").read_text())
+    document["spec"]["zenoh"] = {"mode": "client", "connect": [endpoint]}
+    (tmp_path / "detector.yaml").write_text(json.dumps(document))
+    faulty.start()
+    wait_for(has(faulty, "/readyz", 503, "no Zenoh session yet"))
+    assert has(faulty, "/healthz", 200, "looked")()
+    with router_process(endpoint):
+        wait_for(has(faulty, "/readyz", 200, "looked"))
+    wait_for(has(faulty, "/readyz", 503, "nobody is connected"))
+    assert has(faulty, "/healthz", 200, "looked")()
+    with router_process(endpoint):
+        wait_for(has(faulty, "/readyz", 200, "looked"))
+
+
+def test_a_silent_stream_is_no_illness(faulty: Faulty) -> None:
+    faulty.write(ALWAYS, streams=(a_stream("speed", staleAfter="100ms"),), clientTimeout="100ms")
+    faulty.start()
+    wait_for(has(faulty, "/readyz", 200, "looked"))
+    assert has(faulty, "/healthz", 200, "looked")()

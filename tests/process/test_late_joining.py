@@ -1,0 +1,110 @@
+"""What Advanced Publishers remember is asked for, what was lost on the way is asked for again, and counted."""
+
+import re
+import time
+
+import pytest
+import zenoh
+from zenoh import ext
+
+from detector.assembly import DetectorError, inlets
+from detector.streams.tally import Cause, Tally
+from detector.streams.zenoh import Network
+from tests.networks import PATIENCE, Arrivals, router, stream, wait_for
+from tests.ports import free_endpoint
+from tests.unit.driving import a_detector, a_stream
+from wayside.api.base import PositiveDuration
+from wayside.api.stream import History, Stream
+from wayside.api.zenoh import Zenoh, ZenohMode
+
+KEY = "vehicles/car1/pose"
+
+LOSSY = [{"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "vehicles/**", "freq": 4.0}]}]
+"""The router lets only so many samples a second pass."""
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def arrivals() -> Arrivals:
+    return Arrivals()
+
+
+def network(endpoint: str, arrivals: Arrivals, tally: Tally, streams: list[Stream]) -> Network:
+    running = Network(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint]), streams, arrivals.putter, tally=tally)
+    running.start()
+    wait_for(lambda: running.connected)
+    return running
+
+
+def remembering(session: zenoh.Session) -> ext.AdvancedPublisher:
+    return ext.declare_advanced_publisher(
+        session,
+        KEY,
+        cache=ext.CacheConfig(100),
+        sample_miss_detection=ext.MissDetectionConfig(heartbeat=0.1, sporadic_heartbeat=None),
+        publisher_detection=True,
+    )
+
+
+def test_a_late_joiner_gets_the_history_that_it_asks_for(endpoint: str, arrivals: Arrivals) -> None:
+    streams = [
+        stream("none"),
+        stream("newest", history=History(samples=3)),
+        stream("young", history=History(age=PositiveDuration("1h"))),
+        stream("all", history=History()),
+    ]
+    with router(listen__endpoints=[endpoint]) as session:
+        publisher = remembering(session)
+        for number in range(10):
+            publisher.put(str(number))
+        running = network(endpoint, arrivals, Tally(), streams)
+        arrivals.wait_for(lambda seen: len(seen) >= 23)
+        publisher.put("10")
+        arrivals.wait_for(lambda seen: sum(payload == b"10" for _, _, payload in seen) == 4)
+        running.close()
+    payloads = {
+        each.name: [int(payload) for name, _, payload in arrivals.seen if name == each.name] for each in streams
+    }
+    assert payloads == {"none": [10], "newest": [7, 8, 9, 10], "young": [*range(11)], "all": [*range(11)]}
+
+
+def test_samples_lost_on_the_way_are_counted_or_asked_for_again(endpoint: str, arrivals: Arrivals) -> None:
+    tally = Tally()
+    streams = [stream("counted", history=History(samples=1)), stream("recovered", recover=True)]
+    with router(listen__endpoints=[endpoint], downsampling=LOSSY):
+        running = network(endpoint, arrivals, tally, streams)
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+        with zenoh.open(config) as vehicle:
+            publisher = remembering(vehicle)
+            deadline, number = time.monotonic() + PATIENCE, 0
+            while not tally.entries():
+                assert time.monotonic() < deadline
+                publisher.put(str(number))
+                number += 1
+                time.sleep(0.01)
+            arrivals.wait_for(lambda seen: sum(name == "recovered" for name, _, _ in seen) == number)
+        running.close()
+    recovered = [int(payload) for name, _, payload in arrivals.seen if name == "recovered"]
+    counted = [int(payload) for name, _, payload in arrivals.seen if name == "counted"]
+    assert recovered == [*range(number)]
+    (entry,) = tally.entries()
+    assert (entry.cause, entry.name) == (Cause.MISSED, "counted")
+    assert entry.count == counted[-1] - counted[0] + 1 - len(counted)
+
+
+def test_history_is_for_streams_over_zenoh() -> None:
+    detector = a_detector(
+        a_stream("pose", source="broker", history={}),
+        a_stream("speed", source="broker", recover=True),
+        sources=[{"name": "broker", "plugin": "mqtt"}],
+    )
+    with pytest.raises(DetectorError, match=re.escape("spec.streams[0].history: is for streams over Zenoh")) as caught:
+        inlets(detector)
+    assert "spec.streams[1].recover: is for streams over Zenoh" in str(caught.value)

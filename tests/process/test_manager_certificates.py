@@ -1,0 +1,78 @@
+"""The manager's connection to Zenoh when its certificate is renewed: it connects anew with the new files."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import json
+import threading
+from pathlib import Path
+
+import pytest
+
+from application_manager.work.publishing import Publisher, settings
+from tests.networks import router, wait_for
+from tests.ports import free_endpoint
+from tests.unit.certificates import Authority
+
+SHORT = datetime.timedelta(seconds=12)
+
+
+def test_at_the_end_of_its_certificate_it_goes_on_with_the_new_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    authority, at = Authority(tmp_path), free_endpoint().replace("tcp/127.0.0.1", "tls/localhost")
+    mounted = tmp_path / "own"
+    authority.mount(mounted, "manager", lasting=SHORT)
+    config = {
+        "mode": "client",
+        "connect": {"endpoints": [at]},
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {
+            "link": {
+                "tls": {
+                    "root_ca_certificate": str(mounted / "ca.crt"),
+                    "connect_certificate": str(mounted / "tls.crt"),
+                    "connect_private_key": str(mounted / "tls.key"),
+                    "enable_mtls": True,
+                }
+            }
+        },
+    }
+    (tmp_path / "zenoh.json5").write_text(json.dumps(config))
+    certificate, key = authority.sign("router")
+    tls = {
+        "listen_certificate": str(certificate),
+        "listen_private_key": str(key),
+        "root_ca_certificate": str(authority.ca),
+        "enable_mtls": True,
+        "close_link_on_expiration": True,
+    }
+    heard: list[str] = []
+    with router(listen__endpoints=[at], transport__link__tls=tls) as network:
+        kept = network.declare_subscriber("wayside/**", lambda sample: heard.append(sample.payload.to_string()))
+        publisher = Publisher(settings([str(tmp_path / "zenoh.json5")]))
+        over, going = threading.Event(), threading.Event()
+
+        async def run() -> None:
+            running = asyncio.create_task(publisher.run())
+            publisher.publish(("site", "fusion"), {"a": "1"})
+            going.set()
+            await asyncio.to_thread(over.wait)
+            publisher.finish()
+            await running
+
+        thread = threading.Thread(target=lambda: asyncio.run(run()))
+        thread.start()
+        try:
+            going.wait()
+            wait_for(lambda: bool(heard))
+            authority.mount(mounted, "manager")
+            wait_for(lambda: "zenoh: a connection is lost" in caplog.text)
+            heard.clear()
+            wait_for(lambda: '{"a": "1"}' in heard)
+        finally:
+            over.set()
+            thread.join()
+        del kept

@@ -1,0 +1,182 @@
+"""Alerts: they fire at the start, are repeated before they lapse, are resolved at the end, and keep their labels."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from detector.actions import Completion, OutcomeState
+from detector.actions.notify import alerts
+from tests.http_servers import Endpoint, answers, endpoint, hangs, holds
+from tests.unit.notifying import a_desk, an_episode
+from wayside.times import parse_time
+
+NOBODY = "alerts that nobody heard of"
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(alerts, "FIRST", 0.02)
+    monkeypatch.setattr(alerts, "LONGEST", 0.1)
+
+
+@pytest.fixture
+def there() -> Iterator[Endpoint]:
+    with endpoint() as made:
+        yield made
+
+
+def notify(there: Endpoint, repeat: str = "1h", **fields: Any) -> dict[str, Any]:
+    return {"alertmanager": {"url": f"{there.url}/am/", "repeat": repeat}, "waiting": 100, **fields}
+
+
+def posted(there: Endpoint, count: int = 1) -> list[dict[str, Any]]:
+    """The alerts of so many requests."""
+    return [alert for request in there.received(count) for alert in json.loads(request.body)]
+
+
+def open_of(episode: Any) -> Any:
+    return replace(episode, ended=None, end_time=None, reason=None)
+
+
+def test_an_alert_fires_at_the_start_and_is_resolved_at_the_end(there: Endpoint) -> None:
+    desk = a_desk(notify(there, title="t", text="x", labels={"severity": "page"}))
+    episode = an_episode(rendered={"title": "braking", "text": "car1 brakes", "labels": {"severity": "page", "n": ""}})
+    desk.action.started(open_of(episode))
+    (first,) = posted(there)
+    assert (there.requests[0].method, there.requests[0].path) == ("POST", "/am/api/v2/alerts")
+    assert there.requests[0].headers["content-type"] == "application/json"
+    assert first["labels"] == {
+        "alertname": "braking",
+        "detector": "h",
+        "subject": "car1",
+        "episode": "e1",
+        "severity": "page",
+    }
+    assert first["annotations"] == {"summary": "braking", "description": "car1 brakes"}
+    assert desk.outcome("e1", OutcomeState.RUNNING).message == "fires"
+    desk.action.ended(episode)
+    second = posted(there, 2)[1]
+    assert second["labels"] == first["labels"]
+    assert second["startsAt"] == first["startsAt"] == "2026-01-01T00:00:00.000000000Z"
+    assert second["endsAt"] == "2026-01-01T00:00:05.000000000Z"
+    assert parse_time(first["endsAt"]) - 4 * 3600 * 10**9 > parse_time(first["startsAt"])
+    desk.outcome("e1")
+    desk.action.completed(episode, Completion())
+    desk.end()
+    assert len(there.requests) == 2
+
+
+def test_an_alert_is_repeated_with_a_later_end_while_its_episode_lasts(there: Endpoint) -> None:
+    desk = a_desk(notify(there, repeat="50ms"))
+    desk.action.started(open_of(an_episode()))
+    ends = [parse_time(alert["endsAt"]) for alert in posted(there, 4)[:4]]
+    assert ends == sorted(set(ends))
+    desk.action.ended(an_episode())
+    desk.outcome("e1")
+    count = len(there.requests)
+    desk.end()
+    assert len(there.requests) == count
+
+
+def test_many_alerts_share_a_request(there: Endpoint) -> None:
+    told = threading.Event()
+    there.behaviour = holds(told, answers(200))
+    desk = a_desk(notify(there))
+    desk.action.started(open_of(an_episode("e0")))
+    there.received(1)
+    for number in range(1, 50):
+        desk.action.started(open_of(an_episode(f"e{number}", f"car{number}")))
+    told.set()
+    desk.outcome("e49", OutcomeState.RUNNING)
+    assert len(posted(there, 2)) == 1 + 49
+    desk.end()
+
+
+def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(there: Endpoint) -> None:
+    ended = threading.Event()
+    there.behaviour = holds(ended, answers(503))
+    desk = a_desk(notify(there))
+    desk.action.started(open_of(an_episode()))
+    there.received(1)
+    desk.action.ended(an_episode())
+    there.behaviour = answers(200)
+    ended.set()
+    first, second = posted(there, 2)
+    assert parse_time(first["endsAt"]) > parse_time(second["endsAt"])
+    failed = desk.outcome("e1", OutcomeState.FAILED)
+    assert "heard of only when it was over" in failed.message
+    assert desk.lost[NOBODY] == 1
+    desk.end()
+
+
+def test_an_alertmanager_that_is_away_for_a_while_hears_of_it_when_it_is_back(there: Endpoint) -> None:
+    there.behaviour = answers(503)
+    desk = a_desk(notify(there))
+    desk.action.started(open_of(an_episode()))
+    there.received(3)
+    assert desk.outcome("e1", OutcomeState.RUNNING).message == "not delivered yet: answered 503"
+    there.behaviour = answers(200)
+    desk.until(lambda: desk.outcomes[-1][1].message == "fires")
+    desk.action.ended(an_episode())
+    desk.outcome("e1")
+    desk.end()
+    assert not desk.lost
+
+
+def test_what_is_over_and_refused_is_a_dead_letter(there: Endpoint, tmp_path: Path) -> None:
+    there.behaviour = answers(400, b"bad label")
+    desk = a_desk(notify(there), state=tmp_path)
+    desk.action.started(open_of(an_episode()))
+    desk.until(lambda: desk.lost["times that alerts were refused"])
+    desk.action.ended(an_episode())
+    assert desk.outcome("e1", OutcomeState.FAILED).message == "not delivered: answered 400: bad label"
+    (file,) = (tmp_path / "notify").glob("*.dead.jsonl")
+    assert json.loads(file.read_text())["event"]["id"] == "e1.ended"
+    desk.end()
+
+
+def test_more_alerts_than_may_be_are_dead_letters(there: Endpoint) -> None:
+    there.behaviour = hangs()
+    desk = a_desk(notify(there) | {"waiting": 2})
+    for number in range(3):
+        desk.action.started(open_of(an_episode(f"e{number}")))
+    assert "more messages wait" in desk.outcome("e2", OutcomeState.FAILED).message
+    desk.end()
+
+
+def test_at_the_end_what_is_over_is_told_and_what_fires_is_left_to_the_next_start(there: Endpoint) -> None:
+    there.behaviour = answers(503, Retry_After="60")
+    desk = a_desk(notify(there))
+    desk.action.started(open_of(an_episode("over")))
+    there.received(1)
+    desk.outcome("over", OutcomeState.RUNNING)
+    desk.action.started(open_of(an_episode("open")))
+    desk.action.ended(an_episode("over"))
+    there.behaviour = answers(200)
+    desk.end()
+    told = {alert["labels"]["episode"]: alert for alert in json.loads(there.requests[-1].body)}
+    assert told["over"]["endsAt"] == "2026-01-01T00:00:05.000000000Z"
+    assert parse_time(told["open"]["endsAt"]) > parse_time(told["over"]["endsAt"])
+    assert "had not ended" in desk.outcome("open").message
+    assert len(there.requests) == 2
+
+
+def test_a_resumed_episode_has_the_labels_that_it_had(there: Endpoint, tmp_path: Path) -> None:
+    rule = notify(there, labels={"road": "${road}"})
+    first = a_desk(rule, state=tmp_path)
+    first.action.started(open_of(an_episode(rendered={"labels": {"road": "A1"}})))
+    there.received(1)
+    first.end()
+    second = a_desk(rule, state=tmp_path)
+    second.action.started(open_of(an_episode(resumed=True, unrendered={"labels": "it is of before the restart"})))
+    before, after = posted(there, 2)
+    assert before["labels"] == after["labels"]
+    assert before["labels"]["road"] == "A1"
+    second.end()

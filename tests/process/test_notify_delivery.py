@@ -1,0 +1,391 @@
+"""Notifications over HTTP and Zenoh: what arrives, what is tried again, and what becomes of what nobody takes."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from cloudevents.core.bindings.http import HTTPMessage, from_http_event
+
+from detector.actions import Completion, OutcomeState
+from detector.actions.notify import outbox
+from tests.http_servers import Behaviour, Endpoint, Received, answers, drips, endpoint, hangs, sends
+from tests.ports import free_endpoint
+from tests.unit.notifying import a_desk, an_episode
+
+LOST = "events that nobody was told of"
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Retries after hundredths of a second."""
+    monkeypatch.setattr(outbox, "FIRST", 0.02)
+    monkeypatch.setattr(outbox, "LONGEST", 0.1)
+
+
+@pytest.fixture
+def there() -> Iterator[Endpoint]:
+    with endpoint() as made:
+        yield made
+
+
+def http(there: Endpoint, timeout: str = "5s", **fields: Any) -> dict[str, Any]:
+    return {"url": f"{there.url}/hook", "timeout": timeout, **fields}
+
+
+def events(requests: list[Received]) -> list[dict[str, Any]]:
+    return [json.loads(request.body) for request in requests]
+
+
+def ids(requests: list[Received]) -> list[str]:
+    return [event["id"] for event in events(requests)]
+
+
+def letters(state: Path) -> list[dict[str, Any]]:
+    (file,) = (state / "notify").glob("*.dead.jsonl")
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+@pytest.mark.parametrize("mode", ["Structured", "Binary"])
+def test_the_cloudevents_sdk_reads_what_arrives(there: Endpoint, mode: str) -> None:
+    texts = {"title": "car1 brakes", "text": "at 12.5 m/s", "labels": {"severity": "warning", "speed": 12.0}}
+    desk = a_desk({"http": http(there, mode=mode)})
+    desk.run(an_episode(client="Käfer 1%", rendered=texts))
+    start, end = there.received(2)
+    for request, what in ((start, "started"), (end, "ended")):
+        event = from_http_event(HTTPMessage(request.headers, request.body))
+        assert event.get_id() == f"e1.{what}"
+        assert event.get_type() == f"dev.wayside.event.{what}"
+        assert event.get_source() == "/detectors/h"
+        assert event.get_subject() == "Käfer 1%"
+        data = event.get_data()
+        assert isinstance(data, dict)
+        assert data["values"] == {"speed": 12.5}
+        assert data["notification"] == {**texts, "labels": {"severity": "warning", "speed": "12"}}
+    assert (start.method, start.path) == ("POST", "/hook")
+    done = desk.outcome("e1")
+    assert done.details == {"messages": 2, "attempts": 2}
+    assert done.bytes > 0
+    desk.end()
+
+
+@pytest.mark.parametrize(("wanted", "told"), [(["Started"], ["e1.started"]), (["Ended"], ["e1.ended"])])
+def test_only_the_wanted_events_are_told(there: Endpoint, wanted: list[str], told: list[str]) -> None:
+    desk = a_desk({"http": http(there), "events": wanted})
+    desk.run(an_episode())
+    desk.outcome("e1")
+    assert ids(there.requests) == told
+    desk.end()
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        answers(500, b"out of memory"),
+        answers(408),
+        answers(503, Retry_After="0"),
+        sends(b""),
+        sends(b"HTTP/1.1 200 OK\r\nContent-Length: 1\r\n\r\n" + b"x" * 99_999),
+        hangs(),
+        drips(b"HTTP/1.1 200 OK\r\nX: "),
+    ],
+    ids=["500", "408", "503", "hangs up", "lies", "hangs", "drips"],
+)
+def test_what_fails_is_tried_again_until_it_arrives(there: Endpoint, fault: Behaviour) -> None:
+    there.behaviour = fault
+    desk = a_desk({"http": http(there, "200ms"), "events": ["Started"]})
+    desk.run(an_episode())
+    there.received(2)
+    running = desk.outcome("e1", OutcomeState.RUNNING)
+    assert running.message.startswith("not delivered yet: ")
+    there.behaviour = answers(204)
+    assert desk.outcome("e1").details["attempts"] >= 3
+    assert set(ids(there.requests)) == {"e1.started"}
+    assert not desk.lost
+    desk.end()
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        (answers(400, b"no such field: x"), "answered 400: no such field: x"),
+        (answers(401), "answered 401"),
+        (answers(302, Location="http://localhost:1/elsewhere"), "answered 302: redirects are not followed"),
+    ],
+)
+def test_what_is_refused_is_a_dead_letter_at_once(there: Endpoint, tmp_path: Path, fault: Behaviour, why: str) -> None:
+    there.behaviour = fault
+    desk = a_desk({"http": http(there), "text": "${a}"}, state=tmp_path)
+    desk.run(an_episode(rendered={"text": "car1 brakes"}))
+    failed = desk.outcome("e1", OutcomeState.FAILED)
+    assert failed.message.startswith(f"not delivered: {why}")
+    assert failed.missing == 2
+    assert desk.lost[LOST] == 2
+    assert len(there.requests) == 2
+    first, second = letters(tmp_path)
+    assert (first["event"]["id"], second["event"]["id"]) == ("e1.started", "e1.ended")
+    assert first["texts"] == {"text": "car1 brakes"}
+    assert (first["rule"], first["action"], first["attempts"]) == ("braking", "tell", 1)
+    desk.end()
+
+
+def test_what_does_not_arrive_in_time_is_given_up(tmp_path: Path) -> None:
+    with endpoint() as gone:
+        pass
+    desk = a_desk({"http": http(gone), "giveUpAfter": "100ms", "events": ["Ended"]}, state=tmp_path)
+    desk.run(an_episode())
+    failed = desk.outcome("e1", OutcomeState.FAILED)
+    assert "attempts, http://localhost" in failed.message
+    assert "/hook" not in failed.message
+    assert [letter["event"]["id"] for letter in letters(tmp_path)] == ["e1.ended"]
+    desk.end()
+
+
+def test_a_message_that_the_endpoint_cannot_take_holds_up_no_other_episode(there: Endpoint) -> None:
+    def poisoned(here: Endpoint, connection: Any, request: Received) -> None:
+        answers(500 if b'"e1.' in request.body else 200)(here, connection, request)
+
+    there.behaviour = poisoned
+    desk = a_desk({"http": http(there)})
+    desk.run(an_episode("e1"), an_episode("e2"))
+    desk.outcome("e2")
+    assert "e1.ended" not in ids(there.requests), "the end is not told before the start"
+    desk.end()
+
+
+def test_the_end_is_told_after_the_start(there: Endpoint) -> None:
+    there.behaviour = answers(500)
+    desk = a_desk({"http": http(there)})
+    desk.run(an_episode())
+    there.received(3)
+    there.behaviour = answers(200)
+    desk.outcome("e1")
+    told = ids(there.requests)
+    assert told[-1] == "e1.ended"
+    assert set(told[:-1]) == {"e1.started"}
+    desk.end()
+
+
+def test_an_endpoint_that_says_when_is_left_alone_until_then(there: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+    there.behaviour = answers(429, Retry_After="1")
+    desk = a_desk({"http": http(there), "events": ["Started"]})
+    desk.run(an_episode("e1"), an_episode("e2"))
+    (refused,) = there.received(1)
+    there.behaviour = answers(200)
+    desk.outcome("e1")
+    assert there.requests[1].at - refused.at > 0.9
+    desk.outcome("e2")
+    assert len(there.requests) == 3
+    desk.end()
+
+
+def test_who_tells_does_not_wait_for_an_endpoint_that_hangs(there: Endpoint) -> None:
+    there.behaviour = hangs()
+    desk = a_desk({"http": http(there, "30s"), "waiting": 3, "events": ["Started"]})
+    desk.run(an_episode("e0"))
+    there.received(1)
+    begun = time.monotonic()
+    desk.run(*(an_episode(f"e{number}") for number in range(1, 200)))
+    assert time.monotonic() - begun < 20
+    assert desk.lost[LOST] == 197  # three wait, one of them being sent
+    assert "more messages wait than the rule allows" in desk.outcome("e199", OutcomeState.FAILED).message
+    begun = time.monotonic()
+    desk.end()
+    assert time.monotonic() - begun < 20, "the end does not wait for the endpoint either"
+
+
+def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
+    desk = a_desk(
+        {
+            "http": http(there),
+            "events": ["Started"],
+            "text": "${client} stands",
+            "labels": {"road": "${road}"},
+            "grouping": {"wait": "3s", "by": ["road"], "maximum": 3},
+        }
+    )
+    for number in range(100):
+        desk.run(an_episode(f"e{number}", f"car{number}", {"text": f"car{number} stands", "labels": {"road": "A1"}}))
+    desk.run(an_episode("other", "bus", {"text": "bus stands", "labels": {"road": "B7"}}))
+    first, second = events(there.received(2))
+    assert first["type"] == "dev.wayside.event.group"
+    assert first["data"]["count"] == first["data"]["started"] == 100
+    assert [event["subject"] for event in first["data"]["events"]] == ["car0", "car1", "car2"]
+    assert first["data"]["omitted"] == 97
+    assert first["data"]["notification"] == {"text": "car0 stands (and 99 more)", "labels": {"road": "A1"}}
+    assert (second["data"]["count"], second["data"]["notification"]["text"]) == (1, "bus stands")
+    for number in range(100):
+        desk.outcome(f"e{number}")
+    assert len(there.requests) == 2
+    desk.end()
+
+
+def test_no_more_messages_go_out_than_the_rate_allows(there: Endpoint) -> None:
+    desk = a_desk({"http": http(there), "events": ["Started"], "rate": {"messages": 3, "per": "1h"}})
+    desk.run(*(an_episode(f"e{number}") for number in range(10)))
+    there.received(3)
+    desk.outcome("e2")
+    desk.end()  # also then
+    assert len(there.requests) == 3
+    assert desk.lost[LOST] == 7
+
+
+def test_at_the_end_what_waits_is_tried_once_more(there: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outbox, "FIRST", 60.0)
+    monkeypatch.setattr(outbox, "LONGEST", 60.0)
+    there.behaviour = answers(500)
+    desk = a_desk({"http": http(there), "events": ["Started"]})
+    desk.run(an_episode("e1"), an_episode("e2"))
+    desk.outcome("e2", OutcomeState.RUNNING)
+    there.behaviour = answers(200)
+    desk.end()
+    desk.outcome("e1")
+    desk.outcome("e2")
+    assert not desk.lost
+    assert len(there.requests) == 4
+
+
+def test_at_the_end_a_group_does_not_wait(there: Endpoint) -> None:
+    desk = a_desk({"http": http(there), "grouping": {"wait": "1h"}})
+    desk.run(an_episode("e1"), an_episode("e2"))
+    desk.end()
+    assert [event["data"]["count"] for event in events(there.requests)] == [4]
+
+
+def test_what_cannot_be_delivered_by_the_end_is_a_dead_letter_where_nothing_keeps_it() -> None:
+    with endpoint() as gone:
+        pass
+    desk = a_desk({"http": http(gone), "events": ["Started"]})
+    desk.run(an_episode("e1"), an_episode("e2"))
+    desk.end()
+    assert desk.lost[LOST] == 2
+    assert "before it was delivered" in desk.outcome("e1", OutcomeState.FAILED).message
+
+
+def test_what_cannot_be_delivered_by_the_end_is_delivered_after_the_next_start(there: Endpoint, tmp_path: Path) -> None:
+    there.behaviour = answers(503)
+    notify = {"http": http(there), "text": "x"}
+    first = a_desk(notify, state=tmp_path)
+    first.run(an_episode("e1", rendered={"text": "car1 brakes"}))
+    there.received(1)
+    first.end()
+    assert not first.lost
+    assert "after the detector's next start" in first.outcomes[-1][1].message
+    there.requests.clear()
+    there.behaviour = answers(200)
+    second = a_desk(notify, state=tmp_path)
+    start, end = events(there.received(2))
+    assert (start["id"], end["id"]) == ("e1.started", "e1.ended")
+    assert start["data"]["notification"] == {"text": "car1 brakes"}
+    second.end()
+    assert not second.lost
+    third = a_desk(notify, state=tmp_path)
+    third.end()
+    assert len(there.requests) == 2
+    assert not list((tmp_path / "notify").iterdir())
+
+
+def test_an_action_that_the_rule_no_longer_has_leaves_dead_letters(tmp_path: Path) -> None:
+    with endpoint() as gone:
+        pass
+    desk = a_desk({"http": http(gone), "events": ["Started"]}, state=tmp_path)
+    desk.run(an_episode("e1"))
+    desk.action.close()
+    assert desk.lost[LOST] == 1
+    assert [letter["event"]["id"] for letter in letters(tmp_path)] == ["e1.started"]
+    assert len(list((tmp_path / "notify").iterdir())) == 1
+
+
+def test_of_a_resumed_episode_only_the_end_is_told_with_the_texts_of_its_start(there: Endpoint, tmp_path: Path) -> None:
+    notify = {"http": http(there), "text": "x"}
+    first = a_desk(notify, state=tmp_path)
+    first.action.started(
+        an_episode(
+            rendered={"text": "car1 brakes"},
+        )
+    )
+    there.received(1)
+    first.end()
+    second = a_desk(notify, state=tmp_path)
+    second.run(an_episode(resumed=True, unrendered={"text": "it is of before the restart"}))
+    end = events(there.received(2))[1]
+    assert (end["id"], end["data"]["notification"]) == ("e1.ended", {"text": "car1 brakes"})
+    second.outcome("e1")
+    second.end()
+
+
+def test_a_text_that_could_not_be_rendered_is_missing_and_said(there: Endpoint) -> None:
+    desk = a_desk({"http": http(there), "title": "t", "text": "x"})
+    desk.run(an_episode(rendered={"title": "braking"}, unrendered={"text": "speed is unknown"}))
+    assert events(there.received(1))[0]["data"]["notification"] == {"title": "braking"}
+    assert desk.outcome("e1").message == "text: speed is unknown"
+    desk.end()
+
+
+def test_an_episode_that_does_not_end_is_done_when_its_start_is_told(there: Endpoint) -> None:
+    desk = a_desk({"http": http(there)})
+    episode = an_episode()
+    open_ = type(episode)(**{**episode.__dict__, "ended": None, "end_time": None, "reason": None})
+    desk.action.started(open_)
+    there.received(1)
+    desk.action.completed(open_, Completion(cut="the detector stops"))
+    desk.outcome("e1")
+    desk.end()
+
+
+def test_a_secret_that_is_mounted_late_is_waited_for(
+    there: Endpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
+    desk = a_desk({"http": {"urlSecret": {"name": "hook", "key": "url"}}, "events": ["Started"]})
+    desk.run(an_episode())
+    assert "urlSecret: the Secret hook is not mounted" in desk.outcome("e1", OutcomeState.RUNNING).message
+    (tmp_path / "hook.new").mkdir()
+    (tmp_path / "hook.new" / "url").write_text(f"{there.url}/T0K3N\n")
+    (tmp_path / "hook.new").rename(tmp_path / "hook")
+    desk.outcome("e1")
+    assert there.requests[0].path == "/T0K3N"
+    assert all("T0K3N" not in outcome.message for _, outcome in desk.outcomes)
+    desk.end()
+
+
+class Session:
+    """A messenger over a real session."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def publish(self, key: str, payload: bytes, encoding: str) -> None:
+        self._session.put(key, payload, encoding=encoding)
+
+
+def test_a_zenoh_key_gets_the_event() -> None:
+    config = zenoh.Config()
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("listen/endpoints", json.dumps([free_endpoint()]))
+    arrived: list[tuple[str, str, dict[str, Any]]] = []
+    changed = threading.Event()
+
+    def take(sample: zenoh.Sample) -> None:
+        arrived.append((str(sample.key_expr), str(sample.encoding), json.loads(sample.payload.to_bytes())))
+        if len(arrived) == 2:
+            changed.set()
+
+    with zenoh.open(config) as session:
+        subscriber = session.declare_subscriber("city/alerts", take)
+        desk = a_desk({"zenoh": {"key": "city/alerts"}, "title": "t"}, messenger=Session(session))
+        desk.run(an_episode(rendered={"title": "braking"}))
+        assert changed.wait(60), arrived
+        desk.outcome("e1")
+        desk.end()
+        subscriber.undeclare()
+    assert [key for key, _, _ in arrived] == ["city/alerts"] * 2
+    assert {encoding for _, encoding, _ in arrived} == {"application/cloudevents+json"}
+    assert [event["id"] for _, _, event in arrived] == ["e1.started", "e1.ended"]
+    assert arrived[0][2]["data"]["notification"] == {"title": "braking"}

@@ -1,0 +1,295 @@
+"""Samples of rmw_zenoh nodes come in by their topics; what their keys and numbers tell is checked and counted."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.rosbag2 import Writer as BagWriter
+
+from detector.assembly import inlets, make_engine
+from detector.checking import check_documents
+from detector.engine.samples.intake import Intake
+from detector.losses import Losses
+from detector.replay.recordings import open_recordings
+from detector.replay.replaying import replay_arrivals
+from detector.replay.routing import Router
+from detector.streams.codecs.ros import standard
+from detector.streams.rmw_zenoh import MisfitError, numbered, split
+from detector.streams.sequences import MAXIMUM_PUBLISHERS, Sequences
+from detector.streams.tally import Cause, Tally
+from detector.streams.zenoh import Network
+from tests.networks import wait_for
+from tests.ports import free_endpoint
+from tests.unit.driving import Drive, a_detector, a_rule, at, compiled, lines
+from tests.unit.ros_messages import cdr, odometry, pose_stamped
+from wayside.api.documents import DocumentError, load_documents
+from wayside.api.zenoh import Zenoh
+
+POSE_TYPE = "geometry_msgs/msg/PoseStamped"
+POSE = {
+    "name": "pose",
+    "key": "vehicles/${client:*}/pose",
+    "layout": "RmwZenoh",
+    "encoding": "cdr",
+    "type": POSE_TYPE,
+}
+MOVED = a_rule("moved", signals=[{"name": "x", "stream": "pose", "value": "msg.pose.position.x"}], when="x > 10")
+
+
+def attachment(number: int, gid: bytes, *, named: bool = False) -> zenoh.ZBytes:
+    """As rmw_zenoh writes it, with Zenoh's own serializer; `named`: as its earlier versions did."""
+    values = {"sequence_number": zenoh.ext.Int64(number), "source_timestamp": zenoh.ext.Int64(1_767_225_600 * 10**9)}
+    parts = [
+        part.to_bytes()
+        for name, value in values.items()
+        for part in ([zenoh.ext.z_serialize(name)] if named else []) + [zenoh.ext.z_serialize(value)]
+    ]
+    parts += [zenoh.ext.z_serialize("source_gid").to_bytes()] if named else []
+    return zenoh.ZBytes(b"".join(parts) + zenoh.ext.z_serialize(gid).to_bytes())
+
+
+class Node:
+    """A publisher as rmw_zenoh makes one."""
+
+    def __init__(self, session: zenoh.Session, topic: str, *, type_name: str = POSE_TYPE, domain: int = 0) -> None:
+        package, _, name = type_name.split("/")
+        self._session = session
+        self._key = f"{domain}/{topic}/{package}::msg::dds_::{name}_/RIHS01_{'ab' * 32}"
+        self._gid = next(_GIDS).to_bytes(16, "little")
+        self._number = 0
+
+    def publish(self, payload: bytes, *, skip: int = 0, named: bool = False) -> None:
+        """Publishes a message, after so many that get lost."""
+        self._number += 1 + skip
+        self._session.put(
+            self._key,
+            payload,
+            attachment=attachment(self._number, self._gid, named=named),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+
+
+_GIDS = itertools.count(1)
+
+
+class Receiver:
+    """A network with one stream, and the intake that it fills."""
+
+    def __init__(self, **fields: Any) -> None:
+        self.intake = Intake(lambda: at(0))
+        self.tally = Tally()
+        self.detector = a_detector({**POSE, **fields})
+        self.endpoint = free_endpoint()
+        self.network = Network(
+            Zenoh(listen=[self.endpoint]),
+            self.detector.spec.streams,
+            self.intake.putter,
+            tally=self.tally,
+        )
+
+    def counted(self, cause: Cause) -> int:
+        return counted(self.tally, cause)
+
+    def losses(self) -> list[str]:
+        losses = Losses(Drive(self.detector, MOVED).engine, self.intake)
+        losses.watch(self.tally)
+        return [*losses.report()]
+
+
+def counted(tally: Tally, cause: Cause) -> int:
+    return sum(entry.count for entry in tally.entries() if entry.cause is cause)
+
+
+@pytest.fixture
+def receiver(request: pytest.FixtureRequest) -> Iterator[Receiver]:
+    receiver = Receiver(**getattr(request, "param", {}))
+    receiver.network.start()
+    yield receiver
+    receiver.network.close()
+
+
+@pytest.fixture
+def vehicle(receiver: Receiver) -> Iterator[zenoh.Session]:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/endpoints", f'["{receiver.endpoint}"]')
+    with zenoh.open(config) as session:
+        publisher = session.declare_publisher("7/vehicles/car1/pose/type/hash")
+        wait_for(lambda: publisher.matching_status.matching)
+        yield session
+
+
+def drained(receiver: Receiver, count: int) -> list[Any]:
+    arrivals: list[Any] = []
+
+    def all_there() -> bool:
+        arrivals.extend(receiver.intake.drain(0))
+        return len(arrivals) >= count
+
+    wait_for(all_there)
+    return arrivals
+
+
+def test_samples_come_in_by_their_topic_and_gaps_in_their_numbers_are_losses(
+    receiver: Receiver, vehicle: zenoh.Session
+) -> None:
+    one, other = Node(vehicle, "vehicles/car1/pose"), Node(vehicle, "vehicles/car2/pose", domain=7)
+    for step in range(4):
+        one.publish(cdr(pose_stamped(step)))
+        other.publish(cdr(pose_stamped(step)), skip=step)
+    arrivals = drained(receiver, 8)
+    assert [arrival.key for arrival in arrivals] == ["vehicles/car1/pose", "vehicles/car2/pose"] * 4
+    assert {arrival.payload for arrival in arrivals} == {cdr(pose_stamped(step)) for step in range(4)}
+    wait_for(lambda: receiver.counted(Cause.MISSED) == 1 + 2 + 3)
+    (line,) = [line for line in receiver.losses() if "lost before" in line]
+    assert line.startswith("6 samples of stream pose lost before the detector")
+    assert "vehicles/car2/pose: 7 to 9 of publisher" in line
+
+
+def test_earlier_versions_and_missing_attachments_are_understood(receiver: Receiver, vehicle: zenoh.Session) -> None:
+    node = Node(vehicle, "vehicles/car1/pose")
+    node.publish(b"first", named=True)
+    node.publish(b"second", skip=2, named=True)
+    vehicle.put(f"0/vehicles/car1/pose/{POSE_TYPE.replace('/', '%')}/TypeHashNotSupported", b"third")
+    vehicle.put(
+        f"0/vehicles/car1/pose/{POSE_TYPE.replace('/', '%')}/TypeHashNotSupported", b"fourth", attachment=b"no such"
+    )
+    assert [arrival.payload for arrival in drained(receiver, 4)] == [b"first", b"second", b"third", b"fourth"]
+    wait_for(lambda: receiver.counted(Cause.UNNUMBERED) == 2)
+    assert receiver.counted(Cause.MISSED) == 2
+
+
+def test_a_key_of_another_type_is_dropped_counted_and_said(receiver: Receiver, vehicle: zenoh.Session) -> None:
+    Node(vehicle, "vehicles/car1/pose", type_name="nav_msgs/msg/Odometry").publish(cdr(odometry()))
+    vehicle.put("town/vehicles/car1/pose/on/foot", b"of another layout")
+    Node(vehicle, "vehicles/car1/pose").publish(b"last")
+    (arrival,) = drained(receiver, 1)
+    assert arrival.payload == b"last"
+    wait_for(lambda: receiver.counted(Cause.MISFIT) == 2)
+    (line,) = [line for line in receiver.losses() if "not being the stream's" in line]
+    assert "town/vehicles/car1/pose/on/foot does not read <domain>/<topic>" in line
+    Node(vehicle, "vehicles/car1/pose", type_name="nav_msgs/msg/Odometry").publish(cdr(odometry()))
+    wait_for(lambda: receiver.counted(Cause.MISFIT) == 3)
+    (line,) = [line for line in receiver.losses() if "not being the stream's" in line]
+    assert line.startswith("3 samples of stream pose dropped")
+    assert f"vehicles/car1/pose is nav_msgs/msg/Odometry, but the stream's type is {POSE_TYPE}" in line
+
+
+@pytest.mark.parametrize("receiver", [{"domain": 7}], indirect=True)
+def test_a_stream_may_be_of_one_domain(receiver: Receiver, vehicle: zenoh.Session) -> None:
+    Node(vehicle, "vehicles/car1/pose", domain=0).publish(b"of another domain")
+    Node(vehicle, "vehicles/car1/pose", domain=7).publish(b"of this")
+    assert [arrival.payload for arrival in drained(receiver, 1)] == [b"of this"]
+
+
+def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
+    receiver: Receiver, vehicle: zenoh.Session, tmp_path: Path
+) -> None:
+    nodes = [Node(vehicle, f"vehicles/{client}/pose") for client in ("car1", "car2")]
+    for step in range(30):
+        for index, node in enumerate(nodes):
+            node.publish(cdr(pose_stamped((step + 3 * index) % 20)))
+    arrivals = [arrival._replace(received=at(1 + number / 10)) for number, arrival in enumerate(drained(receiver, 60))]
+    detector, name = receiver.detector, receiver.detector.name
+    live = make_engine(detector, inlets(detector), holder=name, start=arrivals[0].received - 1)
+    events = live.set_rules(compiled(detector, MOVED)) + live.advance(arrivals, arrivals[-1].received)
+    with BagWriter(tmp_path / "bag", version=9) as bag:
+        connections = {
+            topic: bag.add_connection(f"/{topic}", POSE_TYPE, typestore=standard().store)
+            for topic in dict.fromkeys(arrival.key for arrival in arrivals)
+        }
+        for arrival in arrivals:
+            bag.write(connections[arrival.key], arrival.received, arrival.payload)
+    router = Router(detector.spec.streams)
+    replayed = replay_arrivals(router.arrivals(open_recordings([tmp_path / "bag"])), detector, [MOVED])
+    assert len(events) > 3
+    assert lines(replayed.events) == lines(events)
+
+
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [
+        ("0/chatter/std_msgs::msg::dds_::String_/RIHS01_df66", ("chatter", "std_msgs/msg/String")),
+        ("42/a/b/c/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported", ("a/b/c", "nav_msgs/msg/Odometry")),
+        ("0/chatter/std_msgs%msg%String/h", ("chatter", "std_msgs/msg/String")),
+        ("0/add/example::srv::dds_::Add_Request_/h", ("add", "example/srv/Add_Request")),
+    ],
+)
+def test_a_key_tells_topic_and_type(key: str, told: tuple[str, str]) -> None:
+    assert split(key) == told
+
+
+@pytest.mark.parametrize("key", ["", "0", "0/a/b", "x/chatter/std_msgs::msg::dds_::String_/h", "0/chatter/String/h"])
+def test_what_is_no_such_key_is_said(key: str) -> None:
+    with pytest.raises(MisfitError):
+        split(key)
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.binary(min_size=16, max_size=16), st.booleans())
+def test_the_number_and_the_publisher_are_read(number: int, gid: bytes, named: bool) -> None:
+    assert numbered(attachment(number, gid, named=named).to_bytes()) == (gid, number)
+
+
+@given(st.binary(max_size=90))
+def test_other_attachments_have_no_number_or_some_number(noise: bytes) -> None:
+    for raw in (noise, b"\x0fsequence_number" + noise):
+        told = numbered(raw)
+        assert told is None or (len(told[0]) == 16 and -(2**63) <= told[1] < 2**63)
+
+
+@given(st.lists(st.integers(1, 40), min_size=1))
+def test_losses_less_late_ones_are_what_is_missing_in_any_order(numbers: list[int]) -> None:
+    tally = Tally()
+    sequences = Sequences("s", tally)
+    first, *rest = [0, *dict.fromkeys(numbers)]
+    for number in (first, *rest):
+        sequences.follow(b"publisher", number, "t")
+    assert counted(tally, Cause.MISSED) - counted(tally, Cause.OVERTAKEN) == max(rest) + 1 - (len(rest) + 1)
+
+
+def test_a_publisher_that_begins_anew_has_lost_nothing_and_one_sent_twice_neither() -> None:
+    tally = Tally()
+    sequences = Sequences("s", tally)
+    for number in (5_000, 5_001, 5_001, 1, 2, 2**62, 3):
+        sequences.follow(b"publisher", number, "t")
+    assert tally.entries() == []
+
+
+def test_made_up_publishers_cost_no_more_than_the_bound() -> None:
+    sequences = Sequences("s", Tally())
+    for number in range(MAXIMUM_PUBLISHERS + 10):
+        sequences.follow(number.to_bytes(16, "little"), 1, "t")
+    assert len(sequences._last) == MAXIMUM_PUBLISHERS
+
+
+DETECTOR = """\
+apiVersion: wayside.dev/v1alpha1
+kind: Detector
+metadata: {name: d}
+spec:
+  streams:
+    - name: pose
+      key: vehicles/${client:*}/pose
+      layout: RmwZenoh
+      encoding: json
+    - {name: speed, key: "vehicles/${client:*}/speed", encoding: json, domain: 3}
+"""
+
+
+def test_what_does_not_go_together_is_said_with_its_place(tmp_path: Path) -> None:
+    (tmp_path / "detector.yaml").write_text(DETECTOR)
+    with pytest.raises(DocumentError) as caught:
+        check_documents(load_documents([tmp_path / "detector.yaml"]))
+    first, second = caught.value.problems
+    assert (first.line, first.field) == (6, "spec.streams[0]")
+    assert "encoding must be cdr or raw, is json" in first.message
+    assert (second.line, second.field) == (10, "spec.streams[1]")
+    assert "domain is for streams with layout RmwZenoh" in second.message

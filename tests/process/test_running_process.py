@@ -1,0 +1,107 @@
+"""A detector process over real Zenoh: its status and metrics are what was sent, and changes lose nothing."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from detector.status.model import RuleState, read_status
+from detector.streams.asking import NoAnswerError, ask
+from tests.process.running import PATIENCE, Process
+from tests.unit.driving import a_rule, a_stream
+
+SPEED = {"name": "v", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "5m"}
+FAST = a_rule("fast", signals=[SPEED], when="v > 10", evaluation={"every": "100ms"})
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Iterator[Process]:
+    process = Process(tmp_path)
+    process.write(FAST)
+    process.start()
+    yield process
+    assert process.stop() == 0
+
+
+def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
+    for number in range(50):
+        process.send("car1", {"v": number})
+        process.send("car2", {"v": 1})
+    process.send("car2", b"{")
+    process.send("c%", {"v": 1})
+    status = process.status_when(lambda s: s.streams[1].samples == 101 and bool(s.rules[0].open))
+    assert status.connected
+    assert {(drop.cause, drop.stream): drop.count for drop in status.drops if drop.count} == {
+        ("undecodable", "speed"): 1,
+        ("unnamed", "speed"): 1,
+    }
+    assert [client.name for client in status.clients] == ["car1", "car2"]
+    metrics = process.metrics()
+    assert metrics["stream_samples_total", "speed"] == 101
+    (answer,) = ask(process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "30"}, PATIENCE)
+    told = read_status(answer.payload).explanation
+    assert told is not None
+    assert [(each.subject, each.when, each.values) for each in told.subjects] == [("car2", False, {"v": 1.0})]
+    with pytest.raises(NoAnswerError, match="detector d has no rule slow; it has fast"):
+        ask(process.network, "d", "status", {"rule": "slow"}, PATIENCE)
+    assert metrics["rule_episodes_open", "fast"] == 1
+    assert metrics["process_resident_memory_bytes",] > 0
+    assert "looked" in process.page("/healthz")
+    assert "looked" in process.page("/readyz")
+
+
+def test_a_rule_is_asked_paused_and_resumed_by_commands(process: Process) -> None:
+    process.change(FAST, a_rule("asked", signals=[SPEED], when="v > 10", evaluation={"onDemand": True}))
+    process.send("car1", {"v": 20})
+    process.status_when(lambda s: len(s.rules) == 2 and s.streams[1].samples == 1)
+
+    def command(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "detector.cli", *words, "--detector", "detector.yaml"],
+            cwd=process.folder,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    answer = json.loads(command("evaluate", "asked").stdout)
+    assert (answer["subject"], answer["when"], answer["values"]) == ("car1", True, {"v": 20})
+    refused = command("evaluate", "fast")
+    assert refused.returncode == 2
+    assert "rule fast is not evaluated on demand: write evaluation: {onDemand: true}" in refused.stderr
+    assert command("pause", "fast").stderr == "d: rule fast paused\n"
+    process.status_when(lambda s: {rule.name: rule.state for rule in s.rules}["fast"] is RuleState.PAUSED)
+    assert command("resume", "fast").stderr == "d: rule fast resumed\n"
+    process.status_when(lambda s: {rule.name: rule.state for rule in s.rules}["fast"] is RuleState.ACCEPTED)
+
+
+def test_rules_and_streams_change_without_losing_buffer_or_episodes(process: Process) -> None:
+    process.send("car1", {"v": 20})
+    before = process.status_when(lambda s: bool(s.rules[0].open))
+    slow = a_rule("slow", signals=[SPEED], when="v > 15", evaluation={"every": "100ms"})
+    more = (a_stream("speed"), a_stream("pose"), a_stream("more"))
+    process.change(FAST, slow, streams=more, clientTimeout="6m")
+    # The new rule's window reaches back to the sample that came before there was such a rule.
+    after = process.status_when(lambda s: len(s.rules) == 2 and bool(s.rules[1].open))
+    assert [stream.name for stream in after.streams] == ["speed", "pose", "more"]
+    assert (after.rules[0].open, after.rules[0].started) == (1, 1)
+    assert after.streams[0].buffered_bytes == before.streams[1].buffered_bytes
+    process.send("car1", {"v": 1}, stream="more")
+    process.status_when(lambda s: s.streams[2].samples == 1)
+    broken = a_rule("slow", signals=[SPEED], when="w > 15", evaluation={"every": "100ms"})
+    process.change(FAST, broken, streams=more)
+    refused = process.status_when(lambda s: s.rules[1].state == "Refused")
+    assert refused.rules[1].open == 1
+    assert "goes on as it last was" in refused.rules[1].message
+    (process.folder / "rules.yaml").write_text("no: [yaml")
+    process.process.send_signal(signal.SIGHUP)
+    process.send("car2", {"v": 1})
+    still = process.status_when(lambda s: s.streams[0].samples == 2)
+    assert [rule.open for rule in still.rules] == [1, 1]
+    assert process.events == ["fast started", "slow started"]

@@ -1,0 +1,241 @@
+"""Sources run supervised: started again when they fail, left behind when they hang, changed while running."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from pydantic import BaseModel, ConfigDict
+
+from detector import entrypoints
+from detector.actions.deploy.file_store import FileTaskStore
+from detector.actions.deploy.reconciler import DemandReconciler
+from detector.assembly import DetectorError, inlets
+from detector.restoring import Restored
+from detector.rules.selection import RuleSet
+from detector.running import Running
+from detector.sources import Feed, Source
+from detector.sources.registry import OFFERS, plugin_problems
+from detector.sources.supervision import Sources, SourceThread, State
+from detector.streams.tally import Cause, Tally
+from tests.networks import PATIENCE, Arrivals, stream, wait_for
+from tests.unit.driving import a_detector, a_stream
+from wayside.api import Detector
+from wayside.api.source import DataSource
+
+
+class NoParameters(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    text: str = "once"
+
+
+class Once(Source[NoParameters]):
+    """Delivers one message and has nothing more."""
+
+    Parameters: ClassVar[type[BaseModel]] = NoParameters
+
+    def run(self, feed: Feed) -> None:
+        feed.put("vehicles/car1/pose", self.parameters.text.encode())
+        feed.put("vehicles/car1/other", b"no stream's")
+
+
+class Failing(Once):
+    """Delivers one message, then fails."""
+
+    def run(self, feed: Feed) -> None:
+        super().run(feed)
+        raise RuntimeError("the cable is out")
+
+
+class Leaving(Once):
+    """Tries to end the whole program."""
+
+    def run(self, feed: Feed) -> None:
+        raise SystemExit(3)
+
+
+class Lasting(Once):
+    """Delivers one message and waits for its end."""
+
+    def run(self, feed: Feed) -> None:
+        super().run(feed)
+        while not feed.wait(10):
+            pass
+
+
+class Hanging(Once):
+    """Does not look at the feed."""
+
+    ended = threading.Event()
+
+    def run(self, feed: Feed) -> None:
+        self.ended.wait(PATIENCE)
+        feed.put("vehicles/car1/pose", b"late")
+
+
+class Unfinished(Source[Any]):
+    """Has no model of its parameters."""
+
+    def run(self, feed: Feed) -> None: ...
+
+
+@pytest.fixture(autouse=True)
+def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The classes above as installed plugins."""
+    here = [
+        EntryPoint(each.lower(), f"{__name__}:{each}", OFFERS.group)
+        for each in ("Once", "Failing", "Leaving", "Lasting", "Hanging", "Unfinished", "NoParameters", "Absent")
+    ]
+    here.append(EntryPoint("unmet", "no_such_module:Plugin", OFFERS.group))
+    monkeypatch.setattr(entrypoints, "entry_points", lambda group: here)
+    entrypoints._load.cache_clear()
+
+
+@pytest.fixture
+def arrivals() -> Arrivals:
+    return Arrivals()
+
+
+def a_thread(plugin: str, arrivals: Arrivals, tally: Tally) -> SourceThread:
+    source = DataSource(name="s", plugin=plugin)
+    thread = SourceThread(source, (stream(source="s"),), arrivals.putter, tally, first_pause=0.01)
+    thread.start()
+    return thread
+
+
+def a_detector_of(*sources: dict[str, Any], **stream: Any) -> Detector:
+    streams = (
+        a_stream(f"stream{index}", key="vehicles/${client:*}/pose", source=each["name"], **stream)
+        for index, each in enumerate(sources)
+    )
+    return a_detector(*streams, sources=list(sources))
+
+
+def test_messages_reach_their_streams_and_others_are_counted(arrivals: Arrivals) -> None:
+    tally = Tally()
+    thread = a_thread("once", arrivals, tally)
+    wait_for(lambda: thread.state is State.FINISHED)
+    assert arrivals.seen == [("pose", "vehicles/car1/pose", b"once")]
+    assert thread.messages == 1
+    assert [(e.cause, e.name, e.count, e.last) for e in tally.entries()] == [
+        (Cause.UNROUTED, "s", 1, "vehicles/car1/other")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("plugin", "error"), [("failing", "RuntimeError: the cable is out"), ("leaving", "SystemExit: 3")]
+)
+def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, arrivals: Arrivals) -> None:
+    tally = Tally()
+    thread = a_thread(plugin, arrivals, tally)
+
+    def failures() -> int:
+        return sum(entry.count for entry in tally.entries() if entry.cause is Cause.FAILED)
+
+    wait_for(lambda: failures() >= 3)
+    thread.tell_to_stop()
+    thread.join(PATIENCE)
+    assert thread.state is State.STOPPED
+    assert thread.last_error == error
+    assert len(arrivals.seen) in ((0,) if plugin == "leaving" else (failures(), failures() + 1))
+
+
+def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_taken(arrivals: Arrivals) -> None:
+    tally = Tally()
+    Hanging.ended.clear()
+    thread = a_thread("hanging", arrivals, tally)
+    thread.tell_to_stop()
+    thread.join(0.05)
+    assert [(entry.cause, entry.count) for entry in tally.entries()] == [(Cause.LEFT_BEHIND, 1)]
+    Hanging.ended.set()
+    wait_for(lambda: thread.state is State.STOPPED)
+    assert arrivals.seen == []
+
+
+def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals) -> None:
+    sources = Sources(arrivals.putter, Tally())
+    first = {"name": "first", "plugin": "lasting"}
+    second = {"name": "second", "plugin": "lasting"}
+    sources.follow(a_detector_of(first, second))
+    kept, changed = sources.threads
+    sources.follow(a_detector_of(first, {**second, "parameters": {"text": "new"}}))
+    assert sources.threads[0] is kept
+    sources.follow(a_detector_of(first, {**second, "parameters": {"text": "new"}}, buffer={"duration": "1m"}))
+    assert sources.threads[0] is kept
+    wait_for(lambda: changed.state is State.STOPPED)
+    arrivals.wait_for(lambda seen: [payload for _, _, payload in seen].count(b"new") == 1)
+    sources.follow(a_detector())
+    assert kept.state is State.STOPPED
+    assert not sources.threads
+    sources.close()
+
+
+def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, second = ({"name": name, "plugin": "lasting"} for name in ("first", "second"))
+    unknown = {"name": "first", "plugin": "unknown"}
+
+    async def changes() -> AsyncIterator[RuleSet]:
+        for sources in ([first, second], [unknown]):
+            yield RuleSet(a_detector_of(*sources), ())
+
+    def states(running: Running) -> list[tuple[str, str, int]]:
+        return [(each.name, each.state, each.messages) for each in running.answers.status().sources]
+
+    async def live() -> None:
+        reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
+        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, None, None, Restored()) as running:
+            await asyncio.to_thread(wait_for, lambda: states(running) == [("first", "Running", 1)])
+            await running.follow(changes())
+            await asyncio.to_thread(
+                wait_for, lambda: states(running) == [("first", "Running", 1), ("second", "Running", 1)]
+            )
+
+    asyncio.run(live())
+    assert "is not followed, the last good one goes on: spec.sources[0].plugin: no plugin unknown" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("source", "problem"),
+    [
+        ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed here; did you mean once?"),
+        (
+            {"plugin": "unmet"},
+            "spec.sources[0].plugin: plugin unmet cannot be loaded: ModuleNotFoundError: No module named",
+        ),
+        ({"plugin": "absent"}, "spec.sources[0].plugin: plugin absent cannot be loaded: AttributeError"),
+        ({"plugin": "noparameters"}, "which is no complete detector.sources.base.Source"),
+        (
+            {"plugin": "unfinished"},
+            "spec.sources[0].plugin: plugin unfinished: give tests.process.test_sources:Unfinished a",
+        ),
+        (
+            {"plugin": "once", "parameters": {"text": 1}},
+            "spec.sources[0].parameters.text: must be a text, is 1: put what you mean in quotes",
+        ),
+        ({"plugin": "once", "parameters": {"txt": "a"}}, "spec.sources[0].parameters.txt: there is no such field"),
+    ],
+)
+def test_what_is_wrong_with_a_source_is_told_with_its_field(source: dict[str, Any], problem: str) -> None:
+    found = [str(each) for each in plugin_problems(a_detector_of({"name": "s", **source}))]
+    assert len(found) == 1
+    assert problem in found[0]
+
+
+def test_streams_and_sources_must_fit_together() -> None:
+    detector = a_detector(
+        a_stream("pose", source="brokr"),
+        sources=[{"name": "broker", "plugin": "once"}, {"name": "zenoh", "plugin": "once"}],
+    )
+    with pytest.raises(DetectorError) as caught:
+        inlets(detector)
+    assert [str(problem) for problem in caught.value.problems] == [
+        "spec.sources[0].name: no stream comes from broker: write source: broker in those that do, or remove it",
+        "spec.sources[1].name: zenoh is the session of spec.zenoh, which is there without being named: "
+        "choose another name",
+        "spec.streams[0].source: Detector d has no source brokr; did you mean broker?",
+    ]

@@ -1,0 +1,124 @@
+"""Samples arrive from real Zenoh sessions, in order and whenever the other side appears; events go out."""
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+import zenoh
+
+from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
+from tests.networks import PATIENCE, Arrivals, stream, wait_for
+from tests.ports import free_endpoint
+from wayside.api.zenoh import Zenoh, ZenohMode
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def arrivals() -> Arrivals:
+    return Arrivals()
+
+
+def session(mode: str, *, listen: str | None = None, connect: str | None = None) -> zenoh.Session:
+    config = zenoh.Config()
+    config.insert_json5("mode", f'"{mode}"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    if listen is not None:
+        config.insert_json5("listen/endpoints", f'["{listen}"]')
+    if connect is not None:
+        config.insert_json5("connect/endpoints", f'["{connect}"]')
+    return zenoh.open(config)
+
+
+@pytest.fixture
+def listening(endpoint: str, arrivals: Arrivals) -> Iterator[Network]:
+    network = Network(Zenoh(listen=[endpoint]), [stream(), stream("all", "**/${client:*}/pose")], arrivals.putter)
+    network.start()
+    yield network
+    network.close()
+
+
+def test_samples_arrive_in_order_on_every_stream_that_their_key_belongs_to(
+    listening: Network, endpoint: str, arrivals: Arrivals
+) -> None:
+    with session("client", connect=endpoint) as vehicle:
+        for number in range(100):
+            vehicle.put("vehicles/car1/pose", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+        vehicle.put("vehicles/car1/other", "no stream's")
+        arrivals.wait_for(lambda seen: len(seen) == 200)
+    for name in ("pose", "all"):
+        of_stream = [sample for sample in arrivals.seen if sample[0] == name]
+        assert of_stream == [(name, "vehicles/car1/pose", str(number).encode()) for number in range(100)]
+
+
+def test_deletions_are_no_samples_but_empty_payloads_are(listening: Network, endpoint: str, arrivals: Arrivals) -> None:
+    with session("client", connect=endpoint) as vehicle:
+        vehicle.delete("vehicles/car1/pose")
+        vehicle.put("vehicles/car1/pose", b"")
+        vehicle.put("vehicles/car1/pose", b"end")
+        arrivals.wait_for(lambda seen: sum(payload == b"end" for _, _, payload in seen) == 2)
+    assert [payload for name, _, payload in arrivals.seen if name == "pose"] == [b"", b"end"]
+
+
+@pytest.mark.parametrize("mode", ZenohMode)
+def test_data_flows_once_the_router_exists_and_again_after_it_was_away(
+    mode: ZenohMode, endpoint: str, arrivals: Arrivals
+) -> None:
+    listen = ["tcp/127.0.0.1:0"] if mode is ZenohMode.ROUTER else []
+    network = Network(Zenoh(mode=mode, connect=[endpoint], listen=listen), [stream()], arrivals.putter)
+    network.start()
+    assert not network.connected
+    for text in (b"first", b"second"):
+        with session("router", listen=endpoint) as router:
+            deadline = time.monotonic() + PATIENCE
+            while not any(payload == text for _, _, payload in arrivals.seen):
+                assert time.monotonic() < deadline, "nothing arrived"
+                router.put("vehicles/car1/pose", text)
+            wait_for(lambda: network.connected)
+    network.close()
+
+
+def test_events_are_published_with_their_encoding(listening: Network, endpoint: str) -> None:
+    with session("client", connect=endpoint) as listener:
+        subscriber = listener.declare_subscriber("wayside/events/**")
+        deadline = time.monotonic() + PATIENCE
+        while (event := subscriber.try_recv()) is None:  # the first ones may go out before the subscription is known
+            assert time.monotonic() < deadline
+            listening.publish("wayside/events/det/rule/car1+car2", b"{}")
+        assert str(event.key_expr) == "wayside/events/det/rule/car1+car2"
+        assert event.payload.to_bytes() == b"{}"
+        assert str(event.encoding) == EVENT_ENCODING
+
+
+def test_events_wait_for_the_router_and_those_beyond_the_capacity_are_counted(
+    endpoint: str, arrivals: Arrivals
+) -> None:
+    network = Network(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint]), [stream()], arrivals.putter, capacity=2)
+    network.start()
+    for number in range(5):
+        network.publish("wayside/events/d/r/s", str(number).encode())
+    assert network.dropped_events == 3
+    network.close()
+    assert network.dropped_events == 5
+
+
+def test_closing_while_no_router_answers_is_prompt(endpoint: str, arrivals: Arrivals) -> None:
+    network = Network(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint]), [stream()], arrivals.putter)
+    network.start()
+    start = time.monotonic()
+    network.close()
+    assert time.monotonic() - start < 5
+
+
+def test_an_endpoint_that_cannot_be_listened_on_is_an_error_that_names_it(arrivals: Arrivals) -> None:
+    with closing(socket.socket()) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(NetworkError, match=endpoint):
+            Network(Zenoh(listen=[endpoint]), [stream()], arrivals.putter).start()

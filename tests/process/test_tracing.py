@@ -1,0 +1,178 @@
+"""Traces: where a span stands follows from the episode, nobody waits for the exporter, and off costs nothing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detector.engine.consequences.consequences import Begun, Completed, Run
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.rendering import Rendered
+from detector.tracing import episode_traces
+from tests.otlp import Receiver
+from tests.ports import free_ports
+from wayside.tracecontext import Span, TraceContext, episode_context, parse_traceparent
+from wayside.tracing import tracing
+
+CONTEXTS = st.builds(TraceContext, st.integers(1, 2**128 - 1), st.integers(1, 2**64 - 1), st.booleans())
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No variable of the machine counts, spans are handed over soon, and the end waits until they are."""
+    monkeypatch.setattr("wayside.tracing._PATIENCE", 60.0)
+    for name in ("ENDPOINT", "TRACES_ENDPOINT", "PROTOCOL", "TRACES_PROTOCOL"):
+        monkeypatch.delenv(f"OTEL_EXPORTER_OTLP_{name}", raising=False)
+    monkeypatch.delenv("OTEL_SDK_DISABLED", raising=False)
+    monkeypatch.setenv("OTEL_BSP_SCHEDULE_DELAY", "50")
+
+
+@given(CONTEXTS)
+def test_a_traceparent_reads_back(context: TraceContext) -> None:
+    assert parse_traceparent(str(context)) == context
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        None,
+        7,
+        "",
+        "00-" + "0" * 32 + "-" + "1" * 16 + "-01",
+        "00-" + "1" * 32 + "-" + "0" * 16 + "-01",
+        "01-" + "1" * 32 + "-" + "1" * 16 + "-01",
+        "00-" + "A" * 32 + "-" + "1" * 16 + "-01",
+        "00-" + "1" * 32 + "-" + "1" * 16 + "-01\n",
+    ],
+)
+def test_what_is_no_traceparent_is_none(text: object) -> None:
+    assert parse_traceparent(text) is None
+
+
+@given(st.text("abcdefgh234567", min_size=1), st.text("abcdefgh234567", min_size=1))
+def test_an_episode_has_one_trace_and_its_tasks_a_span_each(one: str, other: str) -> None:
+    assert episode_context(one) == episode_context(one)
+    assert (episode_context(one).trace_id == episode_context(other).trace_id) == (one == other)
+    first, second = episode_context(one).child("task-a"), episode_context(one).child("task-b")
+    assert len({episode_context(one).trace_id, first.trace_id, second.trace_id}) == 1
+    assert len({episode_context(one).span_id, first.span_id, second.span_id}) == 3
+
+
+def test_without_an_endpoint_there_are_no_traces_and_nothing_is_imported() -> None:
+    script = (
+        "import sys, detector.service, application_manager.service\n"
+        "from wayside.tracing import tracing\n"
+        "assert tracing('x') is None\n"
+        "assert not [name for name in sys.modules if name.startswith('opentelemetry')]\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2], timeout=60)
+
+
+@pytest.mark.parametrize(("name", "value"), [("OTEL_SDK_DISABLED", "true"), ("OTEL_TRACES_EXPORTER", "none")])
+def test_the_standard_variables_turn_traces_off(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
+    monkeypatch.setenv(name, value)
+    assert tracing("x") is None
+
+
+def test_a_protocol_that_is_not_spoken_and_a_missing_extra_are_said(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_PROTOCOL", "grpc")
+    assert tracing("x") is None
+    assert "OTEL_EXPORTER_OTLP_PROTOCOL is grpc, and only http/protobuf is spoken" in caplog.text
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_PROTOCOL", "http/protobuf")
+    monkeypatch.setitem(sys.modules, "wayside.spans", None)  # as if it could not be imported
+    assert tracing("x") is None
+    assert "pip install 'wayside[otel]'" in caplog.text
+
+
+def test_spans_arrive_with_their_ids_times_links_and_failures(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Receiver() as receiver:
+        monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)
+        told = tracing("of-a-test")
+        assert told is not None
+        root, other = episode_context("one"), episode_context("two")
+        assert told.emit(Span("episode", 10, 90, context=root, attributes={"subjects": ["a", "b"]})) == root
+        made = told.emit(Span("apply", 20, 30, parent=root, links=[other], error="no such kind"))
+        assert made.trace_id == root.trace_id
+        told.close()
+        first, second = receiver.spans()
+    assert (first.service, first.name, first.start, first.end) == ("of-a-test", "episode", 10, 90)
+    assert (first.traceparent, first.parent, first.error) == (str(root), "", None)
+    assert first.attributes == {"subjects": ["a", "b"]}
+    assert (second.trace, second.parent, second.error) == (first.trace, first.id, "no such kind")
+    assert second.links == ((f"{other.trace_id:032x}", f"{other.span_id:016x}"),)
+
+
+def test_the_service_may_be_named_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Receiver() as receiver:
+        monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)
+        monkeypatch.setenv("OTEL_RESOURCE_ATTRIBUTES", "site=north,service.name=ours")
+        told = tracing("theirs")
+        assert told is not None
+        told.emit(Span("episode", 10, 90))
+        told.close()
+        assert [each.service for each in receiver.spans()] == ["ours"]
+
+
+def test_what_finds_the_queue_full_is_dropped_and_counted_and_the_rest_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OTEL_BSP_MAX_QUEUE_SIZE", "8")
+    monkeypatch.setenv("OTEL_BSP_MAX_EXPORT_BATCH_SIZE", "1")
+    with Receiver() as receiver:
+        monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)
+        receiver.hold()
+        told = tracing("x")
+        assert told is not None
+        told.emit(Span("first", 1, 2))
+        assert receiver.asked.wait(60)
+        for number in range(50):
+            told.emit(Span(f"later {number}", 3, 4))
+        assert told.dropped == 50 - 8
+        receiver.release()
+        told.close()
+    assert told.failed == 0
+    assert len(receiver.spans()) == 1 + 8
+
+
+def test_an_endpoint_that_is_away_costs_its_spans_and_they_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    (port,) = free_ports(1)
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", f"http://127.0.0.1:{port}")
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "0.1")
+    told = tracing("x")
+    assert told is not None
+    told.emit(Span("lost", 1, 2))
+    told.close()
+    assert told.failed == 1
+
+
+def test_events_and_what_actions_are_told_bear_the_trace_of_their_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
+    event = Event("town", "close", "a+b", ("a", "b"), "e", 1, 2, None, None, {}, None)
+    run = Run("close", "tell", "e")
+    with episode_traces(export=False) as traces:
+        assert traces is not None
+        marked = traces.event(event)
+        begun, completed = traces.consequences([Begun(run, event, Rendered(), False), Completed(run)])
+    assert marked.cloud_event()["traceparent"] == str(episode_context("e"))
+    assert begun == Begun(run, marked, Rendered(), False)
+    assert completed == Completed(run)
+    assert "traceparent" not in event.cloud_event()
+
+
+def test_a_trace_that_is_not_sampled_says_so_to_those_who_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OTEL_TRACES_SAMPLER", "always_off")
+    with Receiver() as receiver:
+        monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)
+        with episode_traces() as traces:
+            assert traces is not None
+            context = episode_context("one")
+            assert not traces.tracing.sampled(context, "episode")
+            traces.tracing.emit(Span("episode", 1, 2, context=context))
+        assert receiver.spans() == []

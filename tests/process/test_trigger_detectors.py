@@ -1,0 +1,304 @@
+"""One detector has another record: two `detector run` processes and a router, over real Zenoh."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from typer.testing import CliRunner, Result
+
+from detector.actions.trigger.orders import Progress
+from detector.actions.trigger.requests import (
+    RecordingReport,
+    RecordingRequest,
+    read_report,
+    read_reports,
+    write_request,
+)
+from detector.cli import app
+from detector.streams.answering import status_key
+from detector.streams.session import open_session
+from tests.networks import router_process, wait_for
+from tests.ports import free_endpoint
+from tests.process.running import PATIENCE, Process
+from tests.unit.driving import a_rule
+from wayside.api import EventRule
+from wayside.api.base import Duration, PositiveDuration
+from wayside.api.zenoh import Zenoh, ZenohMode
+
+SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
+
+
+class Peer(Process):
+    """A detector of that name which is a client of the router."""
+
+    def __init__(self, folder: Path, endpoint: str, name: str) -> None:
+        folder.mkdir(exist_ok=True)
+        super().__init__(folder)
+        self.endpoint, self.name = endpoint, name
+        self.network = Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])
+
+    def write(self, *rules: Any, streams: tuple[dict[str, Any], ...] = (), **spec: Any) -> None:
+        super().write(*rules, streams=streams, **spec)
+        path = self.folder / "detector.yaml"
+        document = json.loads(path.read_text())
+        document["metadata"]["name"] = self.name
+        document["spec"]["zenoh"] = {"mode": "client", "connect": [self.endpoint]}
+        path.write_text(json.dumps(document))
+
+    def kill(self) -> None:
+        self.vehicle.close()  # type: ignore[no-untyped-call]
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(PATIENCE)
+
+    def folders(self) -> list[Path]:
+        """The recordings that stand under their final names."""
+        return sorted(path.parent for path in (self.folder / "recordings").glob("*/*/metadata.yaml"))
+
+    def recorded(self, folder: Path) -> list[tuple[str, Any]]:
+        """Topic and message of what is in a recording, in order."""
+        messages = []
+        for path in sorted(folder.glob("*.mcap")):
+            with path.open("rb") as file:
+                messages += [(c.topic, json.loads(m.data)) for _, c, m in make_reader(file).iter_messages()]
+        return messages
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    where = free_endpoint()
+    with router_process(where):
+        yield where
+
+
+def a_recorder(folder: Path, endpoint: str) -> Peer:
+    """It records what it is asked for."""
+    peer = Peer(folder / "rsu", endpoint, "rsu")
+    idle = a_rule("idle", signals=[SPEED], when="v > 1000")
+    peer.write(idle, recordings={"path": str(folder / "rsu" / "recordings"), "onRequest": {}}, clientTimeout="60s")
+    peer.start()
+    return peer
+
+
+@pytest.fixture
+def rsu(endpoint: str, tmp_path: Path) -> Iterator[Peer]:
+    peer = a_recorder(tmp_path, endpoint)
+    yield peer
+    if peer.process.poll() is None:
+        assert peer.stop() == 0
+
+
+@pytest.fixture(scope="module")
+def unhurt(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
+    """A recorder that several tests ask, one after the other."""
+    where = free_endpoint()
+    with router_process(where):
+        peer = a_recorder(tmp_path_factory.mktemp("unhurt"), where)
+        yield peer
+        assert peer.stop() == 0
+
+
+@pytest.fixture
+def town(endpoint: str, tmp_path: Path) -> Iterator[Peer]:
+    """It detects."""
+    peer = Peer(tmp_path / "town", endpoint, "town")
+    peer.write(fast(), state={"path": str(tmp_path / "state")})
+    peer.start()
+    yield peer
+    if peer.process.poll() is None:
+        assert peer.stop() == 0
+
+
+def fast(name: str = "rsu", **trigger: Any) -> EventRule:
+    detector = {"name": name, "streams": ["pose"], "before": "30s"}
+    trigger = {"detector": detector, "timeout": "1s", **trigger}
+    return a_rule(
+        "fast",
+        signals=[SPEED],
+        when="v > 10",
+        evaluation={"every": "100ms"},
+        actions=[{"name": "other", "trigger": trigger}],
+    )
+
+
+def asked(endpoint: str, request: RecordingRequest, name: str = "rsu") -> RecordingReport:
+    with open_session(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])) as session:
+        for reply in session.get(status_key(name, "recordings"), payload=write_request(request), timeout=PATIENCE):
+            if reply.ok is not None:
+                return read_report(reply.ok.payload.to_bytes())
+            raise ValueError(reply.err.payload.to_string())
+    raise AssertionError("no answer")
+
+
+def listed(endpoint: str, name: str = "rsu") -> list[RecordingReport]:
+    with open_session(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])) as session:
+        for reply in session.get(status_key(name, "recordings"), timeout=PATIENCE):
+            if reply.ok is not None:
+                return read_reports(reply.ok.payload.to_bytes())
+    raise AssertionError("no answer")
+
+
+def recording(endpoint: str) -> bool:
+    return any(report.state is Progress.RECORDING for report in listed(endpoint))
+
+
+def test_another_detector_records_what_led_to_the_episode_and_the_episode(rsu: Peer, town: Peer) -> None:
+    for number in range(20):
+        town.send("car1", {"n": number}, "pose")
+    rsu.status_when(lambda status: status.streams[0].samples == 20)
+    town.send("car1", {"v": 20})
+    wait_for(lambda: recording(town.endpoint), PATIENCE)
+    for number in range(20, 40):
+        town.send("car1", {"n": number}, "pose")
+    rsu.status_when(lambda status: status.streams[0].samples == 40)
+    town.send("car1", {"v": 1})
+    status = town.status_when(lambda status: bool(status.actions and status.actions[0].done == 1))
+    (told,) = status.actions
+    assert (told.samples, told.files, told.failed, told.running) == (40, 1, 0, 0)
+    (folder,) = rsu.folders()
+    assert rsu.recorded(folder) == [("/vehicles/car1/pose", {"n": number}) for number in range(40)]
+    (report,) = listed(town.endpoint)
+    assert (report.state, report.samples, report.streams) == (Progress.DONE, 40, ["pose"])
+    assert report.id.startswith("town.fast.other.")
+
+
+def test_a_start_and_a_stop_may_come_twice_and_in_any_order(unhurt: Peer) -> None:
+    start = RecordingRequest(do="start", id="x", streams=["pose"])
+    stop = RecordingRequest(do="stop", id="x")
+    assert asked(unhurt.endpoint, start).state is Progress.RECORDING
+    again = asked(unhurt.endpoint, start)
+    assert again.state is Progress.RECORDING
+    assert asked(unhurt.endpoint, stop).state in (Progress.ENDING, Progress.DONE)
+    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="x")).state is Progress.DONE, PATIENCE)
+    assert asked(unhurt.endpoint, stop).state is Progress.DONE
+    assert asked(unhurt.endpoint, start).state is Progress.DONE
+    assert [each.id for each in listed(unhurt.endpoint)].count("x") == 1
+    assert len(asked(unhurt.endpoint, stop).files) == 1
+
+    late = RecordingRequest(do="stop", id="y")
+    assert asked(unhurt.endpoint, late).state is Progress.UNKNOWN
+    begun = asked(unhurt.endpoint, RecordingRequest(do="start", id="y"))
+    assert (begun.state, begun.message) == (Progress.UNKNOWN, "it was stopped before it was started")
+
+
+def test_a_recording_whose_stop_never_comes_ends_by_itself(unhurt: Peer) -> None:
+    request = RecordingRequest(do="start", id="long", maximum_duration=PositiveDuration("1s"))
+    report = asked(unhurt.endpoint, request)
+    assert report.state is Progress.RECORDING
+    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="long")).state is Progress.DONE, PATIENCE)
+    done = asked(unhurt.endpoint, RecordingRequest(id="long"))
+    assert (done.message, done.until) == ("ended by its maximumDuration", report.until)
+
+
+def test_what_is_not_allowed_is_refused(rsu: Peer, town: Peer) -> None:
+    refused = asked(rsu.endpoint, RecordingRequest(do="start", id="x", streams=["poes"]))
+    assert (refused.state, refused.message) == (
+        Progress.REFUSED,
+        "stream poes is none that may be recorded here: there is pose, speed",
+    )
+    refused = asked(rsu.endpoint, RecordingRequest(do="start", id="x"), "town")
+    assert refused.message.startswith("this detector records nothing on request")
+    for number in range(8):
+        assert asked(rsu.endpoint, RecordingRequest(do="start", id=f"x{number}")).state is Progress.RECORDING
+    full = asked(rsu.endpoint, RecordingRequest(do="start", id="x8"))
+    assert full.message == "8 recordings are under way, as many as recordings.onRequest.maximumRecordings allows"
+    with pytest.raises(ValueError, match="start which recording"):
+        asked(rsu.endpoint, RecordingRequest(do="start"))
+
+
+def test_a_killed_requester_comes_back_and_stops_what_it_started(rsu: Peer, town: Peer) -> None:
+    town.send("car1", {"v": 20})
+    wait_for(lambda: recording(town.endpoint), PATIENCE)
+    wait_for(lambda: '"episode"' in "".join(p.read_text() for p in (town.folder.parent / "state").glob("*.json")))
+    town.kill()
+    assert recording(rsu.endpoint)
+    town.start()
+    town.status_when(lambda status: status.rules[0].open == 1 and status.actions[0].running == 1)
+    assert [each.state for each in listed(rsu.endpoint)] == [Progress.RECORDING]
+    town.send("car1", {"v": 1})
+    town.status_when(lambda status: status.actions[0].done == 1)
+    assert [each.state for each in listed(rsu.endpoint)] == [Progress.DONE]
+
+
+def test_a_requester_that_finds_its_episode_gone_stops_what_it_had_started(rsu: Peer, town: Peer) -> None:
+    """Its rule is another when it comes back: the journal tells what is to be stopped."""
+    town.send("car1", {"v": 20})
+    wait_for(lambda: recording(town.endpoint), PATIENCE)
+    town.kill()
+    changed = fast()
+    changed = changed.model_copy(update={"spec": changed.spec.model_copy(update={"when": "v > 11"})})
+    town.write(changed, state={"path": str(town.folder.parent / "state")})
+    town.start()
+    wait_for(lambda: [each.state for each in listed(rsu.endpoint)] == [Progress.DONE], PATIENCE)
+
+
+def test_a_recorder_that_is_killed_goes_on_when_it_is_back(rsu: Peer, town: Peer) -> None:
+    """What it had is kept as cut; the requester says the start again within seconds."""
+    town.send("car1", {"v": 20})
+    wait_for(lambda: recording(town.endpoint), PATIENCE)
+    town.send("car1", {"n": 1}, "pose")
+    rsu.status_when(lambda status: status.streams[0].samples == 1)
+    rsu.kill()
+    rsu.start()
+    wait_for(lambda: recording(rsu.endpoint), PATIENCE)
+    rsu.send("car1", {"n": 2}, "pose")
+    rsu.status_when(lambda status: status.streams[0].samples == 1)
+    town.send("car1", {"v": 1})
+    town.status_when(lambda status: status.actions[0].done == 1)
+    wait_for(lambda: len(rsu.folders()) == 2, PATIENCE)
+    assert [rsu.recorded(folder)[-1:] for folder in rsu.folders() if "cut" not in folder.name] == [
+        [("/vehicles/car1/pose", {"n": 2})]
+    ]
+
+
+def test_nobody_who_records_costs_only_the_recording(town: Peer) -> None:
+    town.change(fast("nobody", giveUpAfter="1s"), state={"path": str(town.folder.parent / "state")})
+    town.status_when(lambda status: bool(status.actions))
+    town.send("car1", {"v": 20})
+    status = town.status_when(lambda status: status.actions[0].running == 1 and bool(status.actions[0].current))
+    assert "nobody answered" in next(iter(status.actions[0].current.values()))
+    town.send("car1", {"v": 1})
+    town.status_when(lambda status: status.rules[0].ended == 1)
+    status = town.status_when(lambda status: status.actions[0].failed == 1)
+    assert status.actions[0].last_failure.startswith("not started, and given up:")
+    lost = town.status_when(lambda status: any(drops.cause.startswith("action_recordings") for drops in status.drops))
+    assert [drops.count for drops in lost.drops if drops.cause.startswith("action_recordings")] == [1]
+
+
+def test_people_ask_for_recordings_by_commands(unhurt: Peer) -> None:
+    def command(*words: str) -> Result:
+        return CliRunner().invoke(app, [*words, "--connect", unhurt.endpoint])
+
+    begun = command("recordings", "start", "mine", "--stream", "pose", "--name", "rsu", "--json")
+    assert json.loads(begun.stdout)["state"] == "Recording"
+    assert command("recordings", "stop", "mine", "--name", "rsu").exit_code == 0
+    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="mine")).state is Progress.DONE, PATIENCE)
+    told = command("recordings", "status").stdout
+    assert "rsu" in told
+    assert "mine" in told
+    assert "Done" in told
+    refused = command("recordings", "start", "other", "--stream", "poes", "--name", "rsu")
+    assert refused.exit_code == 1
+    assert "stream poes is none that may be recorded here" in refused.stdout
+    wrong = command("recordings", "start", "x", "--name", "rsu", "--maximum-duration", "1 hour")
+    assert "maximumDuration: '1 hour' is not a duration" in wrong.output
+    shown = command("status", "--name", "rsu").stdout
+    assert "_requested/record" in shown
+
+
+def test_an_order_of_a_stranger_is_not_believed(unhurt: Peer) -> None:
+    """Its subject stands in names of files."""
+    request = RecordingRequest(
+        do="start", id="stranger", event={"subject": "../../../x", "data": {"classification": 3}}
+    )
+    assert asked(unhurt.endpoint, request).state is Progress.RECORDING
+    asked(unhurt.endpoint, RecordingRequest(do="stop", id="stranger", after=Duration("0s")))
+    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="stranger")).state is Progress.DONE, PATIENCE)
+    (file,) = asked(unhurt.endpoint, RecordingRequest(id="stranger")).files
+    assert "~fleet" in file
+    assert ".." not in file

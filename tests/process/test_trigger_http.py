@@ -1,0 +1,261 @@
+"""A rule has an HTTP endpoint record: real requests to real servers, also to such as misbehave."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from detector.actions import ActionError, Completion, Episode, Outcome, OutcomeState, Setting, Surroundings
+from detector.actions.trigger import Trigger
+from detector.assembly import inlets
+from tests.http_servers import answers, endpoint, hangs, sends
+from tests.unit.driving import a_detector, a_rule
+from wayside.api.actions import trigger as api
+
+PATIENCE = 30.0
+
+
+class NoNetwork:
+    """Where no Zenoh session is needed."""
+
+    def publish(self, key: str, payload: bytes, encoding: str) -> None:
+        raise AssertionError(key)
+
+    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+        raise ActionError(f"{selector}: nobody answered")
+
+
+class Driven:
+    """The action as its host drives it, on this thread."""
+
+    def __init__(self, trigger: dict[str, Any], state: Path | None = None) -> None:
+        spec = {} if state is None else {"state": {"path": str(state)}}
+        detector = a_detector(**spec)
+        surroundings = Surroundings(detector, inlets(detector).decoders, inlets(detector).types)
+        self.outcomes: list[Outcome] = []
+        self.lost: list[str] = []
+        self.closing = threading.Event()
+        self.parameters = api.Trigger.model_validate(trigger)
+        rule = a_rule("r", when="true", actions=[{"name": "other", "trigger": trigger}])
+        self.setting = Setting(
+            rule=rule,
+            action="other",
+            holder="h",
+            surroundings=lambda: surroundings,
+            messenger=NoNetwork(),
+            report=lambda _, outcome: self.outcomes.append(outcome),
+            lose=lambda what, count, why: self.lost.append(f"{count} {what}: {why}"),
+            closing=self.closing,
+        )
+        self.action = Trigger(self.parameters, self.setting)
+
+    def until(self, done: Any) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < deadline, self.outcomes
+            time.sleep(min(self.action.wake() or 0.01, 0.05))
+
+    def finished(self) -> Outcome:
+        self.until(lambda: self.outcomes and self.outcomes[-1].state is not OutcomeState.RUNNING)
+        return self.outcomes[-1]
+
+    def recording(self) -> bool:
+        return any("Recording" in outcome.message for outcome in self.outcomes)
+
+
+def an_episode(parameters: api.Trigger, **fields: Any) -> Episode:
+    now = time.time_ns()
+    given: dict[str, Any] = {
+        "id": "e1", "rule": "r", "subject": "car1", "clients": ("car1",), "element": None, "onset_time": now,
+        "start_time": now, "values": {"v": 3.0}, "classification": None, "rendered": parameters.templates,
+        "unrendered": {}, "started": {"id": "e1.started", "subject": "car1"},
+    }  # fmt: skip
+    return Episode(**{**given, **fields})
+
+
+def http(url: str, **fields: Any) -> dict[str, Any]:
+    calls = {
+        "start": {"method": "PUT", "url": f"{url}/recordings/{{id}}"},
+        "stop": {"method": "DELETE", "url": f"{url}/recordings/{{id}}"},
+    }
+    return {"http": {**calls, "timeout": "1s"}, **fields}
+
+
+def end(episode: Episode) -> Episode:
+    return replace(episode, end_time=time.time_ns(), reason="Until", ended={})
+
+
+def test_an_endpoint_is_told_of_the_start_and_of_the_end() -> None:
+    with endpoint() as there:
+        driven = Driven(http(there.url, maximumDuration="5m"))
+        episode = an_episode(driven.parameters)
+        driven.action.started(episode)
+        driven.until(driven.recording)
+        driven.action.ended(end(episode))
+        driven.action.completed(end(episode), Completion())
+        assert driven.finished().state is OutcomeState.DONE
+        first, last = there.received(2)
+    assert (first.method, last.method) == ("PUT", "DELETE")
+    identity = first.path.rsplit("/", 1)[1]
+    assert identity.startswith("h.r.other.")
+    assert first.headers["idempotency-key"] == f"{identity}.start"
+    assert last.headers["idempotency-key"] == f"{identity}.stop"
+    assert json.loads(first.body) == {
+        "id": identity,
+        "do": "start",
+        "maximumDuration": "5m",
+        "event": {"id": "e1.started", "subject": "car1"},
+    }
+
+
+def test_a_body_of_ones_own_is_sent_as_it_is_rendered() -> None:
+    with endpoint() as there:
+        call = {"url": f"{there.url}/snap", "body": {"vehicle": "${client}", "speed": "${v}"}}
+        driven = Driven({"http": {"stop": call}})
+        rendered = {"http": {"stop": {"body": {"vehicle": "car1", "speed": 3.0}}}}
+        episode = an_episode(driven.parameters, rendered=rendered)
+        driven.action.started(episode)
+        driven.action.ended(end(episode))
+        driven.finished()
+        (request,) = there.requests
+    assert json.loads(request.body) == {"vehicle": "car1", "speed": 3.0}
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        answers(500),
+        answers(503, Retry_After="1"),
+        hangs(),
+        sends(b"HTTP/1.1 200 OK\r\nContent-"),
+        sends(b"nonsense\r\n\r\n"),
+    ],
+    ids=["500", "busy", "hangs", "cut", "nonsense"],
+)
+def test_what_fails_is_sent_again_under_the_same_key(fault: Any) -> None:
+    with endpoint(fault) as there:
+        driven = Driven(http(there.url))
+        episode = an_episode(driven.parameters)
+        driven.action.started(episode)
+        driven.until(lambda: any("start is not confirmed yet" in outcome.message for outcome in driven.outcomes))
+        there.behaviour = answers()
+        driven.until(driven.recording)
+        keys = {request.headers["idempotency-key"] for request in there.requests}
+        assert len(keys) == 1
+        there.behaviour = fault
+        driven.action.ended(end(episode))
+        driven.until(lambda: any("stop is not confirmed yet" in outcome.message for outcome in driven.outcomes))
+        there.behaviour = answers(404)  # it had arrived: nothing is there any more
+        assert driven.finished().state is OutcomeState.DONE
+    assert driven.lost == []
+
+
+def test_a_start_that_is_refused_for_good_is_not_sent_again() -> None:
+    with endpoint(answers(403, b"not you")) as there:
+        driven = Driven(http(there.url))
+        driven.action.started(an_episode(driven.parameters))
+        outcome = driven.finished()
+        assert outcome.state is OutcomeState.FAILED
+        assert outcome.message == f"http://localhost:{there.port} answered 403: not you"
+        assert len(there.requests) == 1
+
+
+def test_a_stop_that_is_never_confirmed_is_counted() -> None:
+    with endpoint() as there:
+        driven = Driven(http(there.url, giveUpAfter="1s"))
+        episode = an_episode(driven.parameters)
+        driven.action.started(episode)
+        driven.until(driven.recording)
+        there.behaviour = answers(500)
+        driven.action.ended(end(episode))
+        assert driven.finished().state is OutcomeState.FAILED
+        assert "the stop was not confirmed, and is given up" in driven.outcomes[-1].message
+    (lost,) = driven.lost
+    assert lost.startswith(
+        "1 recordings elsewhere whose stop was not confirmed: they end by their maximumDuration: h.r."
+    )
+
+
+def test_a_recording_ends_after_its_maximum_duration_also_while_the_episode_lasts() -> None:
+    with endpoint() as there:
+        driven = Driven(http(there.url, maximumDuration="1s"))
+        driven.action.started(an_episode(driven.parameters))
+        outcome = driven.finished()
+        assert [request.method for request in there.requests] == ["PUT", "DELETE"]
+    assert (outcome.state, outcome.message) == (
+        OutcomeState.DONE,
+        "ended by its maximumDuration, before the episode did",
+    )
+
+
+def test_at_the_end_of_the_detector_an_episode_that_will_not_be_known_again_is_stopped() -> None:
+    with endpoint() as there:
+        driven = Driven(http(there.url))
+        episode = an_episode(driven.parameters)
+        driven.action.started(episode)
+        driven.until(driven.recording)
+        driven.closing.set()
+        driven.action.completed(episode, Completion("the detector stopped"))
+        driven.action.close()
+        assert [request.method for request in there.requests] == ["PUT", "DELETE"]
+    assert driven.outcomes[-1].state is OutcomeState.DONE
+
+
+def test_what_the_next_run_takes_up_goes_on_and_is_stopped_by_that_one(tmp_path: Path) -> None:
+    """The journal keeps what was rendered, of which the next run knows nothing else."""
+    with endpoint() as there:
+        trigger = http(there.url)
+        trigger["http"]["stop"] = {"url": f"{there.url}/stop", "body": {"who": "${client}"}}
+        driven = Driven(trigger, tmp_path)
+        rendered = {"http": {"stop": {"body": {"who": "car1"}}}}
+        episode = an_episode(driven.parameters, rendered=rendered)
+        driven.action.started(episode)
+        driven.until(driven.recording)
+        driven.closing.set()
+        driven.action.completed(episode, Completion("the detector stopped"))
+        driven.action.close()
+        assert [request.method for request in there.requests] == ["PUT"]
+
+        following = Driven(trigger, tmp_path)
+        unrendered = {"http": "what it needs is of before the detector's restart"}
+        resumed = an_episode(following.parameters, rendered={}, unrendered=unrendered, resumed=True)
+        following.action.started(resumed)
+        following.until(following.recording)
+        following.action.ended(end(resumed))
+        assert following.finished().state is OutcomeState.DONE
+        assert [request.method for request in there.requests] == ["PUT", "PUT", "POST"]
+        keys = [request.headers["idempotency-key"] for request in there.requests]
+        assert keys[0] == keys[1]
+        assert json.loads(there.requests[-1].body) == {"who": "car1"}
+    assert list((tmp_path / "triggers").glob("*.json")) == []
+
+
+def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:
+    """Fifty episodes wait for it together, and not each for its own timeout."""
+    with endpoint(hangs()) as there:
+        driven = Driven(http(there.url))
+        for number in range(50):
+            driven.action.started(an_episode(driven.parameters, id=f"e{number}"))
+        begin = time.monotonic()
+        driven.until(lambda: len(there.requests) >= 2)
+        assert time.monotonic() - begin < 20
+        there.behaviour = answers()
+        driven.until(lambda: len({request.path for request in there.requests}) == 50)
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({}, "give start, stop or both"),
+        ({"start": {"url": "https://${client}/x"}}, "takes no"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(fields: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        api.Trigger.model_validate({"http": fields})

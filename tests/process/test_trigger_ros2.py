@@ -1,0 +1,167 @@
+"""A rule has a ROS 2 recorder started and stopped: a `detector run` process and a made-up node, over real Zenoh."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from detector.checking import check_documents
+from tests.process.ros2_services import HASHES, Node
+from tests.process.running import Process
+from tests.unit.driving import a_detector, a_rule
+from wayside.api import EventRule
+from wayside.api.documents import load_documents
+
+SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
+NOTHING: dict[str, Any] = {}
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Iterator[Process]:
+    process = Process(tmp_path)
+    process.write(fast(start={"service": "/recorder/on", "type": "std_srvs/srv/Trigger"}))
+    process.start()
+    yield process
+    assert process.stop() == 0
+
+
+def fast(give_up: str = "5m", timeout: str = "30s", **ros2: Any) -> EventRule:
+    trigger = {"ros2": ros2, "timeout": timeout, "giveUpAfter": give_up}
+    return a_rule(
+        "fast",
+        signals=[SPEED],
+        when="v > 10",
+        evaluation={"every": "100ms"},
+        actions=[{"name": "bag", "trigger": trigger}],
+    )
+
+
+def call(service: str, name: str, **fields: Any) -> dict[str, Any]:
+    return {"service": f"/rosbag2_recorder/{service}", "type": f"rosbag2_interfaces/srv/{name}", **fields}
+
+
+def test_a_service_of_rmw_zenoh_is_called_once_for_each_episode(process: Process) -> None:
+    """With the very key that a node of std_srvs has, and the attachment that its server asks for."""
+    node = Node(process.vehicle, domain=7)
+    served = {"success": True, "message": "snapped"}
+    node.offer(
+        "recorder/snap",
+        "std_srvs/srv/Trigger",
+        "",
+        "bool success\nstring message\n",
+        lambda request: served,
+        HASHES["std_srvs/srv/Trigger"],
+    )
+    process.change(fast(domain=7, stop={"service": "/recorder/snap", "type": "std_srvs/srv/Trigger"}))
+    process.send("car1", {"v": 20})
+    process.send("car2", {"v": 20})
+    process.status_when(lambda status: status.rules[0].open == 2)
+    process.send("car1", {"v": 1})
+    process.send("car2", {"v": 1})
+    status = process.status_when(lambda status: bool(status.actions and status.actions[0].done == 2))
+    assert node.names == ["recorder/snap"] * 2
+    assert len(node.askers) == 1
+    assert [(each.kind, each.running, each.failed) for each in status.actions] == [("trigger", 0, 0)]
+
+
+def test_episodes_that_overlap_are_one_recording_of_a_bridged_recorder(process: Process) -> None:
+    node = Node(process.vehicle, bridged=True)
+    node.offer("rosbag2_recorder/resume", "rosbag2_interfaces/srv/Resume", "", "", lambda request: NOTHING)
+    node.offer("rosbag2_recorder/pause", "rosbag2_interfaces/srv/Pause", "", "", lambda request: NOTHING)
+    process.change(fast(layout="Plain", start=call("resume", "Resume"), stop=call("pause", "Pause")))
+    process.send("car1", {"v": 20})
+    process.send("car2", {"v": 20})
+    process.status_when(lambda status: status.rules[0].open == 2)
+    process.send("car1", {"v": 1})
+    process.status_when(lambda status: bool(status.actions and status.actions[0].done == 1))
+    assert node.names == ["rosbag2_recorder/resume"]
+    process.send("car2", {"v": 1})
+    process.status_when(lambda status: bool(status.actions and status.actions[0].done == 2))
+    assert node.names == ["rosbag2_recorder/resume", "rosbag2_recorder/pause"]
+
+
+def test_a_silent_service_is_called_again_and_what_had_arrived_is_no_failure(process: Process) -> None:
+    """rosbag2 answers 1 to a second Record: after a call that was not answered this says that it had arrived."""
+    node = Node(process.vehicle, bridged=True)
+    uris: list[str] = []
+    heard = threading.Event()
+
+    def record(request: Any) -> dict[str, Any] | None:
+        uris.append(request["uri"])
+        return None if not heard.is_set() else {"return_code": 1, "error_string": "already recording"}
+
+    code = "int32 return_code\nstring error_string\n"
+    node.offer("rosbag2_recorder/record", "rosbag2_interfaces/srv/Record", "string uri\n", code, record)
+    node.offer(
+        "rosbag2_recorder/stop",
+        "rosbag2_interfaces/srv/Stop",
+        "",
+        code,
+        lambda request: {"return_code": 0, "error_string": ""},
+    )
+    start = call("record", "Record", request={"uri": "/bags/${client}-${int(v)}"})
+    process.change(fast(timeout="1s", layout="Plain", start=start, stop=call("stop", "Stop")))
+    process.send("car1", {"v": 20})
+    node.wait_for(lambda calls: len(calls) == 1)
+    status = process.status_when(lambda status: bool(status.actions and status.actions[0].current))
+    assert "start is not confirmed yet: /rosbag2_recorder/record" in next(iter(status.actions[0].current.values()))
+    heard.set()
+    process.status_when(lambda status: "not confirmed" not in str(status.actions[0].current))
+    process.send("car1", {"v": 1})
+    process.status_when(lambda status: status.actions[0].done == 1)
+    assert node.names[-1] == "rosbag2_recorder/stop"
+    assert len(uris) >= 2
+    assert set(uris) == {"/bags/car1-20"}
+
+
+def test_what_a_service_refuses_is_told(process: Process) -> None:
+    node = Node(process.vehicle, bridged=True)
+    refusal = {"success": False, "message": "the disk is full"}
+    node.offer("recorder/on", "std_srvs/srv/Trigger", "", "bool success\nstring message\n", lambda request: refusal)
+    start = {"service": "/recorder/on", "type": "std_srvs/srv/Trigger"}
+    process.change(fast("5s", layout="Plain", start=start))
+    process.send("car1", {"v": 20})
+    status = process.status_when(lambda status: bool(status.actions and status.actions[0].failed))
+    assert status.actions[0].last_failure == "not started, and given up: /recorder/on refused: the disk is full"
+    assert len(node.calls) >= 2
+
+
+def test_what_is_wrong_with_a_call_is_told_with_its_place(tmp_path: Path) -> None:
+    documents = [
+        a_detector().to_json(),
+        fast(
+            start={"service": "/a", "type": "my/srv/Own"},
+            stop={"service": "/b", "type": "std_srvs/srv/SetBool", "request": {"data": 3, "more": "${v}"}},
+        ).to_json(),
+        fast(start={"service": "/a", "type": "my/srv/Own", "definition": "int8 x\n"}).to_json(),
+    ]
+    documents[2]["metadata"]["name"] = "second"
+    (tmp_path / "all.yaml").write_text(yaml.safe_dump_all(documents, sort_keys=False))
+    told = [str(problem) for problem in check_documents(load_documents([tmp_path / "all.yaml"]))]
+    assert [text.split("all.yaml:", 1)[1].split(" ", 1)[1] for text in told] == [
+        "spec.actions[0].trigger.ros2.start.type: the service type my/srv/Own is not known: give its .srv file as "
+        "definition",
+        "spec.actions[0].trigger.ros2.stop.request: request.data is 3, but must be of type bool",
+        "spec.actions[0].trigger.ros2.start.definition: the definition of my/srv/Own has 0 lines of ---: one stands "
+        "between request and response",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("ros2", "told"),
+    [
+        ({"layout": "Plain"}, "give start, stop or both"),
+        (
+            {"layout": "Plain", "domain": 3, "stop": call("pause", "Pause")},
+            "domain is for services with layout RmwZenoh",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_refused(ros2: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        fast(**ros2)

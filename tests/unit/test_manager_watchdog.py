@@ -1,0 +1,91 @@
+"""A manager that hangs is ended, whatever of it hangs, and one that works or only stood still is not."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from application_manager import watchdog
+from application_manager.measures import Measures
+from application_manager.observability.pages import stalled
+from application_manager.watchdog import STALLED
+from application_manager.work.workqueue import WorkQueue
+
+
+def ended_by(stall: watchdog.Stall, work: float, silent: float = 3600.0) -> str | None:
+    """Why the watchdog ends a loop that blocks for `work` seconds, if it does."""
+    said: list[str] = []
+    called = threading.Event()
+
+    def end(reason: str) -> None:
+        said.append(reason)
+        called.set()
+
+    async def scenario() -> None:
+        async with watchdog.watchdog(stall, silent, step=0.02, end=end):
+            time.sleep(work)  # noqa: ASYNC251  it hangs
+            await asyncio.to_thread(called.wait, 60 if silent < 3600 or stall() else 0.3)
+
+    asyncio.run(scenario())
+    return said[0] if said else None
+
+
+def test_an_event_loop_that_hangs_is_ended() -> None:
+    assert "the event loop has not run for" in str(ended_by(lambda: None, work=1.0, silent=0.2))
+
+
+def test_what_has_stalled_is_ended_if_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watchdog, "PERSISTENT", 0.2)
+    assert ended_by(lambda: "no resync has ended for 300 s", work=0.0) == "no resync has ended for 300 s"
+
+
+def test_one_that_works_is_left_alone() -> None:
+    assert ended_by(lambda: None, work=0.0) is None
+
+
+def test_the_process_ends_with_a_line_and_where_it_hangs() -> None:
+    program = """
+import asyncio, time
+from application_manager.watchdog import watchdog
+def hanging(): time.sleep(600)
+async def main():
+    async with watchdog(lambda: None, 0.2, step=0.05):
+        await asyncio.sleep(0.1)
+        hanging()
+asyncio.run(main())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == STALLED
+    assert "CRITICAL watchdog: the event loop has not run for" in done.stderr
+    assert "in hanging" in done.stderr
+
+
+def test_a_worker_that_is_at_one_key_for_too_long_has_stalled() -> None:
+    async def scenario() -> tuple[str | None, str | None, str | None]:
+        begun = asyncio.Event()
+
+        async def work(_: str) -> None:
+            begun.set()
+            await asyncio.sleep(3600)
+
+        queue = WorkQueue("instance", work, 1)
+        look = stalled(Measures(), 0.01, [queue], least=0.05)
+        before = queue.stuck(0.05)
+        queue.add("north")
+        running = asyncio.create_task(queue.run())
+        await begun.wait()
+        await asyncio.sleep(0.1)
+        found = look()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        return before, found, stalled(Measures(), 3600, [queue])()
+
+    before, found, after = asyncio.run(scenario())
+    assert before is None
+    assert "instance north is worked on for" in str(found)
+    assert after is None

@@ -1,0 +1,238 @@
+"""The webhook's server: HTTPS with a certificate that is followed, and an answer or none, but never a wait."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+import yaml
+
+from application_manager.admission.authority import make_certificates
+from application_manager.admission.certificate import ServingCertificate
+from application_manager.admission.reviewing import AT_ONCE, LARGEST, Desk, Serving, webhook
+from application_manager.cli import EXPECTED, app
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.core.findings.reviews import ReviewError
+from application_manager.core.findings.webhooks import PATH
+from application_manager.measures import Measures
+from tests.ports import free_port
+from tests.unit.manager_objects import DEPLOYMENT
+from wayside import commandline
+
+Ask = Callable[..., Awaitable[tuple[int, str]]]
+
+
+def served(folder: Path, desk: Desk, scenario: Callable[[Ask], Awaitable[None]], authority: Path | None = None) -> None:
+    """Run the scenario with a function that posts to the webhook."""
+    port = free_port()
+
+    async def run() -> None:
+        context = ssl.create_default_context(cafile=str(authority or folder / "ca.crt"))
+
+        async def ask(body: bytes = b"{}", path: str = "/admission", method: str = "POST") -> tuple[int, str]:
+            url = f"https://127.0.0.1:{port}{path}"
+            async with (
+                aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session,
+                session.request(method, url, data=body, ssl=context) as response,
+            ):
+                return response.status, await response.text()
+
+        async with asyncio.timeout(120), webhook(Serving(port, folder), {PATH: desk}):
+            await scenario(ask)
+
+    asyncio.run(run())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "certificates"
+    make_certificates(made, ["127.0.0.1", "manager.wayside.svc"])
+    return made
+
+
+def failures(measures: Measures) -> str:
+    return next(
+        (line for line in measures.text().decode().splitlines() if 'answer="failed"' in line and "_total" in line), ""
+    )
+
+
+def test_a_question_is_answered_and_what_is_none_is_not(folder: Path) -> None:
+    measures = Measures()
+
+    async def review(asked: Any) -> dict[str, Any]:
+        if asked == "a defect":
+            raise KeyError("spec")
+        if not isinstance(asked, dict):
+            raise ReviewError("is no AdmissionReview")
+        return {"response": asked}
+
+    async def scenario(ask: Ask) -> None:
+        assert await ask(b'{"a": 1}') == (200, '{"response":{"a":1}}')
+        assert await ask(b"[]") == (400, "is no AdmissionReview\n")
+        assert (await ask(b"{"))[0] == 400
+        assert (await ask(b'"\xff"'))[0] == 400
+        assert (await ask(b'"a defect"'))[0] == 500
+        assert (await ask(b" " * (LARGEST + 1)))[0] == 413
+        assert (await ask(path="/"))[0] == 404
+        assert (await ask(method="GET"))[0] == 405
+        assert await ask(b'{"a": 2}') == (200, '{"response":{"a":2}}')
+
+    served(folder, Desk(review, lambda: True, measures), scenario)
+    assert failures(measures).endswith(" 5.0")
+
+
+def test_nothing_is_answered_before_everything_is_known(folder: Path) -> None:
+    known: list[bool] = []
+
+    async def review(asked: Any) -> dict[str, Any]:
+        return {}
+
+    async def scenario(ask: Ask) -> None:
+        assert await ask() == (503, "not everything is listed and watched yet\n")
+        known.append(True)
+        assert (await ask())[0] == 200
+
+    served(folder, Desk(review, lambda: bool(known), Measures()), scenario)
+
+
+def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:
+    all_there, go_on = asyncio.Event(), asyncio.Event()
+    waiting: list[Any] = []
+
+    async def review(asked: Any) -> dict[str, Any]:
+        waiting.append(asked)
+        if len(waiting) == AT_ONCE:
+            all_there.set()
+        await go_on.wait()
+        return {}
+
+    async def scenario(ask: Ask) -> None:
+        asked = [asyncio.create_task(ask()) for _ in range(AT_ONCE)]  # type: ignore[arg-type]
+        await all_there.wait()
+        assert (await ask())[0] == 503
+        go_on.set()
+        assert {status for status, _ in await asyncio.gather(*asked)} == {200}
+        assert (await ask())[0] == 200
+
+    served(folder, Desk(review, lambda: True, Measures()), scenario)
+
+
+def test_a_certificate_is_for_the_hosts_given_and_its_key_for_its_owner_alone(folder: Path) -> None:
+    text = ssl._ssl._test_decode_cert(str(folder / "tls.crt"))  # type: ignore[attr-defined]
+    assert text["subjectAltName"] == (("IP Address", "127.0.0.1"), ("DNS", "manager.wayside.svc"))
+    assert (folder / "tls.key").stat().st_mode & 0o077 == 0
+
+
+def test_renewed_files_are_taken_whole_or_not_at_all(folder: Path) -> None:
+    certificate = ServingCertificate(folder, "--admission-certificates")
+    assert not certificate.renewed()
+    old = {each.name: each.read_bytes() for each in folder.iterdir()}
+    make_certificates(folder, ["127.0.0.1"])
+    new = (folder / "tls.key").read_bytes()
+    (folder / "tls.key").write_bytes(old["tls.key"])
+    for _ in range(2):  # the new certificate without its key
+        with pytest.raises(ssl.SSLError):
+            certificate.renewed()
+    (folder / "tls.key").write_bytes(new)
+    assert certificate.renewed()
+    assert not certificate.renewed()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "part"),
+    [
+        (lambda folder: (folder / "tls.key").unlink(), "tls.key: No such file or directory: the folder must"),
+        (lambda folder: (folder / "tls.crt").write_text("x"), "are no certificate and key"),
+        (lambda folder: make_certificates(folder / "b", ["a"]) and (folder / "b/tls.key").replace(folder / "tls.key"),
+         "tls.key is not the key of tls.crt"),
+    ],
+    ids=["absent", "none", "of another"],
+)  # fmt: skip
+def test_files_that_cannot_be_used_are_said_at_the_start(folder: Path, spoil: Callable[[Path], Any], part: str) -> None:
+    spoil(folder)
+    with pytest.raises(ConfigurationError, match=r"^--admission-certificates .*certificates: ") as error:
+        ServingCertificate(folder, "--admission-certificates")
+    assert part in str(error.value)
+
+
+def test_a_port_that_is_taken_is_said(folder: Path) -> None:
+    async def review(asked: Any) -> dict[str, Any]:
+        return {}
+
+    desk = Desk(review, lambda: True, Measures())
+
+    async def run() -> None:
+        serving = Serving(free_port(), folder)
+        async with webhook(serving, {PATH: desk}):
+            with pytest.raises(ConfigurationError, match=f"--admission-port {serving.port}: .*give another port"):
+                async with webhook(serving, {PATH: desk}):
+                    pass
+
+    asyncio.run(run())
+
+
+# --- At the desk
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    def command(*arguments: str) -> tuple[int, str, str]:
+        code = commandline.run(app, "application-manager", EXPECTED, arguments)
+        return code, *capsys.readouterr()
+
+    return command
+
+
+def test_check_says_where_in_the_files_what_would_be_refused_is(
+    command: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    file = tmp_path / "all.yaml"
+    manifest = yaml.safe_dump(DEPLOYMENT)
+    indented = "\n".join(f"      {line}" for line in manifest.splitlines())
+    file.write_text(
+        "apiVersion: wayside.dev/v1alpha1\nkind: ApplicationTemplate\nmetadata: {name: app}\nspec:\n"
+        "  key: ${parameters.regoin}\n  parameters: {region: {type: string}}\n  manifests:\n    -\n" + indented + "\n"
+        "---\napiVersion: wayside.dev/v1alpha1\nkind: EventRule\nmetadata: {name: fast}\nspec: {when: 'true'}\n"
+    )
+    code, _, said = command("check", str(file))
+    assert code == 1
+    assert f"{file}:5:8: ApplicationTemplate app: spec.key" in said
+    assert "regoin" in said
+    assert "warning: " in said
+    assert "no valid Detector in namespace default selects the rule" in said
+    file.write_text(file.read_text().replace("regoin", "region"))
+    code, _, said = command("check", str(file))
+    assert (code, said.splitlines()[-1]) == (0, "2 looked at: nothing that would be refused")
+
+
+def test_check_finds_nothing_that_would_be_refused_in_the_examples(
+    command: Callable[..., tuple[int, str, str]],
+) -> None:
+    folders = sorted({str(each.parent) for each in Path("examples").rglob("template*.yaml")})
+    assert folders
+    for folder in folders:
+        code, _, said = command("check", folder)
+        assert code == 0, said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["run", "--admission-port", "9443"], "go together: give both"),
+        (["webhooks"], "give either --service NAMESPACE/NAME or --url"),
+        (["webhooks", "--service", "manager"], "'manager' is no Service: write NAMESPACE/NAME"),
+        (["webhooks", "--service", "a/b", "--ca-bundle", "nowhere.crt"], "nowhere.crt: No such file"),
+        (["webhooks", "--service", "a/b", "--ca-bundle", "pyproject.toml"], "holds no certificate"),
+    ],
+)
+def test_bad_usage_is_one_line_with_the_remedy(
+    command: Callable[..., tuple[int, str, str]], arguments: list[str], part: str
+) -> None:
+    code, out, said = command(*arguments)
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert part in said

@@ -1,0 +1,44 @@
+"""What is wrong with a rule whatever Detector is to evaluate it: its own expressions and names.
+
+The rule is compiled against a Detector that has every stream, keeps everything and takes every action. So what remains
+is the rule's alone, and no change of a Detector could put it right.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from wayside.api import Detector, EventRule
+from wayside.api.base import Metadata, PositiveDuration
+from wayside.api.detector import Buffer, DetectorSpec
+from wayside.api.stream import Stream
+from wayside.rules.compiling import compile_rule
+from wayside.rules.problems import RuleError, RuleProblem
+
+
+def own_problems(rule: EventRule) -> tuple[RuleProblem, ...]:
+    """Every problem that the rule has with each Detector; none where some Detector could evaluate it."""
+    try:
+        compile_rule(rule, _taking_everything())
+    except RuleError as error:
+        # Of a stream's type or messages a Detector says more than we make up here.
+        return tuple(each for each in error.problems if each.path[-1:] != ("stream",))
+    return ()
+
+
+class _AllStreams(DetectorSpec):
+    """A Detector's spec with a stream of every name."""
+
+    def stream(self, name: str) -> Stream | None:
+        return self.streams[0].model_copy(update={"name": name})
+
+
+@lru_cache(maxsize=1)
+def _taking_everything() -> Detector:
+    raw = {
+        "streams": [{"name": "any", "key": "${client:*}/any", "encoding": "json"}],
+        "recordings": {"path": "/recordings"},
+        "database": {"uriVariable": "WAYSIDE_DATABASE", "files": {"path": "/files"}},
+    }
+    spec = _AllStreams.model_validate(raw).model_copy(update={"buffer": Buffer(duration=PositiveDuration("999999h"))})
+    return Detector.model_construct(kind="Detector", metadata=Metadata(name="any"), spec=spec)

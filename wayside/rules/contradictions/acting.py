@@ -1,0 +1,73 @@
+"""Which types of action an action of a rule can be.
+
+Some are told by what the action is: `record` records. Others are told by what stands at the other end: a message to
+software may be what reconfigures it, and an application that is launched may do anything.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from wayside.api.actions.action import Action
+from wayside.api.actions.notify import Notify
+from wayside.api.operation import Operation
+from wayside.api.scheme import TypeOfAction
+
+_ANY = frozenset(TypeOfAction)
+_TOLD = _ANY - {TypeOfAction.DATA_COLLECTION}
+
+
+class Types(NamedTuple):
+    """What an action is taken for."""
+
+    needed: frozenset[TypeOfAction]
+    """One of these must be named where the action is; empty: nothing is needed."""
+    possible: frozenset[TypeOfAction]
+    """It accounts for these where they are named."""
+    does: str
+    """What it does, for a warning."""
+
+
+_LAUNCHES = Types(frozenset({TypeOfAction.DEPLOYMENT}), _ANY, "launches software")
+_CONFIGURES = Types(
+    frozenset({TypeOfAction.RECONFIGURATION}),
+    _ANY - {TypeOfAction.DEPLOYMENT},
+    "configures what runs, and starts nothing",
+)
+_SUSPENDS = Types(
+    frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
+    frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
+    "stops what runs",
+)
+_RECORDS = Types(frozenset({TypeOfAction.DATA_COLLECTION}), frozenset({TypeOfAction.DATA_COLLECTION}), "records data")
+_TRIES_RECORDING = _RECORDS._replace(needed=frozenset())
+_ASKS = Types(frozenset(), _ANY, "asks another system")
+_ALERTS = Types(frozenset({TypeOfAction.NOTIFICATION}), frozenset({TypeOfAction.NOTIFICATION}), "raises an alert")
+_TELLS = Types(_TOLD, _ANY, "tells somebody, or something")
+
+_OF_OPERATION = {
+    Operation.DEPLOY: _LAUNCHES,
+    Operation.RECONFIGURE: _CONFIGURES,
+    Operation.SUSPEND: _SUSPENDS,
+}
+
+
+def types(action: Action) -> Types:
+    """What the action can be."""
+    if action.deploy is not None:
+        return _OF_OPERATION[action.deploy.operation]
+    if action.record is not None:
+        return _RECORDS
+    if action.database is not None:
+        return _TRIES_RECORDING if action.database.dry_run else _RECORDS
+    if action.trigger is not None:
+        return _RECORDS if action.trigger.detector is not None else _ASKS
+    if action.notify is not None:
+        return _ALERTS if action.notify.alertmanager is not None else _TELLS
+    return _ASKS
+
+
+def delay_ns(action: Action) -> int:
+    """How long the action waits before it does anything, in nanoseconds."""
+    notify: Notify | None = action.notify
+    return 0 if notify is None or notify.grouping is None else notify.grouping.wait.ns

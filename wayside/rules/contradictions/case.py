@@ -1,0 +1,88 @@
+"""A rule with its classification: what a contradiction is looked for in, and how one is said."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from wayside.api import Detector, EventRule
+from wayside.api.base import Duration
+from wayside.api.classification import Classification
+from wayside.api.eventrule import Signal
+from wayside.api.scheme import SCHEME, Dimension, Value
+from wayside.rules.compiled import CompiledRule
+from wayside.rules.problems import RuleProblem
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A rule that compiles, and what it is evaluated with."""
+
+    rule: EventRule
+    compiled: CompiledRule
+    detector: Detector
+    others: Mapping[str, EventRule]
+    """The rules that it may name, by name."""
+
+    def given(self, values: type[Value]) -> list[Value]:
+        """What the classification says in the dimension; nothing where it says nothing."""
+        classification = self.rule.spec.classification or Classification()
+        return classification.values_of(_dimension(values))
+
+    def only(self, *values: Value) -> bool:
+        """Whether the classification says something in the values' dimension, and nothing but these."""
+        given = self.given(type(values[0]))
+        return bool(given) and set(given) <= set(values)
+
+    def against(self, value: Value, fact: str) -> RuleProblem:
+        """The warning that a value that is given does not fit the fact, which also says what would."""
+        dimension = _dimension(type(value))
+        index = self.given(type(value)).index(value)
+        return RuleProblem(
+            ("spec", "classification", dimension.name, index), f"{value.explained()} contradicts the rule: {fact}"
+        )
+
+    def lacks(self, values: type[Value], fact: str) -> RuleProblem:
+        """The warning that a value is missing in a dimension; the fact says which."""
+        return RuleProblem(("spec", "classification", _dimension(values).name), fact)
+
+
+def conditions(rule: EventRule) -> Iterator[str]:
+    """The expressions that decide whether, and for whom, an episode starts or ends."""
+    spec, scope = rule.spec, rule.spec.scope
+    yield spec.when
+    if spec.until is not None:
+        yield spec.until
+    for role in (scope.client, scope.pairs, *((scope.pairs.a, scope.pairs.b) if scope.pairs is not None else ())):
+        if role is not None and role.where is not None:
+            yield role.where
+    if scope.fleet is not None:
+        yield scope.fleet.members
+
+
+def detecting(rule: EventRule) -> Iterator[tuple[int, Signal]]:
+    """The signals that decide about episodes, with their places; not those that only actions read.
+
+    A signal decides if its name is in a condition or in the scope, or if it goes into a model that decides.
+    """
+    spec = rule.spec
+    names = {name for condition in conditions(rule) for name in _NAME.findall(condition)}
+    for model in [signal.model for signal in spec.signals if signal.name in names]:
+        if model is not None:
+            names |= {name for each in model.inputs for name in each.signals}
+    return ((index, signal) for index, signal in enumerate(spec.signals) if signal.name in names)
+
+
+def span(nanoseconds: int) -> str:
+    """A length of time, as files have it."""
+    for unit, factor in (("h", 3_600 * 10**9), ("m", 60 * 10**9), ("s", 10**9)):
+        if nanoseconds >= factor and nanoseconds % factor == 0:
+            return str(Duration(f"{nanoseconds // factor}{unit}"))
+    return str(Duration(f"{nanoseconds // 10**6}ms"))
+
+
+def _dimension(values: type[Value]) -> Dimension:
+    return next(dimension for dimension in SCHEME if dimension.values is values)

@@ -1,0 +1,99 @@
+"""How much time the data covers in which a rule finds its event, as far as the rule tells.
+
+A rule that looks at the newest samples alone needs none. Windows need theirs, and `for` comes on top. A plugin, the age
+of a sample and the like may reach back any time: then the time is at least what is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from wayside.api import EventRule
+from wayside.api.eventrule import Aggregate, Signal
+from wayside.rules.contradictions.case import conditions, detecting, span
+
+_OF_ANY_TIME = frozenset({Aggregate.FIRST, Aggregate.PREVIOUS, Aggregate.AGE, Aggregate.ACTIVE})
+"""Without a window, these may look at a time long ago."""
+
+_CLOSING_SPEED_NS = 10**9
+"""It is the change of the distance over the last second."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The time that a rule looks back."""
+
+    ns: int
+    """At least so long, in nanoseconds."""
+    why: str
+    """The fields that say so; what nothing says is said in words."""
+    any_time: bool
+    """Whether it may look back farther, which cannot be told."""
+
+
+class _Reach(NamedTuple):
+    ns: int
+    why: str
+    any_time: bool = False
+
+
+def observation(rule: EventRule, others: Mapping[str, EventRule]) -> Observation:
+    """How far the rule looks back, through the rules that it names as well."""
+    return _observation(rule, others, frozenset())
+
+
+def _observation(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[str]) -> Observation:
+    reaches = list(_reaches(rule, others, above | {rule.name}))
+    longest = max(reaches, key=lambda reach: reach.ns, default=_Reach(0, ""))
+    why = [longest.why] if longest.ns else []
+    if rule.spec.for_.ns:
+        why.append(f"spec.for: {rule.spec.for_}")
+    return Observation(
+        longest.ns + rule.spec.for_.ns,
+        " and ".join(why) or "it looks at the newest samples alone",
+        any(reach.any_time for reach in reaches),
+    )
+
+
+def _reaches(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[str]) -> Iterator[_Reach]:
+    if any("closingSpeed" in condition for condition in conditions(rule)):
+        yield _Reach(_CLOSING_SPEED_NS, "closingSpeed")
+    for index, signal in detecting(rule):
+        own = _reach(f"spec.signals[{index}]", signal)
+        if signal.rule is None or signal.rule in above:
+            yield own
+        elif signal.rule not in others:
+            yield own._replace(any_time=True)
+        else:
+            other = _observation(others[signal.rule], others, above)
+            why = f"{other.why} of the rule {signal.rule}" if other.ns else ""
+            yield _Reach(
+                own.ns + other.ns,
+                " and ".join(each for each in (own.why, why) if each),
+                own.any_time or other.any_time,
+            )
+
+
+def _reach(at: str, signal: Signal) -> _Reach:
+    if signal.plugin is not None:
+        return _Reach(0, "", any_time=True)
+    if signal.model is not None:
+        windows = [each.window for each in signal.model.inputs if each.window is not None]
+        longest = max((window.over for window in windows if window.over is not None), key=lambda o: o.ns, default=None)
+        # Of a number of samples it is not known how much time they are.
+        any_time = any(window.over is None for window in windows)
+        return _Reach(0, "", any_time) if longest is None else _Reach(longest.ns, f"{at}.model: {longest}", any_time)
+    if signal.aggregate is Aggregate.LAST and signal.rule is None:
+        return _Reach(0, "")  # `over` says how old it may be; one sample is enough
+    if signal.over is not None:
+        return _Reach(signal.over.ns, f"{at}.over: {signal.over}")
+    return _Reach(0, "", any_time=signal.aggregate in _OF_ANY_TIME or signal.rule is not None)
+
+
+def looks_back(observed: Observation) -> str:
+    """What an observation says, for a warning."""
+    if not observed.ns:
+        return observed.why
+    return f"it looks back {span(observed.ns)} ({observed.why})"

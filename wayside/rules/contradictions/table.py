@@ -1,0 +1,240 @@
+"""The table of contradictions: for a dimension of the scheme, what of a rule contradicts which value.
+
+Only what is certain is here. Of the overarching purpose, the data source entity, the affected entity and the scope of
+impact no rule says anything that could contradict a value. Where several values are given in a dimension, it is enough
+that one fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+from wayside.api import Detector, EventRule
+from wayside.api.scheme import (
+    ActingEntity,
+    DetectionAlgorithm,
+    EventDetectionEntity,
+    Incidence,
+    NumberOfParticipants,
+    ObservationPeriod,
+    TimeSensitivity,
+    TypeOfAction,
+    TypeOfParticipants,
+    Value,
+)
+from wayside.rules.compiled import CompiledRule, FleetSubject, PairSubject
+from wayside.rules.contradictions.acting import delay_ns, types
+from wayside.rules.contradictions.case import Case, detecting, span
+from wayside.rules.contradictions.observation import looks_back, observation
+from wayside.rules.problems import RuleProblem
+
+_COUPLE_OF_SECONDS = 2 * 10**9
+_HOUR = 3_600 * 10**9
+
+_SENDERS = {
+    "etsi/vam": TypeOfParticipants.VRU,
+    "etsi/spatem": TypeOfParticipants.ROAD_INFRASTRUCTURE,
+    "etsi/mapem": TypeOfParticipants.ROAD_INFRASTRUCTURE,
+}
+"""Who alone sends these messages: of VAM ETSI TS 103 300-3 says so, of SPATEM and MAPEM ETSI TS 103 301."""
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """One way in which a classification can be wrong."""
+
+    dimension: type[Value]
+    says: str
+    """When there is a warning, for people."""
+    find: Callable[[Case], Iterator[RuleProblem]]
+
+
+def contradictions(
+    rule: EventRule, compiled: CompiledRule, detector: Detector, others: Mapping[str, EventRule]
+) -> list[RuleProblem]:
+    """Every contradiction of a rule that compiles; none where it has no classification.
+
+    Args:
+        rule: as written.
+        compiled: the same.
+        detector: the one that it was compiled against.
+        others: the rules that it may name, by name.
+    """
+    if rule.spec.classification is None:
+        return []
+    case = Case(rule, compiled, detector, others)
+    return [problem for each in CONTRADICTIONS for problem in each.find(case)]
+
+
+def _senders(case: Case) -> Iterator[RuleProblem]:
+    given = case.given(TypeOfParticipants)
+    for name in sorted(case.compiled.streams):
+        stream = case.detector.spec.stream(name)
+        sender = _SENDERS.get(stream.type or "") if stream is not None else None
+        if given and sender is not None and sender not in given:
+            yield case.lacks(
+                TypeOfParticipants,
+                f"the messages of the stream {name} ({stream.type if stream else ''}) are sent by "
+                f"{sender.explained()}: add it",
+            )
+
+
+def _one_of_several(case: Case) -> Iterator[RuleProblem]:
+    one = NumberOfParticipants.ONE
+    if not case.only(one):
+        return
+    if isinstance(case.compiled.subject, PairSubject):
+        yield case.against(one, "spec.scope.pairs is about two clients: write Two, or Multiple where more take part")
+    elif isinstance(case.compiled.subject, FleetSubject):
+        yield case.against(one, "spec.scope.fleet is about all members together: write Two or Multiple")
+
+
+def _one_and_external(case: Case) -> Iterator[RuleProblem]:
+    external = EventDetectionEntity.EXTERNAL
+    if case.only(NumberOfParticipants.ONE) and case.only(external):
+        yield case.against(
+            external,
+            f"whose data it is and who detects the event are two that take part, and numberOfParticipants says "
+            f"{NumberOfParticipants.ONE.explained()}: correct one of them",
+        )
+
+
+def _records_itself(case: Case) -> Iterator[RuleProblem]:
+    actions = case.rule.spec.actions
+    if case.only(ActingEntity.EXTERNAL) and actions and all(each.record or each.database for each in actions):
+        fields = ", ".join(f"spec.actions[{index}].{each.field}" for index, each in enumerate(actions))
+        yield case.against(
+            ActingEntity.EXTERNAL, f"the detector itself carries out {fields}: write EventDetectionEntity"
+        )
+
+
+def _observed(case: Case) -> Iterator[RuleProblem]:
+    given = case.given(ObservationPeriod)
+    observed = observation(case.rule, case.others)
+    fits = {
+        ObservationPeriod.IMMEDIATE: observed.ns < _COUPLE_OF_SECONDS,
+        ObservationPeriod.SHORT_TERM: observed.ns < _HOUR and (observed.ns > 0 or observed.any_time),
+        ObservationPeriod.LONG_TERM: observed.ns >= _HOUR or observed.any_time,
+    }
+    fitting = [value for value, fit in fits.items() if fit]
+    if given and not set(given) & set(fitting):
+        remedy = " or ".join(value.value for value in fitting)
+        for value in given:
+            yield case.against(value, f"{looks_back(observed)}: write {remedy}")
+
+
+def _late(case: Case) -> Iterator[RuleProblem]:
+    every = case.compiled.every_ns or 0
+    waits = [delay_ns(action) for action in case.rule.spec.actions]
+    wait = min(waits, default=0)
+    delay, given = every + wait, case.given(TimeSensitivity)
+    why = f"it is evaluated every {span(every)} (spec.evaluation.every)" if every >= wait else ""
+    if wait:
+        first = f"spec.actions[{waits.index(wait)}].notify.grouping.wait: {span(wait)}"
+        why = " and ".join(each for each in (why, first) if each)
+    if case.only(TimeSensitivity.IMMEDIATE) and delay >= _COUPLE_OF_SECONDS:
+        yield case.against(TimeSensitivity.IMMEDIATE, f"{why}: shorten it, or write ShortTerm or LongTerm")
+    elif case.only(TimeSensitivity.IMMEDIATE, TimeSensitivity.SHORT_TERM) and delay >= _HOUR:
+        for value in given:
+            yield case.against(value, f"{why}: shorten it, or write LongTerm")
+
+
+def _always(case: Case) -> Iterator[RuleProblem]:
+    if not case.only(Incidence.RARE, Incidence.UNEXPECTED) or case.compiled.when.names:
+        return
+    if case.compiled.when.evaluate_or_unknown({}) is True:
+        for value in case.given(Incidence):
+            yield case.against(value, f"spec.when: {case.rule.spec.when} always holds: write Frequent")
+
+
+def _algorithm(case: Case) -> Iterator[RuleProblem]:
+    models, plugins = _learnt(case.rule, case.others, frozenset())
+    if case.only(DetectionAlgorithm.RULE_BASED) and models:
+        yield case.against(DetectionAlgorithm.RULE_BASED, f"{models[0]} is a learnt model: add LearningBased")
+    if case.only(DetectionAlgorithm.LEARNING_BASED) and not models and not plugins:
+        yield case.against(
+            DetectionAlgorithm.LEARNING_BASED,
+            "no signal that decides comes from a model or a plugin: write RuleBased, or add it where what the rule "
+            "looks at was learnt",
+        )
+
+
+def _learnt(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[str]) -> tuple[list[str], bool]:
+    """The fields with models that decide, of the rules that are named as well; and whether a plugin decides."""
+    models, plugins = [], False
+    for index, signal in detecting(rule):
+        plugins = plugins or signal.plugin is not None
+        if signal.model is not None:
+            models.append(f"spec.signals[{index}].model")
+        elif signal.rule is not None and signal.rule in others and signal.rule not in above:
+            further, any_plugin = _learnt(others[signal.rule], others, above | {rule.name})
+            models += [f"{each} of the rule {signal.rule}" for each in further]
+            plugins = plugins or any_plugin
+    return models, plugins
+
+
+def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
+    given = set(case.given(TypeOfAction))
+    actions = case.rule.spec.actions
+    if not given:
+        return
+    # Somebody is told, and gets the data with it: that is a report, as in the paper's Table 2.
+    report = TypeOfAction.NOTIFICATION in given and any(action.notify is not None for action in actions)
+    for index, action in enumerate(actions):
+        needed, _, does = types(action)
+        if needed == {TypeOfAction.DATA_COLLECTION} and report:
+            continue
+        if needed and not needed & given:
+            missing = " or ".join(value.explained() for value in TypeOfAction if value in needed)
+            yield case.lacks(TypeOfAction, f"spec.actions[{index}].{action.field} {does}: add {missing}")
+
+
+def _unaccounted_type(case: Case) -> Iterator[RuleProblem]:
+    actions = case.rule.spec.actions
+    possible = frozenset[Value]().union(*(types(action).possible for action in actions))
+    for value in case.given(TypeOfAction) if actions else ():  # without actions, somebody else acts on the events
+        if value not in possible:
+            listed = ", ".join(f"spec.actions[{index}].{each.field}" for index, each in enumerate(actions))
+            yield case.against(value, f"no action of the rule does that ({listed}): remove it, or add the action")
+
+
+CONTRADICTIONS = (
+    Contradiction(
+        TypeOfParticipants,
+        "the rule looks at a stream of VAM without VRU, or of SPATEM or MAPEM without RoadInfrastructure",
+        _senders,
+    ),
+    Contradiction(NumberOfParticipants, "One alone, and the scope is pairs or the fleet", _one_of_several),
+    Contradiction(
+        EventDetectionEntity, "External alone, and numberOfParticipants One: two take part", _one_and_external
+    ),
+    Contradiction(ActingEntity, "External alone, and all actions are record or database", _records_itself),
+    Contradiction(
+        ObservationPeriod,
+        "no value fits the time that the rule looks back, with windows, for, models and the rules that it names: "
+        "Immediate is below 2 s, ShortTerm below 1 h and more than the newest samples, LongTerm is 1 h or more",
+        _observed,
+    ),
+    Contradiction(
+        TimeSensitivity,
+        "Immediate alone, and evaluation.every with the grouping of notifications delays the action by 2 s or more; "
+        "or without LongTerm by 1 h or more",
+        _late,
+    ),
+    Contradiction(Incidence, "Rare or Unexpected, and when always holds", _always),
+    Contradiction(
+        DetectionAlgorithm,
+        "RuleBased alone with a model that decides, or LearningBased alone without a model or plugin that does",
+        _algorithm,
+    ),
+    Contradiction(
+        TypeOfAction,
+        "an action whose type is not named: deploy needs Deployment (Reconfigure: Reconfiguration; Suspend: "
+        "Reconfiguration or Other), record, database and trigger.detector need DataCollection (but not beside a notify "
+        "action with Notification: that is a report), notify.alertmanager needs Notification",
+        _unnamed_action,
+    ),
+    Contradiction(TypeOfAction, "a type that no action of the rule can be", _unaccounted_type),
+)
+"""All of them, in the order of the scheme."""
