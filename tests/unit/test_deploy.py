@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,12 @@ async def eventually(holds: Callable[[], bool], what: str) -> None:
 
 
 def stored(folder: Path) -> dict[str, dict[str, Any]]:
-    return {file.stem: yaml.safe_load(file.read_text()) for file in sorted(folder.glob("[!.]*.yaml"))}
+    """The tasks that are there; one that is removed between the look at the folder and the look into it is not."""
+    tasks = {}
+    for file in sorted(folder.glob("[!.]*.yaml")):
+        with suppress(FileNotFoundError):
+            tasks[file.stem] = yaml.safe_load(file.read_text())
+    return tasks
 
 
 def ends(folder: Path) -> dict[str, str | None]:
