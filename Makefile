@@ -69,7 +69,7 @@ crds: $(BIN)/.installed ## write crds/ anew from the models, and what of the cha
 
 requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by the newest that pyproject.toml allows
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra certificates --extra etsi --extra mqtt --extra otel --upgrade \
+	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra etsi --extra mqtt --extra otel --upgrade \
 	  --generate-hashes --universal --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements.txt
 
 clean: ## remove what was made here; the caches outside the tree stay

@@ -1,7 +1,6 @@
 """Certificates of our own making, for trying the webhook where there is no cert-manager.
 
 A new authority signs one certificate and is forgotten: its key is kept nowhere, so nothing else can be signed with it.
-Needs the package cryptography, which nothing else of the manager does.
 """
 
 from __future__ import annotations

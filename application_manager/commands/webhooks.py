@@ -60,20 +60,15 @@ def webhooks(
         place = Place.of_service(service) if service is not None else Place.of_url(url or "")
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--url" if service is None else "--service") from None
-    authority = _authority(ca_bundle, make_certificates, place)
+    bundle = _authority(ca_bundle, make_certificates, place)
     made = [webhook_configuration, *([injection_configuration] if detectors else [])]
-    sys.stdout.write(to_yaml([each(place, authority, namespace or (), name) for each in made]))
+    sys.stdout.write(to_yaml([each(place, bundle, namespace or (), name) for each in made]))
 
 
 def _authority(given: Path | None, folder: Path | None, place: Place) -> bytes | None:
     if folder is not None:
-        try:
-            from application_manager.admission.authority import make_certificates  # noqa: PLC0415  needs an extra
-        except ImportError:
-            raise ConfigurationError(
-                "--make-certificates: the package cryptography is missing: pip install 'wayside[certificates]', or "
-                "give the certificate of an authority of yours by --ca-bundle"
-            ) from None
+        from application_manager.admission.authority import make_certificates  # noqa: PLC0415  hardly ever asked for
+
         return make_certificates(folder, place.hosts)
     if given is None:
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import ssl
 from pathlib import Path
 
 import pytest
@@ -40,13 +41,11 @@ def test_a_chain_ends_with_the_first_of_its_certificates(ends: list[datetime.dat
 
 @given(st.binary(max_size=60), st.integers(0, 300))
 def test_what_is_no_certificate_is_a_value_error(noise: bytes, cut: int) -> None:
-    with pytest.raises(ValueError, match=r"certificate|validity|end|early|DER|no "):
+    with pytest.raises(ValueError, match="PEM"):
         expiry(noise)
-    whole = x509.load_pem_x509_certificate(certificate(datetime.datetime(2030, 1, 1))).public_bytes(
-        serialization.Encoding.DER
-    )
-    with pytest.raises(ValueError, match=r"certificate|validity|end|early|DER|no "):
-        credentials._not_after(whole[: min(cut, len(whole) - 1)])
+    der = ssl.PEM_cert_to_DER_cert(certificate(datetime.datetime(2030, 1, 1)).decode())
+    with pytest.raises(ValueError, match="asn1"):
+        expiry(ssl.DER_cert_to_PEM_cert(der[: min(cut, len(der) - 1)]).encode())
 
 
 def access(folder: Path) -> Access:

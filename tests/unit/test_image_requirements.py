@@ -14,7 +14,7 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
-EXTRAS = ("certificates", "etsi", "mqtt", "otel")
+EXTRAS = ("etsi", "mqtt", "otel")
 PINS = {
     canonicalize_name(name): (Version(version), block)
     for block in re.split(r"\n(?=\S)", (ROOT / "docker" / "requirements.txt").read_text())
