@@ -79,28 +79,21 @@ def injection(
     name = detector_of(metadata)
     if name is None:
         return Injection()
-    why_not = _why_not(name, metadata, spec, namespace, detector, defaults)
-    if why_not is None:
-        assert detector is not None and defaults is not None  # noqa: S101, PT018  said otherwise
-        try:
-            return Injection(addition(spec, detector, defaults))
-        except UnfitError as error:
-            why_not = str(error)
-    return Injection(why_not=why_not)
-
-
-def _why_not(
-    name: str,
-    metadata: Mapping[str, Any],
-    spec: Mapping[str, Any],
-    namespace: str,
-    detector: Detector | None,
-    defaults: PodDefaults | None,
-) -> str | None:
     if defaults is None:
-        return _NO_IMAGE
+        return Injection(why_not=_NO_IMAGE)
     if detector is None:
-        return f"label {SIDECAR_LABEL}: namespace {namespace} has no Detector {name!r} that can be read: create it"
+        missing = f"namespace {namespace} has no Detector {name!r} that can be read: create it"
+        return Injection(why_not=f"label {SIDECAR_LABEL}: {missing}")
+    why_not = _why_not(name, metadata, spec, detector)
+    if why_not is not None:
+        return Injection(why_not=why_not)
+    try:
+        return Injection(addition(spec, detector, defaults))
+    except UnfitError as error:
+        return Injection(why_not=str(error))
+
+
+def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], detector: Detector) -> str | None:
     if detector.spec.mode is not DetectorMode.SIDECAR:
         mode = f"of mode {detector.spec.mode}" if detector.spec.mode else "without a mode"
         return f"Detector {name} is {mode}: give it mode Sidecar, or remove the label {SIDECAR_LABEL}"
