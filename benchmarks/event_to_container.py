@@ -27,12 +27,10 @@ import yaml
 
 from tests.cluster.api import Api, Object
 from tests.cluster.crds import CRDS
-from tests.cluster.managed_world import condition
 from tests.cluster.namespaces import fresh_namespace
 from tests.e2e.images import WAYSIDE_IMAGE, wayside_archive
 from tests.e2e.node import Node
-from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, apply_manager, expose_detector
-from tests.e2e.workloads import wait_available
+from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, run_town
 
 sys.path.insert(0, str(EXAMPLE))
 
@@ -80,16 +78,7 @@ def measure(node: Node, api: Api, rounds: int) -> Seconds:
     rule = api.list("EventRule")[0]
     record = [action for action in rule["spec"]["actions"] if action["name"] == "record"]
     api.patch("EventRule", rule["metadata"]["name"], {"spec": {"actions": record}})
-    apply_manager(api, WAYSIDE_IMAGE)
-    port = expose_detector(api, "town")
-    wait_available(api, "application-manager")
-    api.wait_for(
-        "Detector",
-        "town",
-        lambda raw: condition(raw, "Running").get("status") == "True",
-        timeout=PATIENCE,
-        what="the manager runs the detector",
-    )
+    port = run_town(api, WAYSIDE_IMAGE)
     taken: Seconds = {EVENT: [], KUBECTL: [], REQUEST: []}
     made: Object = {}
     with Standing([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:

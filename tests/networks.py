@@ -14,6 +14,7 @@ from typing import Any
 import zenoh
 
 from detector.streams.zenoh import Put
+from tests.unit.certificates import Authority
 from wayside.api.stream import Encoding, Stream
 
 PATIENCE = 60.0
@@ -53,6 +54,21 @@ def router(**settings: Any) -> Iterator[zenoh.Session]:
     for path, value in settings.items():
         config.insert_json5(path.replace("__", "/"), json.dumps(value))
     with zenoh.open(config) as session:
+        yield session
+
+
+@contextmanager
+def guarded_router(at: str, authority: Authority, **more: Any) -> Iterator[zenoh.Session]:
+    """A router that knows this authority, lets in only what it signed, and nothing whose certificate has expired."""
+    certificate, key = authority.sign("router")
+    tls = {
+        "listen_certificate": str(certificate),
+        "listen_private_key": str(key),
+        "root_ca_certificate": str(authority.ca),
+        "enable_mtls": True,
+        "close_link_on_expiration": True,
+    }
+    with router(listen__endpoints=[at], transport__link__tls=tls, **more) as session:
         yield session
 
 

@@ -127,6 +127,16 @@ def wait_enforced(api: Api) -> None:
     api.wait_for("ResourceQuota", "few", lambda raw: bool(raw.get("status", {}).get("hard")), what="the quota holds")
 
 
+def beyond_the_quota(api: Api, name: str) -> Object:
+    """The task of this name, once it says what keeps it back."""
+    return api.wait_for(
+        "ApplicationTask",
+        name,
+        lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
+        what="the task says that the quota is exceeded",
+    )
+
+
 def test_an_object_beyond_the_quota_is_said_and_made_once_there_is_room(
     api: Api, processes: Processes, namespace: str
 ) -> None:
@@ -137,12 +147,7 @@ def test_an_object_beyond_the_quota_is_said_and_made_once_there_is_room(
     api.create(task("low"))
     wait_task(api, "low", "Active")
     api.create(task("high"))
-    told = api.wait_for(
-        "ApplicationTask",
-        "high",
-        lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
-        what="the task says that the quota is exceeded",
-    )
+    told = beyond_the_quota(api, "high")
     assert told["status"]["phase"] == "Pending"
     assert f"Deployment {HIGH}" in told["status"]["message"]
     assert "raise the ResourceQuota" in told["status"]["message"]
@@ -162,12 +167,7 @@ def test_an_instance_beyond_the_quota_is_told_to_its_tasks(api: Api, processes: 
     api.create(task("low"))
     wait_task(api, "low", "Active")
     api.create(task("high"))
-    told = api.wait_for(
-        "ApplicationTask",
-        "high",
-        lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
-        what="the task says that the quota is exceeded",
-    )
+    told = beyond_the_quota(api, "high")
     assert f"instance {HIGH} cannot be made" in told["status"]["message"]
     assert told["status"]["phase"] == "Pending"
     api.patch("ResourceQuota", "few", {"spec": {"hard": {"count/applicationinstances.wayside.dev": "2"}}})
@@ -241,12 +241,7 @@ def test_pods_that_only_events_tell_are_refused_are_said_and_made_once_there_is_
     start_manager(processes, namespace)
     api.create(template(manifests=[workload(kind)]))
     api.create(task("low"))
-    told = api.wait_for(
-        "ApplicationTask",
-        "low",
-        lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
-        what="the task says that the quota is exceeded",
-    )
+    told = beyond_the_quota(api, "low")
     assert told["status"]["phase"] == "Active"
     ready = condition(api.get("ApplicationInstance", LOW), "Ready")
     assert (ready["status"], ready["reason"]) == ("False", "QuotaExceeded")

@@ -8,11 +8,9 @@ from collections.abc import Callable
 import yaml
 
 from tests.cluster.api import Api, Objects
-from tests.cluster.managed_world import condition
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
-from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, apply_manager, expose_detector
-from tests.e2e.workloads import wait_available
+from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, run_town
 
 sys.path.insert(0, str(EXAMPLE))
 
@@ -53,16 +51,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
 ) -> None:
     first, second, third = (vehicle.name for vehicle in LIDAR_VEHICLES[:3])
     apply_example(api, image, ["python3", "-c", TELL])
-    apply_manager(api, image)
-    port = expose_detector(api, "town")
-    wait_available(api, "application-manager")
-    api.wait_for(
-        "Detector",
-        "town",
-        lambda raw: condition(raw, "Running").get("status") == "True",
-        timeout=PATIENCE,
-        what="the manager runs the detector",
-    )
+    port = run_town(api, image)
     with Standing([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
         vehicles.put(first, 0)
         vehicles.put(second, 100)

@@ -11,10 +11,12 @@ from typing import Any
 import yaml
 
 from tests.cluster.api import Api, Object
-from tests.e2e.workloads import deployment, service
+from tests.cluster.managed_world import condition
+from tests.e2e.workloads import deployment, service, wait_available
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 ZENOH_PORT, METRICS_PORT = 7447, 9100
+PATIENCE = 300.0
 RESTRICTED = {  # the Pod Security Standard of this name
     "allowPrivilegeEscalation": False,
     "capabilities": {"drop": ["ALL"]},
@@ -42,6 +44,21 @@ def apply_manager(api: Api, image: str) -> None:
     options = (f"--metrics-port={METRICS_PORT}", f"--detector-image={image}")
     command = ("application-manager", "run", "--namespace", api.namespace, *options)
     api.apply(_program("application-manager", image, command))
+
+
+def run_town(api: Api, image: str) -> int:
+    """Have a manager run the example's detector; returns the port of the node where its Zenoh is."""
+    apply_manager(api, image)
+    port = expose_detector(api, "town")
+    wait_available(api, "application-manager")
+    api.wait_for(
+        "Detector",
+        "town",
+        lambda raw: condition(raw, "Running").get("status") == "True",
+        timeout=PATIENCE,
+        what="the manager runs the detector",
+    )
+    return port
 
 
 def expose_detector(api: Api, name: str) -> int:

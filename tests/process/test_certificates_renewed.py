@@ -16,7 +16,7 @@ import zenoh
 from detector.engine.samples.liveliness import LIVELINESS, Token
 from detector.streams.session import open_session
 from detector.streams.zenoh import Network
-from tests.networks import PATIENCE, Arrivals, router, stream, wait_for
+from tests.networks import PATIENCE, Arrivals, guarded_router, stream, wait_for
 from tests.ports import free_endpoint
 from tests.unit.certificates import Authority
 from wayside.api.zenoh import Zenoh
@@ -44,20 +44,6 @@ def at() -> str:
 @pytest.fixture
 def arrivals() -> Arrivals:
     return Arrivals()
-
-
-@contextmanager
-def guarded_router(at: str, authority: Authority, **more: Any) -> Iterator[zenoh.Session]:
-    certificate, key = authority.sign("router")
-    tls = {
-        "listen_certificate": str(certificate),
-        "listen_private_key": str(key),
-        "root_ca_certificate": str(authority.ca),
-        "enable_mtls": True,
-        "close_link_on_expiration": True,
-    }
-    with router(listen__endpoints=[at], transport__link__tls=tls, **more) as session:
-        yield session
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from application_manager.work.publishing import Publisher, settings
-from tests.networks import router, wait_for
+from tests.networks import guarded_router, wait_for
 from tests.ports import free_endpoint
 from tests.unit.certificates import Authority
 
@@ -41,16 +41,8 @@ def test_at_the_end_of_its_certificate_it_goes_on_with_the_new_one(
         },
     }
     (tmp_path / "zenoh.json5").write_text(json.dumps(config))
-    certificate, key = authority.sign("router")
-    tls = {
-        "listen_certificate": str(certificate),
-        "listen_private_key": str(key),
-        "root_ca_certificate": str(authority.ca),
-        "enable_mtls": True,
-        "close_link_on_expiration": True,
-    }
     heard: list[str] = []
-    with router(listen__endpoints=[at], transport__link__tls=tls) as network:
+    with guarded_router(at, authority) as network:
         kept = network.declare_subscriber("wayside/**", lambda sample: heard.append(sample.payload.to_string()))
         publisher = Publisher(settings([str(tmp_path / "zenoh.json5")]))
         over, going = threading.Event(), threading.Event()

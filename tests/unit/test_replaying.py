@@ -7,6 +7,7 @@ from detector.evaluator import Evaluator
 from detector.replay.intake_file import Control
 from detector.replay.replaying import replay_arrivals, replay_intake
 from tests.unit.driving import START, a_deploy, a_detector, a_rule, an_engine, arrival, at
+from wayside.api.detector import Clock
 
 FAST = a_rule(
     "fast",
@@ -27,7 +28,7 @@ def test_an_episode_that_starts_and_ends_between_two_looks_has_its_task_too() ->
 
 def test_with_clock_data_the_tasks_are_the_same() -> None:
     detector = a_detector({"name": "speed", "key": "vehicles/${client:*}/speed", "encoding": "json", "stamp": "msg.t"})
-    data = detector.model_copy(update={"spec": detector.spec.model_copy(update={"clock": "Data"})})
+    data = detector.model_copy(update={"spec": detector.spec.model_copy(update={"clock": Clock.DATA})})
     stamped = [
         arrival(9.0 + n, "a", {"v": v, "t": (START + t) / 1e9})
         for n, (t, v) in enumerate([(5 * 10**8, 20), (25 * 10**8, 0), (9 * 10**9, 0)])
