@@ -6,7 +6,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from detector.actions import Completion, Episode, EpisodeSample, Outcome, OutcomeState, Setting, Surroundings
@@ -124,3 +126,12 @@ def wait_until(condition: Callable[[], bool], within: float = 60, pause: float =
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"
         time.sleep(pause)
+
+
+def spooled(folder: Path) -> int:
+    """Bytes in the segments of a spool; one that goes between the look at the folder and at itself has none."""
+    found = 0
+    for segment in folder.glob("*.spool"):
+        with suppress(FileNotFoundError):
+            found += segment.stat().st_size
+    return found

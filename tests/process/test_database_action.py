@@ -13,7 +13,7 @@ import pytest
 from detector.actions import ActionError, EpisodeSample, OutcomeState
 from detector.actions.database.server import Redactor
 from tests.mongodb.way import Way
-from tests.process.database_desk import Desk, speeds, wait_until
+from tests.process.database_desk import Desk, speeds, spooled, wait_until
 from tests.unit.driving import START, a_stream
 
 SPEEDS = "json/speed"
@@ -238,7 +238,7 @@ def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_eac
     keep.finish(first)
     keep.take(second, speeds(100))
     keep.finish(second)
-    wait_until(lambda: any(each.stat().st_size > 100_000 for each in (tmp_path / "spool").glob("*.spool")))
+    wait_until(lambda: spooled(tmp_path / "spool") > 100_000)
     assert scenario(database)["complete"] is False
     way.restore()
     assert [keep.outcome(name).state for name in ("e1", "e2")] == [OutcomeState.DONE] * 2

@@ -13,7 +13,7 @@ import pytest
 
 from detector.streams.codecs.cdr import CdrDecoder
 from tests.mongodb.way import Way
-from tests.process.database_desk import wait_until
+from tests.process.database_desk import spooled, wait_until
 from tests.process.running import PATIENCE, Process
 from tests.unit.driving import a_rule, a_stream
 from tests.unit.recording_bench import mcap_files, read_with_mcap
@@ -150,7 +150,7 @@ def test_after_kill_9_nothing_that_looks_complete_is_incomplete(
         wait_until(lambda: check(database) > 0, PATIENCE)
         way.cut()
         send_bouts(process, range(200, 400))
-        wait_until(lambda: any(each.stat().st_size > 0 for each in (process.folder / "spool").glob("*.spool")))
+        wait_until(lambda: spooled(process.folder / "spool") > 0)
     else:
         wait_until(lambda: database["json/speed"].count_documents({}) > 100, PATIENCE)
         send_bouts(process, range(200, 240))
