@@ -62,7 +62,8 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
 
         wait_until(is_gone, bool, timeout=PATIENCE, what="the application is gone")
 
-    for certificate in (None, foreign.sign("car1")):
+    mixed = authority.sign("car1")[0], authority.sign("car2")[1]
+    for certificate in (None, foreign.sign("car1"), mixed):
         with pytest.raises(zenoh.ZError), vehicle(endpoint, authority.ca, certificate):
             pass
 

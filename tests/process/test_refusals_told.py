@@ -103,6 +103,8 @@ def test_who_is_not_let_in_and_who_has_no_rights_is_in_the_routers_log(guarded: 
     with pytest.raises(NetworkError):
         guarded.connect(Authority(tmp_path, "stranger").sign("car1"))
     wait_for(lambda: "invalid peer certificate: UnknownIssuer" in guarded.log)
+    with pytest.raises(NetworkError):
+        guarded.connect((guarded.authority.sign("car1")[0], guarded.authority.sign("car2")[1]))
     with guarded.connect(guarded.authority.sign("unknown")):
         wait_for(lambda: "did not match any configured ACL subject" in guarded.log)
 
