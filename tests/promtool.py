@@ -31,10 +31,11 @@ def find_promtool() -> Path:
 
 
 def _unpack(folder: Path) -> None:
-    download = ["apt-get", "--quiet", "download", _PACKAGE]
+    apt = ["apt-get", "--quiet", "-o", "Acquire::Retries=5"]
+    download = [*apt, "download", _PACKAGE]
     try:
         if _run(download, folder, check=False).returncode:  # the lists of packages are missing or old
-            _run(["apt-get", "--quiet", "update"], folder)
+            _run([*apt, "update"], folder)
             _run(download, folder)
         (package,) = folder.glob("*.deb")
         _run(["dpkg-deb", "--extract", str(package), "root"], folder)

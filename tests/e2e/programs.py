@@ -51,6 +51,8 @@ PACKAGES = {
     "ip": "iproute2",
 }
 """The Debian package of each program."""
+PATIENTLY = ("-o", "Acquire::Retries=5", "-o", "DPkg::Lock::Timeout=600")
+"""A mirror that stumbles, or somebody else who installs something just now, is no reason to fail."""
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
@@ -99,7 +101,7 @@ def _install(console: Console) -> None:
     environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
     for command in (["update"], ["install", "--yes", "--no-install-recommends", *missing]):
         done = subprocess.run(
-            ["apt-get", "--quiet", *command], env=environment, capture_output=True, text=True, check=False
+            ["apt-get", "--quiet", *PATIENTLY, *command], env=environment, capture_output=True, text=True, check=False
         )
         if done.returncode:
             output = (done.stdout + done.stderr)[-3000:]
