@@ -158,7 +158,7 @@ def test_many_actions_at_once_keep_to_the_limit(tmp_path: Path) -> None:
             bench.action.started(episode)
             for sample in THREE:
                 bench.action.samples(episode, [sample])
-                most.append(taken_now(tmp_path))
+                most.append(sum(taken_now(tmp_path).values()))
             bench.action.completed(episode, Completion())
 
     threads = [threading.Thread(target=drive, args=(number,)) for number in range(3)]
@@ -171,11 +171,19 @@ def test_many_actions_at_once_keep_to_the_limit(tmp_path: Path) -> None:
     assert all(read_with_mcap(file) for file in tmp_path.rglob("*.mcap"))
 
 
-def taken_now(path: Path) -> int:
-    """While others delete."""
-    total = 0
+def taken_now(path: Path) -> dict[str, int]:
+    """The files and their sizes at one moment, while others write and delete: what two looks in a row find alike."""
+    found, before = sizes(path), None
+    while found != before:
+        found, before = sizes(path), found
+    return found
+
+
+def sizes(path: Path) -> dict[str, int]:
+    found = {}
     for folder, _, names in os.walk(path):
         for name in names:
             with contextlib.suppress(FileNotFoundError):
-                total += os.stat(os.path.join(folder, name)).st_size
-    return total
+                file = os.path.join(folder, name)
+                found[file] = os.stat(file).st_size
+    return found
