@@ -59,6 +59,15 @@ def hangs(after: bytes = b"") -> Behaviour:
     return hang
 
 
+def first_then(first: Behaviour, then: Behaviour) -> Behaviour:
+    """The one for the first request, the other for all that follow, however soon they come."""
+
+    def one_after_the_other(endpoint: Endpoint, connection: socket.socket, request: Received) -> None:
+        (first if request is endpoint.requests[0] else then)(endpoint, connection, request)
+
+    return one_after_the_other
+
+
 def holds(until: threading.Event, then: Behaviour) -> Behaviour:
     """Nothing until the event is set, then that."""
 
@@ -173,6 +182,14 @@ def endpoint(behaviour: Behaviour | None = None, certificate: tuple[Path, Path] 
         yield made
     finally:
         made.close()
+
+
+@contextmanager
+def nobody() -> Iterator[str]:
+    """The URL of an endpoint at which nobody listens; its port is nobody else's meanwhile."""
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        yield f"http://localhost:{held.getsockname()[1]}"
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import threading
 from contextlib import suppress
 
 from tests.mongodb import MongoServer
+from tests.ports import free_port
 
 
 class Way:
@@ -16,7 +17,7 @@ class Way:
         self._server = server
         self._to = (server.host, server.port)
         self._listener: socket.socket | None = None
-        self.port = 0
+        self.port = free_port()  # of those that no client's end takes while the way is cut
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._flowing = threading.Event()
@@ -41,19 +42,18 @@ class Way:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(("127.0.0.1", self.port))
         listener.listen()
-        self.port = listener.getsockname()[1]
         self._listener = listener
         threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
 
     def cut(self) -> None:
         """End all connections, and refuse others."""
-        if self._listener is not None:
-            self._listener.shutdown(socket.SHUT_RDWR)
-            self._listener.close()
-            self._listener = None
-        self._flowing.set()
         with self._lock:
+            listener, self._listener = self._listener, None
             ends = list(self._open)
+        if listener is not None:
+            listener.shutdown(socket.SHUT_RDWR)
+            listener.close()
+        self._flowing.set()
         for each in ends:
             _end(each)
 
@@ -71,7 +71,13 @@ class Way:
                     _end(near)
                     continue
                 with self._lock:
-                    self._open |= {near, far}
+                    stands = self._listener is listener
+                    if stands:
+                        self._open |= {near, far}
+                if not stands:  # cut since it was accepted
+                    _end(near)
+                    _end(far)
+                    continue
                 for source, target in ((near, far), (far, near)):
                     threading.Thread(target=self._pass_on, args=(source, target), daemon=True).start()
 

@@ -13,14 +13,14 @@ from pydantic import ValidationError
 
 from detector.actions.http import Answer, HttpClient, HttpError, Verdict, judge
 from detector.actions.http.answer import wait_asked
-from tests.http_servers import Behaviour, answers, drips, echoes_headers, endpoint, endpoint_for, hangs, sends
+from tests.http_servers import Behaviour, answers, drips, echoes_headers, endpoint, endpoint_for, hangs, nobody, sends
 from tests.unit.certificates import Authority
 from wayside.api.actions.http import HttpAccess, HttpHeader
 
 OK = b"HTTP/1.1 200 OK\r\n"
 
 
-def client(timeout: str = "5s", **access: Any) -> HttpClient:
+def client(timeout: str = "60s", **access: Any) -> HttpClient:
     return HttpClient(HttpAccess.model_validate({"timeout": timeout, **access}), "spec.actions[0].notify.http")
 
 
@@ -115,10 +115,8 @@ def test_what_is_no_answer_is_told(behaviour: Behaviour, told: str) -> None:
 
 
 def test_nobody_there_and_no_such_name_are_told_without_the_path() -> None:
-    with endpoint() as there:
-        pass
-    with pytest.raises(HttpError, match=rf"^http://localhost:{there.port}: cannot be reached: "):
-        send(client("2s"), f"{there.url}/secret-path")
+    with nobody() as there, pytest.raises(HttpError, match=rf"^{there}: cannot be reached: "):
+        send(client(), f"{there}/secret-path")
     with pytest.raises(HttpError, match=r"^http://nobody\.invalid:80: ") as caught:
         send(client("2s"), "http://nobody.invalid/secret-path")
     assert "secret" not in str(caught.value)
