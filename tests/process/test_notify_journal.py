@@ -13,14 +13,14 @@ import pytest
 
 from detector.actions.notify.dead_letters import DeadLetters
 from detector.actions.notify.journal import Journal, JournalError
-from tests.http_servers import answers, endpoint
+from tests.http_servers import answers, endpoint, hangs
 from tests.unit.notifying import a_desk
 
 _KILLED = """
 import sys
 from pathlib import Path
 from tests.unit.notifying import a_desk, an_episode
-desk = a_desk({"http": {"url": sys.argv[1]}, "text": "x"}, state=Path(sys.argv[2]))
+desk = a_desk({"http": {"url": sys.argv[1], "timeout": "2m"}, "text": "x"}, state=Path(sys.argv[2]))
 for number in range(20):
     desk.run(an_episode(f"e{number}", rendered={"text": f"number {number}"}))
 print("told", flush=True)
@@ -29,7 +29,7 @@ sys.stdin.read()
 
 
 def test_what_was_told_before_a_kill_is_delivered_after_it_each_event_once(tmp_path: Path) -> None:
-    with endpoint(answers(500)) as there:
+    with endpoint(hangs()) as there:  # so that nothing else is on its way when the process ends
         process = subprocess.Popen(
             [sys.executable, "-c", _KILLED, there.url, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )

@@ -52,7 +52,8 @@ def test_who_hangs_holds_up_nobody_and_hears_of_it_after_a_kill(tmp_path: Path) 
         end = events(good.received(2))[1]
         assert (end["type"], end["data"]["episode"]) == ("dev.wayside.event.ended", start["data"]["episode"])
         process.status_when(lambda _: len(arrived) == 2)
-        actions = {each.action: each for each in process.status_when(lambda status: _done(status, "good", 1)).actions}
+        status = process.status_when(lambda status: _done(status, "good", 1) and _done(status, "city", 1))
+        actions = {each.action: each for each in status.actions}
         assert (actions["bad"].running, actions["bad"].failed, actions["city"].done) == (1, 0, 1)
         process.process.kill()
         process.process.wait()
@@ -74,7 +75,13 @@ def test_an_alert_goes_on_after_a_kill_with_the_labels_that_it_had(tmp_path: Pat
             when="v > 10",
             evaluation={"every": "100ms"},
             actions=[
-                {"name": "am", "notify": {"alertmanager": {"url": there.url}, "labels": {"vehicle": "${client}"}}}
+                {
+                    "name": "am",
+                    "notify": {
+                        "alertmanager": {"url": there.url, "repeat": "1h"},
+                        "labels": {"vehicle": "${client}"},
+                    },
+                }
             ],
         )
         process.write(rule, state={"path": str(tmp_path / "state")})

@@ -18,7 +18,7 @@ from tests.http_servers import answers, endpoint, hangs, sends
 from tests.unit.driving import a_detector, a_rule
 from wayside.api.actions import trigger as api
 
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 
 class NoNetwork:
@@ -79,12 +79,12 @@ def an_episode(parameters: api.Trigger, **fields: Any) -> Episode:
     return Episode(**{**given, **fields})
 
 
-def http(url: str, **fields: Any) -> dict[str, Any]:
+def http(url: str, timeout: str = "30s", **fields: Any) -> dict[str, Any]:
     calls = {
         "start": {"method": "PUT", "url": f"{url}/recordings/{{id}}"},
         "stop": {"method": "DELETE", "url": f"{url}/recordings/{{id}}"},
     }
-    return {"http": {**calls, "timeout": "1s"}, **fields}
+    return {"http": {**calls, "timeout": timeout}, **fields}
 
 
 def end(episode: Episode) -> Episode:
@@ -140,7 +140,7 @@ def test_a_body_of_ones_own_is_sent_as_it_is_rendered() -> None:
 )
 def test_what_fails_is_sent_again_under_the_same_key(fault: Any) -> None:
     with endpoint(fault) as there:
-        driven = Driven(http(there.url))
+        driven = Driven(http(there.url, "1s"))
         episode = an_episode(driven.parameters)
         driven.action.started(episode)
         driven.until(lambda: any("start is not confirmed yet" in outcome.message for outcome in driven.outcomes))
@@ -239,7 +239,7 @@ def test_what_the_next_run_takes_up_goes_on_and_is_stopped_by_that_one(tmp_path:
 def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:
     """Fifty episodes wait for it together, and not each for its own timeout."""
     with endpoint(hangs()) as there:
-        driven = Driven(http(there.url))
+        driven = Driven(http(there.url, "1s"))
         for number in range(50):
             driven.action.started(an_episode(driven.parameters, id=f"e{number}"))
         begin = time.monotonic()
