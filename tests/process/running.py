@@ -106,7 +106,15 @@ class Process:
         self.write(*rules, **spec)
         self.process.send_signal(signal.SIGHUP)
 
-    @property
-    def events(self) -> list[str]:
-        lines = (self.folder / "out" / "events.jsonl").read_text().splitlines()
-        return [f"{(event := json.loads(line))['data']['rule']} {event['type'].rsplit('.', 1)[-1]}" for line in lines]
+    def written(self) -> list[dict[str, Any]]:
+        """The events in the file. A thread of its own writes it: what was told elsewhere may not be there yet."""
+        whole = (self.folder / "out" / "events.jsonl").read_text().split("\n")[:-1]
+        return [json.loads(line) for line in whole]
+
+    def events_when(self, count: int) -> list[dict[str, Any]]:
+        """The events in the file once there are so many."""
+        end = time.monotonic() + PATIENCE
+        while len(found := self.written()) < count:
+            assert time.monotonic() < end, found
+            time.sleep(0.05)
+        return found

@@ -27,6 +27,16 @@ def process(tmp_path: Path, way: Way, monkeypatch: pytest.MonkeyPatch) -> Iterat
     assert process.stop() == 0
 
 
+def tasks_in(folder: Path) -> list[dict[str, Any]]:
+    """Those of the folder; a file that is written, and not yet under its name, begins with a dot."""
+    return [
+        task
+        for path in folder.rglob("[!.]*.yaml")
+        for task in yaml.safe_load_all(path.read_text())
+        if task and task["kind"] == "ApplicationTask"
+    ]
+
+
 def test_events_recordings_scenarios_tasks_and_notices_have_it(process: Process, name: str, database: Any) -> None:
     rule = a_rule(
         "r",
@@ -60,7 +70,7 @@ def test_events_recordings_scenarios_tasks_and_notices_have_it(process: Process,
     wait_until(lambda: len(notices) == 2, PATIENCE)
     listening.undeclare()
 
-    events = [json.loads(line) for line in (process.folder / "out" / "events.jsonl").read_text().splitlines()]
+    events = process.events_when(2)
     assert [each["data"]["classification"] for each in events] == [GIVEN, GIVEN]
     assert [each["data"]["classification"] for each in notices] == [GIVEN, GIVEN]
     (folder,) = (path.parent for path in process.folder.glob("recordings/*/[!.]*/recording.json"))
@@ -69,11 +79,6 @@ def test_events_recordings_scenarios_tasks_and_notices_have_it(process: Process,
     assert GIVEN in [json.loads(each.get("classification", "null")) for each in metadata_of(file).values()]
     (scenario,) = database["Scenarios"].find()
     assert scenario["classification"] == GIVEN
-    tasks = [
-        task
-        for path in (process.folder / "out").rglob("*.yaml")
-        for task in yaml.safe_load_all(path.read_text())
-        if task and task["kind"] == "ApplicationTask"
-    ]
-    assert tasks
+    wait_until(lambda: bool(tasks_in(process.folder / "out")), PATIENCE)
+    tasks = tasks_in(process.folder / "out")
     assert all(each["spec"]["event"]["classification"] == GIVEN for each in tasks)

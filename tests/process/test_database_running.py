@@ -77,13 +77,11 @@ def test_the_database_has_the_samples_that_the_recording_has(process: Process, n
             wanted = 1 if number == 100 else 2
             process.status_when(lambda status, wanted=wanted: sum(r.open for r in status.rules) == wanted)
     wait_until(lambda: [each["state"] for each in scenarios(database).values()] == ["Complete"] * 2, PATIENCE)
+    bags = process.folder / "recordings"  # each action has a thread of its own
+    wait_until(lambda: len(list(bags.glob("*/[!.]*/metadata.yaml"))) == 2, PATIENCE)
     for each in scenarios(database).values():
         assert each["metadata"] == {"who": "car1"}
-        (folder,) = [
-            path.parent
-            for path in (process.folder / "recordings").rglob("metadata.yaml")
-            if each["episode"] in path.read_text()
-        ]
+        (folder,) = [path.parent for path in bags.glob("*/[!.]*/metadata.yaml") if each["episode"] in path.read_text()]
         recorded = {message for file in mcap_files(folder) for message in read_keys(file)}
         written = {
             (document["key"], payload_of(process, document))

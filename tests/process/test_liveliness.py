@@ -200,10 +200,13 @@ def test_live_and_replay_agree_on_tokens(endpoint: str, tmp_path: Path) -> None:
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path / "tasks", "h"))
         with Running(RuleSet(watched, (rule,)), "h", reconciler, tmp_path, tmp_path / "intake.mcap", Restored()):
-            for reason in ("ended", None):  # the second time, the detector ends first
+            for times, reason in ((1, "ended"), (2, None)):  # the second time, the detector ends first
                 car1 = await asyncio.to_thread(vehicle, endpoint)
                 token = car1.liveliness().declare_token("alive/car1")
-                await asyncio.to_thread(wait_for, lambda: events.exists() and "started" in events.read_text())
+                await asyncio.to_thread(
+                    wait_for,
+                    lambda times=times: events.exists() and events.read_text().count("event.started") == times,
+                )
                 if reason is not None:
                     token.undeclare()
                     await asyncio.to_thread(wait_for, lambda: "ClientLost" in events.read_text())
