@@ -69,9 +69,10 @@ class Lasting(Once):
 class Hanging(Once):
     """Does not look at the feed."""
 
-    ended = threading.Event()
+    began, ended = threading.Event(), threading.Event()
 
     def run(self, feed: Feed) -> None:
+        self.began.set()
         self.ended.wait(PATIENCE)
         feed.put("vehicles/car1/pose", b"late")
 
@@ -145,8 +146,10 @@ def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, a
 
 def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_taken(arrivals: Arrivals) -> None:
     tally = Tally()
+    Hanging.began.clear()
     Hanging.ended.clear()
     thread = a_thread("hanging", arrivals, tally)
+    assert Hanging.began.wait(PATIENCE)  # what is told to stop before it runs, ends
     thread.tell_to_stop()
     thread.join(0.05)
     assert [(entry.cause, entry.count) for entry in tally.entries()] == [(Cause.LEFT_BEHIND, 1)]
@@ -168,7 +171,7 @@ def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals
     wait_for(lambda: changed.state is State.STOPPED)
     arrivals.wait_for(lambda seen: [payload for _, _, payload in seen].count(b"new") == 1)
     sources.follow(a_detector())
-    assert kept.state is State.STOPPED
+    wait_for(lambda: kept.state is State.STOPPED)
     assert not sources.threads
     sources.close()
 
