@@ -123,8 +123,11 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr("detector.entrypoints.entry_points", lambda group: entries)
     Recorded.told.clear()
     SLOW.clear()
+    before = threading.enumerate()
     yield
     SLOW.set()
+    for thread in set(threading.enumerate()).difference(before):
+        thread.join(60)  # what was let go just now is still to note its words, and not among those of the next test
 
 
 class Site:

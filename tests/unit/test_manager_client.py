@@ -49,11 +49,13 @@ def test_what_the_api_server_did_not_look_at_is_asked_again_after_its_time_and_n
         return refused(code, 1) if len(came) == 1 else web.json_response({})
 
     async def scenario() -> None:
-        async with serving(handle) as client:
+        pacing = Pacing()
+        async with serving(handle, pacing=pacing) as client:
             first = asyncio.create_task(client.get(LEASES, "n", "first"))
             while not came:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
-            await asyncio.sleep(0.1)  # the refusal has arrived
+            while not pacing.held:  # noqa: ASYNC110  until the refusal has arrived
+                await asyncio.sleep(0.01)
             await asyncio.gather(first, *(client.get(LEASES, "n", f"other-{index}") for index in range(10)))
 
     asyncio.run(scenario())
@@ -156,13 +158,13 @@ def test_a_write_is_given_up_when_its_time_is_over_and_the_api_server_knows_it()
         return web.json_response({})
 
     async def scenario() -> None:
-        async with serving(handle, may_act=lambda: 0.3) as client:
+        async with serving(handle, may_act=lambda: 2.0) as client:
             with pytest.raises(Unreachable):
                 await client.replace(LEASES, BODY)
             assert client.open_until > 0
 
     asyncio.run(scenario())
-    assert queries == ["300ms"]
+    assert queries == ["2000ms"]
 
 
 def test_rights_that_lack_are_told_with_the_remedy() -> None:

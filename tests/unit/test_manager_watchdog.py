@@ -6,7 +6,6 @@ import asyncio
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
@@ -17,8 +16,8 @@ from application_manager.watchdog import STALLED
 from application_manager.work.workqueue import WorkQueue
 
 
-def ended_by(stall: watchdog.Stall, work: float, silent: float = 3600.0) -> str | None:
-    """Why the watchdog ends a loop that blocks for `work` seconds, if it does."""
+def ended_by(stall: watchdog.Stall, *, hangs: bool = False, silent: float = 3600.0) -> str | None:
+    """Why the watchdog ends a loop, which `hangs` until then, if it does."""
     said: list[str] = []
     called = threading.Event()
 
@@ -28,24 +27,25 @@ def ended_by(stall: watchdog.Stall, work: float, silent: float = 3600.0) -> str 
 
     async def scenario() -> None:
         async with watchdog.watchdog(stall, silent, step=0.02, end=end):
-            time.sleep(work)  # noqa: ASYNC251  it hangs
-            await asyncio.to_thread(called.wait, 60 if silent < 3600 or stall() else 0.3)
+            if hangs:
+                called.wait(60)
+            await asyncio.to_thread(called.wait, 60 if hangs or stall() else 0.3)
 
     asyncio.run(scenario())
     return said[0] if said else None
 
 
 def test_an_event_loop_that_hangs_is_ended() -> None:
-    assert "the event loop has not run for" in str(ended_by(lambda: None, work=1.0, silent=0.2))
+    assert "the event loop has not run for" in str(ended_by(lambda: None, hangs=True, silent=0.2))
 
 
 def test_what_has_stalled_is_ended_if_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watchdog, "PERSISTENT", 0.2)
-    assert ended_by(lambda: "no resync has ended for 300 s", work=0.0) == "no resync has ended for 300 s"
+    assert ended_by(lambda: "no resync has ended for 300 s") == "no resync has ended for 300 s"
 
 
 def test_one_that_works_is_left_alone() -> None:
-    assert ended_by(lambda: None, work=0.0) is None
+    assert ended_by(lambda: None) is None
 
 
 def test_the_process_ends_with_a_line_and_where_it_hangs() -> None:
@@ -54,7 +54,7 @@ import asyncio, time
 from application_manager.watchdog import watchdog
 def hanging(): time.sleep(600)
 async def main():
-    async with watchdog(lambda: None, 0.2, step=0.05):
+    async with watchdog(lambda: None, 2.0, step=0.05):
         await asyncio.sleep(0.1)
         hanging()
 asyncio.run(main())

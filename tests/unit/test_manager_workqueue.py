@@ -121,7 +121,7 @@ def test_what_the_api_server_asks_for_is_waited_for(monkeypatch: pytest.MonkeyPa
             await finished.wait()
 
     asyncio.run(scenario())
-    assert at[1] - at[0] >= 0.3
+    assert at[1] - at[0] >= 0.29  # the queue goes by another clock
 
 
 @in_a_loop
