@@ -97,7 +97,7 @@ def test_what_stands_still_is_not_live_and_live_again_once_it_goes_on(faulty: Fa
     wait_for(has(faulty, "/readyz", 200, "looked"))
     (faulty.folder / fault).touch()
     wait_for(has(faulty, "/healthz", 503, says))
-    assert has(faulty, "/readyz", 503, says)()
+    wait_for(has(faulty, "/readyz", 503, says))
     (faulty.folder / fault).unlink()
     wait_for(has(faulty, "/healthz", 200, "looked"))
 
@@ -112,12 +112,13 @@ def test_a_router_that_is_away_makes_it_unready_and_leaves_it_live_with_its_buff
     document["spec"]["zenoh"] = {"mode": "client", "connect": [endpoint]}
     (tmp_path / "detector.yaml").write_text(json.dumps(document))
     faulty.start()
+    # On a machine that is busy enough, the evaluation itself may once be late by the second that is allowed here.
     wait_for(has(faulty, "/readyz", 503, "no Zenoh session yet"))
-    assert has(faulty, "/healthz", 200, "looked")()
+    wait_for(has(faulty, "/healthz", 200, "looked"))
     with router_process(endpoint):
         wait_for(has(faulty, "/readyz", 200, "looked"))
     wait_for(has(faulty, "/readyz", 503, "nobody is connected"))
-    assert has(faulty, "/healthz", 200, "looked")()
+    wait_for(has(faulty, "/healthz", 200, "looked"))
     with router_process(endpoint):
         wait_for(has(faulty, "/readyz", 200, "looked"))
 
@@ -126,4 +127,4 @@ def test_a_silent_stream_is_no_illness(faulty: Faulty) -> None:
     faulty.write(ALWAYS, streams=(a_stream("speed", staleAfter="100ms"),), clientTimeout="100ms")
     faulty.start()
     wait_for(has(faulty, "/readyz", 200, "looked"))
-    assert has(faulty, "/healthz", 200, "looked")()
+    wait_for(has(faulty, "/healthz", 200, "looked"))

@@ -76,7 +76,7 @@ class GuardedRouter:
 
     @property
     def log(self) -> str:
-        return self._log.read_text()
+        return self._log.read_text(errors="replace")  # its end may be half a character
 
     def connect(self, certificate: tuple[Path, Path] | None) -> zenoh.Session:
         own = {} if certificate is None else {"certificate": str(certificate[0]), "key": str(certificate[1])}

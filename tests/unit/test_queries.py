@@ -97,7 +97,7 @@ def a_pose(seconds: float, stamp: float, x: float, yaw: float) -> Any:
 def test_between_two_samples_the_position_is_on_the_line_and_the_heading_on_the_arc(share: float, yaw: float) -> None:
     queries = queried(a_pose(2.5, 2, 10, yaw), a_pose(2.6, 1, 0, 0), until=3)  # arrived the other way round
     pose = queries.pose("a", "pose", at(1 + share))
-    exact = round(share * 1e6) / 1e6
+    exact = (at(1 + share) - at(1)) / 1e9  # to the microsecond
     assert pose is not None
     assert pose.position == pytest.approx((10 * exact, 0, 0))
     assert 2 * math.atan2(pose.orientation[2], pose.orientation[3]) == pytest.approx(exact * yaw, abs=1e-9)
