@@ -13,6 +13,8 @@ import pytest
 import yaml
 
 from detector.checking import check_documents
+from detector.status.model import read_status
+from detector.streams.asking import ask
 from tests.process.running import PATIENCE, Process
 from tests.unit.recording_bench import mcap_files, metadata_of, read_with_mcap
 from wayside.api import EventRule
@@ -55,11 +57,22 @@ def named(folder: Path, rule: str, count: int) -> list[Path]:
     raise AssertionError(f"no recording of {rule}: {[*folder.glob('recordings/*/*')]}")
 
 
+def until_evaluated(process: Process, speed: float) -> None:
+    """The rule has looked at this speed."""
+    end, seen = time.monotonic() + PATIENCE, []
+    while seen != [speed]:
+        assert time.monotonic() < end, seen
+        asked = {"rule": "threshold", "subject": "car1", "wait": "30"}
+        (answer,) = ask(process.network, process.name, "status", asked, PATIENCE)
+        explanation = read_status(answer.payload).explanation
+        assert explanation is not None
+        seen = [each.values.get("speed") for each in explanation.subjects]
+
+
 def test_record_all_has_everything_and_threshold_what_it_is_about(process: Process) -> None:
-    sent = [{"v": value} for value in (5, 20, 25, 5, 6)]
-    for value in sent:
-        process.send("car1", value)
-        time.sleep(1.1)  # so that each is evaluated
+    for value in (5, 20, 25, 5, 6):
+        process.send("car1", {"v": value})
+        until_evaluated(process, value)
     (bag,) = named(process.folder, "threshold", 1)
     assert not bag.name.endswith("_cut")
     found = [json.loads(each.payload)["v"] for file in mcap_files(bag) for each in read_with_mcap(file)]
