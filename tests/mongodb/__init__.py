@@ -82,7 +82,7 @@ def running(folder: Path | None = None) -> Iterator[MongoServer]:
 
 
 def _wait(server: MongoServer, process: subprocess.Popen[bytes], log: Path) -> None:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 180
     with pymongo.MongoClient[dict[str, object]](server.uri, serverSelectionTimeoutMS=50) as client:
         while True:
             try:
