@@ -159,8 +159,12 @@ def test_wrong_charts_block_nobody(api: Api, manager: Process, charts: Path) -> 
         api.create(template("app", {"chart": str(write_chart(charts, "app"))}))
         api.create(demand("one", "app", "car1"))
         wait_for_image(api, "app")
-        waiting = condition(api.get("ApplicationInstance", "silent-0"), "Applied")
-        assert waiting["status"] == "False"
+        api.wait_for(
+            "ApplicationInstance",
+            "silent-0",
+            lambda raw: condition(raw, "Applied").get("status") == "False",
+            what="one that waits for its chart says so",
+        )
         assert manager.terminate(patience=15) == 0
 
 

@@ -21,13 +21,14 @@ def wait_accepted(api: Api, name: str, reason: str) -> Object:
     )
 
 
-def wait_condition(api: Api, instance: str, type_: str, status: str) -> Object:
-    found = api.wait_for(
-        "ApplicationInstance",
-        instance,
-        lambda raw: condition(raw, type_).get("status") == status,
-        what=f"{type_} of {instance} is {status}",
-    )
+def wait_condition(api: Api, instance: str, type_: str, status: str, says: str = "") -> Object:
+    """Wait for the condition, whose message may follow its status, and both the task's; return it."""
+
+    def holds(raw: Object) -> bool:
+        found = condition(raw, type_)
+        return found.get("status") == status and says in found["message"]
+
+    found = api.wait_for("ApplicationInstance", instance, holds, what=f"{type_} of {instance} is {status}, {says}")
     return condition(found, type_)
 
 
@@ -47,9 +48,15 @@ def test_what_is_not_ready_in_time_says_so(api: Api, processes: Processes, names
         what="the task says that its application was not ready in time",
     )
     assert f"instance {FULL} was not ready for 2s" in told["status"]["message"]
-    instance = api.get("ApplicationInstance", FULL)
-    assert "not ready for 2s: Deployment" in condition(instance, "Ready")["message"]
-    assert "not ready for 2s" in instance["status"]["message"]
+    api.wait_for(
+        "ApplicationInstance",
+        FULL,
+        lambda raw: (
+            "not ready for 2s: Deployment" in condition(raw, "Ready").get("message", "")
+            and "not ready for 2s" in raw["status"].get("message", "")
+        ),
+        what="the instance says so too",
+    )
     become_ready(api, FULL)
     api.wait_for(
         "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="it is served after all"
@@ -69,8 +76,8 @@ def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
     assert f"instance {FULL} is not ready: instance {LITE} of template lite serves" in fallen["status"]["message"]
     become_ready(api, LITE)
     api.wait_for("ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="the fallback serves")
-    assert LITE in wait_condition(api, FULL, "TimedOut", "True")["message"]
-    assert FULL in wait_condition(api, LITE, "StandsIn", "True")["message"]
+    wait_condition(api, FULL, "TimedOut", "True", LITE)
+    wait_condition(api, LITE, "StandsIn", "True", FULL)
     wait_settled(api)
 
     uid = api.get("ApplicationInstance", LITE)["metadata"]["uid"]

@@ -149,8 +149,10 @@ def test_a_suspended_instance_is_at_zero_and_comes_back_with_the_replicas_it_had
     wait_replicas(api, NORTH, 0)
     end(api, "night")
     wait_replicas(api, NORTH, 3)
-    back = wait_suspended(api, NORTH, "False")
-    assert "suspendedReplicas" not in back["status"] or back["status"]["suspendedReplicas"] == []
+    wait_suspended(api, NORTH, "False")
+    api.wait_for(
+        "ApplicationInstance", NORTH, lambda raw: not raw["status"].get("suspendedReplicas"), what="nothing is noted"
+    )
     wait_settled(api)
 
 

@@ -98,8 +98,12 @@ def test_the_node_that_a_task_names_gets_the_application_and_one_that_is_not_the
     named = "fits no node: nodeSelector: no node has the label kubernetes.io/hostname=rsu-9"
     told = wait_told(api, "west", named, "no node takes the pod")
     assert nodes[0] in told["status"]["message"]  # what there is instead
-    instance = api.get("ApplicationInstance", instance_name("app", "west"))
-    assert condition(instance, "Ready")["reason"] == "Unschedulable"
+    api.wait_for(
+        "ApplicationInstance",
+        instance_name("app", "west"),
+        lambda raw: condition(raw, "Ready").get("reason") == "Unschedulable",
+        what="the instance says so too",
+    )
     api.patch("ApplicationTask", "west", {"spec": {"parameters": {"node": nodes[0]}}})
     wait_bound(api, "west", nodes[0])
     wait_settled(api)

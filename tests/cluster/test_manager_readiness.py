@@ -14,6 +14,7 @@ from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import condition, deployment, start_manager, task, template, wait_settled
 from tests.cluster.pods import running
 from tests.cluster.processes import Process, Processes
+from tests.cluster.waiting import wait_until
 
 NORTH = instance_name("app", "north")
 PODS = f"wayside.dev/instance={NORTH}"
@@ -91,8 +92,11 @@ def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api:
     kubelet_says(api, pod, containerStatuses=crashed, conditions=ready)
     wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="now: container main crashes")
     wait_ready_says(api, "ApplicationInstance", NORTH, reason="CrashLoop", text="has 0 of 1 pods available")
-    warned = [each["reason"] for each in api.list("Event.events.k8s.io") if each["type"] == "Warning"]
-    assert sorted(set(warned) - {"FailedScheduling"}) == ["CrashLoop", "ImagePullFailed", "Unschedulable"]
+    wait_until(
+        lambda: {each["reason"] for each in api.list("Event.events.k8s.io") if each["type"] == "Warning"},
+        lambda warned: warned - {"FailedScheduling"} == {"CrashLoop", "ImagePullFailed", "Unschedulable"},
+        what="the Events, which are posted in the background, warn of each",
+    )
     wait_settled(api)
 
 
