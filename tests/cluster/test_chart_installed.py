@@ -24,6 +24,12 @@ from tests.ports import free_ports
 
 RELEASE = "wayside"
 PODS_ARE_RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
+UNRESTRICTED: Object = {
+    "apiVersion": "v1",
+    "kind": "Pod",
+    "metadata": {"name": "unrestricted"},
+    "spec": {"containers": [{"name": "main", "image": "app:1"}]},
+}
 ALL: dict[str, Any] = {
     "manager": {"replicas": 2},
     "detectors": [
@@ -52,7 +58,20 @@ def there(bare: ControlPlane, request: pytest.FixtureRequest) -> Iterator[Api]:
     """An administrator's client for a fresh namespace under the restricted Pod Security Standard."""
     with fresh_namespace(bare.api(), request.node.name) as name:
         bare.api().patch("Namespace", name, {"metadata": {"labels": PODS_ARE_RESTRICTED}})
-        yield bare.api(name)
+        api = bare.api(name)
+        wait_until(lambda: takes(api, UNRESTRICTED), lambda taken: not taken, what="the standard is in force")
+        yield api
+
+
+def takes(api: Api, manifest: Object) -> bool:
+    """Whether the API server would take it."""
+    try:
+        api.apply(manifest, dry_run=True)
+    except ApiError as error:
+        if error.code != 403:
+            raise
+        return False
+    return True
 
 
 @pytest.fixture

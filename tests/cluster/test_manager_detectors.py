@@ -16,7 +16,7 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import faulty_proxy
 from tests.cluster.managed_world import condition, start_manager
 from tests.cluster.processes import Process, Processes
-from tests.cluster.test_manager_rbac import ALLOWED, granted, printed, put, used, without
+from tests.cluster.test_manager_rbac import ALLOWED, granted, may, printed, put, used, wait_in_force, without
 from tests.cluster.waiting import wait_until
 from tests.ports import free_endpoint
 from wayside.api import Detector
@@ -162,7 +162,9 @@ def test_the_manager_runs_it_with_the_rights_that_are_printed(
 ) -> None:
     api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
     account = control_plane.kubeconfig_of_service_account(namespace, "manager")
-    put(api, printed("--namespace", namespace, "--account", f"{namespace}/manager", "--detectors", *ALLOWED))
+    manifests = printed("--namespace", namespace, "--account", f"{namespace}/manager", "--detectors", *ALLOWED)
+    put(api, manifests)
+    wait_in_force(account, namespace, manifests)
     manager = start_manager(processes, namespace, *RUNS, *ALLOWED, kubeconfig=account)
     api.create(detector(mode="Standalone"))
     is_made(api)
@@ -197,6 +199,7 @@ def test_a_detector_needs_all_the_rights_that_its_role_gives_and_no_more(
     roles = detector_roles(namespace, HOLDER)
     put(api, roles)
     account = control_plane.kubeconfig_of_service_account(namespace, NAME)
+    wait_in_force(account, namespace, roles)
     api.create(detector(zenoh={"mode": "peer", "listen": [endpoint]}))
     api.create(close_vehicles())
     with faulty_proxy(account) as (proxy, kubeconfig):
@@ -242,11 +245,3 @@ def test_each_verb_of_its_own_role_is_granted_and_for_one_fewer_it_is_refused(
     for verb in sorted(granted(roles)):
         put(api, without(roles, *verb))
         wait_until(lacks, lambda found, verb=verb: found == [verb], what=f"{verb} lacks, and nothing else")
-
-
-def may(account: Api, namespace: str, group: str, resource: str, verb: str, name: str) -> bool:
-    about = {"group": group, "resource": resource, "verb": verb, "name": name, "namespace": namespace}
-    api_version = "authorization.k8s.io/v1"
-    kind = "SelfSubjectAccessReview"
-    asked = {"apiVersion": api_version, "kind": kind, "metadata": {}, "spec": {"resourceAttributes": about}}
-    return bool(account.create(asked)["status"]["allowed"])

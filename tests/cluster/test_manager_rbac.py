@@ -76,6 +76,33 @@ def put(api: Api, manifests: list[Object]) -> None:
         api.apply(each)
 
 
+def wait_in_force(account: Path, namespace: str, manifests: list[Object]) -> None:
+    """Wait until the account has all that the roles give: the API server learns of them by watches, a moment later."""
+    client = Api(account, namespace)
+
+    def lacks() -> list[Verb]:
+        return [
+            (group, resource, verb)
+            for role in manifests
+            for rule in role.get("rules", [])
+            for group in rule["apiGroups"]
+            for resource in rule["resources"]
+            for verb in rule["verbs"]
+            for name in rule.get("resourceNames", [""])
+            if not may(client, namespace, group, resource, verb, name)
+        ]
+
+    wait_until(lacks, lambda found: not found, what="the roles are in force")
+
+
+def may(account: Api, namespace: str, group: str, resource: str, verb: str, name: str) -> bool:
+    about = {"group": group, "resource": resource, "verb": verb, "name": name, "namespace": namespace}
+    api_version = "authorization.k8s.io/v1"
+    kind = "SelfSubjectAccessReview"
+    asked = {"apiVersion": api_version, "kind": kind, "metadata": {}, "spec": {"resourceAttributes": about}}
+    return bool(account.create(asked)["status"]["allowed"])
+
+
 def used(seen: list[Seen], namespace: str) -> Iterator[Verb]:
     """What the requests of a manager asked for, in RBAC's words."""
     for each in seen:
@@ -107,6 +134,7 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
 ) -> None:
     manifests = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
     put(api, manifests)
+    wait_in_force(account, namespace, manifests)
     with faulty_proxy(account) as (proxy, kubeconfig):
         manager = start_manager(
             processes, namespace, *ALLOWED, "--ttl-after-finished", "2s", "--resync", "2s", kubeconfig=kubeconfig
@@ -171,6 +199,7 @@ def test_it_lives_on_a_cluster_role(
     manifests = printed("--account", f"{namespace}/manager", "--name", namespace, *ALLOWED)
     put(api, manifests)
     try:
+        wait_in_force(account, namespace, manifests)
         lease = ["--lease", f"{namespace}/application-manager"]
         manager = start_manager(processes, None, *ALLOWED, *lease, kubeconfig=account)
         manager.wait_for_output("active: holds the Lease")
@@ -215,7 +244,8 @@ def test_what_nothing_works_without_ends_the_start_with_one_line(
     api: Api, processes: Processes, namespace: str, account: Path
 ) -> None:
     whole = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
-    put(api, without(whole, "wayside.dev", "applicationtasks", "watch"))
+    put(api, fewer := without(whole, "wayside.dev", "applicationtasks", "watch"))
+    wait_in_force(account, namespace, fewer)
     environment = {"KUBECONFIG": str(account)}
     manager = processes.start("application-manager", "run", "--namespace", namespace, *ALLOWED, environment=environment)
     assert manager.wait() == 2
@@ -228,7 +258,8 @@ def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
     api: Api, processes: Processes, namespace: str, account: Path
 ) -> None:
     whole = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
-    put(api, without(whole, "", "configmaps", "patch"))
+    put(api, fewer := without(whole, "", "configmaps", "patch"))
+    wait_in_force(account, namespace, fewer)
     manager = start_manager(processes, namespace, *ALLOWED, kubeconfig=account)
     assert (
         f"its account may not patch configmaps in namespace {namespace}: no ConfigMap of a template" in manager.output()

@@ -24,8 +24,8 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import faulty_proxy
 from tests.cluster.managed_world import condition, start_manager
 from tests.cluster.processes import BIN, Processes
-from tests.cluster.test_manager_detectors import close_vehicles, detector, live, may
-from tests.cluster.test_manager_rbac import ALLOWED, granted, printed, put, used
+from tests.cluster.test_manager_detectors import close_vehicles, detector, live
+from tests.cluster.test_manager_rbac import ALLOWED, granted, may, printed, put, used, wait_in_force
 from tests.cluster.waiting import wait_until
 from tests.cluster.webhook import Webhook
 from tests.ports import free_endpoint, free_port
@@ -329,17 +329,18 @@ def test_the_manager_puts_it_into_pods_with_the_rights_that_are_printed(
 ) -> None:
     api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
     account = control_plane.kubeconfig_of_service_account(namespace, "manager")
-    put(api, printed("--namespace", namespace, "--account", f"{namespace}/manager", "--detectors", *ALLOWED))
+    manifests = printed("--namespace", namespace, "--account", f"{namespace}/manager", "--detectors", *ALLOWED)
+    put(api, manifests)
+    wait_in_force(account, namespace, manifests)
     webhook = Webhook(processes, api, tmp_path / "certificates", options=(*RUNS, *ALLOWED), kubeconfig=account)
     with webhook.asked():
         api.create(sidecar_detector("vehicle"))
         wait_injecting(api)
         api.create(pod(account="other"))
         event_of(api, "car", "has only vehicle")
-    said = api.wait_for(
-        "Detector", HOLDER, lambda raw: bool(condition(raw, "Running")), what="it is said whether it runs"
+    api.wait_for(
+        "Detector", HOLDER, lambda raw: condition(raw, "Running").get("reason") == "InPods", what="it runs in pods"
     )
-    assert condition(said, "Running")["reason"] == "InPods"
     assert webhook.manager.terminate() == 0
     assert "orbidden" not in webhook.manager.output()
     assert "may not" not in webhook.manager.output()
@@ -351,6 +352,7 @@ def test_in_a_pod_it_holds_for_this_pod_alone_and_needs_its_rights_and_no_more(
     roles = sidecar_roles(namespace, HOLDER, ["vehicle"])
     put(api, roles)
     account = control_plane.kubeconfig_of_service_account(namespace, "vehicle")
+    wait_in_force(account, namespace, roles)
     endpoint = free_endpoint()
     api.create(sidecar_detector("vehicle", zenoh={"mode": "peer", "listen": [endpoint]}))
     api.create(close_vehicles())
