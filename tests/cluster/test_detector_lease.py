@@ -103,10 +103,10 @@ def test_it_lasts_15_seconds_and_belongs_to_the_pod(
 
 
 def test_it_is_renewed_after_each_third_of_its_duration(api: Api, namespace: str, loop: Background) -> None:
-    Holding(loop, namespace, Identity("pod-1"), duration=9.0).wait_held()
+    Holding(loop, namespace, Identity("pod-1"), duration=15.0).wait_held()
     specs = renewals(api, 3)
     gaps = [(moment(after) - moment(before)).total_seconds() for before, after in pairwise(specs)]
-    assert all(2.9 < gap < 9.0 for gap in gaps), gaps
+    assert all(4.9 < gap < 15.0 for gap in gaps), gaps
     assert {spec["leaseTransitions"] for spec in specs} == {0}
     assert len({spec["acquireTime"] for spec in specs}) == 1
 
@@ -181,7 +181,7 @@ def test_one_that_was_taken_over_holds_no_more(
     first.wait_held()
     api.patch("Lease", NAME, {"spec": {"holderIdentity": "pod-2", "leaseDurationSeconds": LONG}})
     first.wait_held(False)
-    assert "pod-2 has taken over" in caplog.text
+    wait_until(lambda: caplog.text, lambda text: "pod-2 has taken over" in text, what="it is said")
 
 
 def test_an_outage_does_not_take_it_away(

@@ -12,7 +12,7 @@ from detector.rules.selection import RuleSet
 from tests.cluster.api import Api, Object
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 
 API_VERSION = "wayside.dev/v1alpha1"
 SITE = {"site": "a"}
@@ -45,11 +45,11 @@ class Following:
         async for rule_set in self.rules.follow():
             self.sets.append(rule_set)
 
-    def wait(self, holds: Callable[[RuleSet], bool], what: str, timeout: float = 30) -> RuleSet:
+    def wait(self, holds: Callable[[RuleSet], bool], what: str, timeout: float = PATIENCE) -> RuleSet:
         sets = wait_until(lambda: self.sets, lambda sets: bool(sets) and holds(sets[-1]), timeout=timeout, what=what)
         return sets[-1]
 
-    def wait_rules(self, *names: str, timeout: float = 30) -> RuleSet:
+    def wait_rules(self, *names: str, timeout: float = PATIENCE) -> RuleSet:
         return self.wait(lambda last: names_of(last) == list(names), f"the rules are {names}", timeout)
 
 
@@ -113,11 +113,16 @@ def test_the_last_known_set_holds_while_the_detector_is_gone(
     following.wait_rules("a")
     before = len(following.sets)
     api.delete("Detector", "intersection-a")
-    api.create(rule("b"))
     wait_until(lambda: caplog.text.count("no Detector"), lambda n: n == 2, what="it is said again")
+    # Only now: Detectors and rules come by two watches, and the rule may be faster.
+    deploy = {"name": "x", "deploy": {"template": "t", "parameters": {"not-an-identifier": 1}}}
+    api.create(rule("b"))
+    api.create(rule("c", actions=[deploy]))
+    wait_until(lambda: following.rules.problems, bool, what="the rules that were created meanwhile are known")
     assert len(following.sets) == before
-    api.create(detector())
-    following.wait_rules("a", "b")
+    api.create(detector(clientTimeout="7s"))
+    following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the Detector that is back is followed")
+    assert [names_of(each) for each in following.sets[before:]] == [["a", "b"]]
 
 
 def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
