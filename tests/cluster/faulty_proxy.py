@@ -26,12 +26,16 @@ _HOP = frozenset({"connection", "content-length", "content-encoding", "host", "k
 
 @dataclass
 class Seen:
-    """One request: when it came, by a monotonic clock, and what was answered (0: nothing yet)."""
+    """One request: when it came, by a monotonic clock, and what was answered (0: nothing yet).
+
+    `refused`: by the proxy, since an API server itself may have reasons to answer the same.
+    """
 
     method: str
     path: str
     at: float
     status: int = 0
+    refused: bool = False
 
 
 @dataclass
@@ -120,6 +124,7 @@ async def _answer(
     refusal = proxy.refuse(request.method, request.path_qs)
     if refusal is not None:
         seen.status, seconds = refusal
+        seen.refused = True
         status = {
             "kind": "Status",
             "apiVersion": "v1",

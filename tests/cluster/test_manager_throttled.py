@@ -17,6 +17,8 @@ from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 
 WATCHERS = 8  # requests of watches that (re)list, and those about the Lease: apart from the bound
+HOLD = 9  # s for which the API server wants to be left alone
+UNDER_WAY = 5.0  # s: what was sent before the answer had arrived at a manager on a machine that is busy otherwise
 
 
 def test_a_burst_of_a_thousand_tasks_is_worked_off_with_few_requests_at_once(
@@ -28,13 +30,12 @@ def test_a_burst_of_a_thousand_tasks_is_worked_off_with_few_requests_at_once(
         proxy.most, proxy.slow = 0, 0.02  # slow enough that all that may run at once does
         with ThreadPoolExecutor(8) as pool:
             list(pool.map(api.create, (task(f"t{index}", region=f"r{index % 20}") for index in range(1000))))
-        accepted = wait_until(
-            lambda: [each for each in api.list("ApplicationTask") if each.get("status", {}).get("phase")],
-            lambda found: len(found) == 1000,
+        wait_until(
+            lambda: [each.get("status", {}).get("phase") for each in api.list("ApplicationTask")].count("Active"),
+            lambda active: active == 1000,
             timeout=300,
-            what="all tasks are answered",
+            what="all tasks are answered, and served",
         )
-        assert {each["status"]["phase"] for each in accepted} == {"Active"}
         assert proxy.most <= AT_ONCE + WATCHERS
         proxy.slow = 0
         wait_settled(api)
@@ -51,19 +52,18 @@ def test_nothing_is_asked_before_the_time_that_the_api_server_gave_is_over(
         once = itertools.count()
 
         def refuse(method: str, path: str) -> tuple[int, int] | None:
-            return (code, 3) if method == "PATCH" and "/deployments/" in path and next(once) == 0 else None
+            return (code, HOLD) if method == "PATCH" and "/deployments/" in path and next(once) == 0 else None
 
         proxy.refuse = refuse
         for index in range(10):
             api.create(task(f"t{index}"))
         api.wait_list("Deployment", lambda found: len(found) == 10, what="all is served in the end")
         wait_settled(api)
-        (refused,) = (each for each in proxy.seen if each.status == code)
-        under_way = 0.5  # s: what was sent before the answer had arrived
+        (refused,) = (each for each in proxy.seen if each.refused)
         own = [each for each in proxy.seen if "/leases" not in each.path and not watches(each)]
-        early = [each for each in own if refused.at + under_way < each.at < refused.at + 3]
+        early = [each for each in own if refused.at + UNDER_WAY < each.at < refused.at + HOLD]
         assert early == []
-        assert [each for each in own if each.at >= refused.at + 3]
+        assert [each for each in own if each.at >= refused.at + HOLD]
         assert "Traceback" not in manager.output()
 
 
@@ -80,10 +80,8 @@ def test_an_api_server_that_refuses_everything_for_a_while_is_waited_for(
         began = time.monotonic()
         for index in range(20):
             api.create(task(f"t{index}"))
-        wait_until(
-            lambda: [each for each in proxy.seen if each.status == 429], lambda found: len(found) > 3, what="refused"
-        )
-        asked = [each for each in proxy.seen if each.at > began and each.status == 429]
+        wait_until(lambda: [each for each in proxy.seen if each.refused], lambda found: len(found) > 3, what="refused")
+        asked = [each for each in proxy.seen if each.at > began and each.refused]
         proxy.refuse = lambda method, path: None
         assert len(asked) < 200, "it does not storm"
         api.wait_list("Deployment", lambda found: len(found) == 21, what="all is served in the end")
