@@ -94,13 +94,13 @@ def test_a_manager_killed_amid_a_hundred_tasks_finishes_when_it_is_back(api: Api
 
 def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process, control_plane: ControlPlane) -> None:
     api.create(template())
-    # The holder's Lease lapses after 25 s; the outage takes 30, in which it cannot be renewed.
+    # In the end the holder's Lease lapses after 25 s; the outage takes 30, in which it cannot be renewed.
     api.create(template("held", lifecycle={"linger": "1s", "onDetectorLoss": {"policy": "Release", "after": "1s"}}))
     lease: Object = {
         "apiVersion": "coordination.k8s.io/v1",
         "kind": "Lease",
         "metadata": {"name": "wayside-det"},
-        "spec": {"holderIdentity": "det", "leaseDurationSeconds": 24, "renewTime": "2026-01-01T00:00:00.000000Z"},
+        "spec": {"holderIdentity": "det", "leaseDurationSeconds": LONG, "renewTime": "2026-01-01T00:00:00.000000Z"},
     }
     api.create(lease)
     api.create(task("north"))
@@ -108,7 +108,8 @@ def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process
     held = instance_name("held", "held")
     before = [there(api, name)["metadata"]["uid"] for name in (NORTH, held)]
     control_plane.stop_controller_manager()  # else it starts with the API server, and the holder waits for that
-    api.patch("Lease", "wayside-det", {"spec": {"renewTime": "2026-01-01T00:00:10.000000Z"}})
+    short = {"leaseDurationSeconds": 24, "renewTime": "2026-01-01T00:00:10.000000Z"}
+    api.patch("Lease", "wayside-det", {"spec": short})
     api.create(task("west"))
     there(api, instance_name("app", "west"))  # by now the manager has seen that the Lease was renewed
     control_plane.stop_api_server()
