@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ SEED, DURATION = 3528, 25.0
 EVALUATION = 0.5  # s, of the example's rule
 REACTION = 2.0  # s from the evaluation to a Deployment that is there, or gone
 REQUESTS = 10  # how often the API server is asked on the way
+LOOKING = 0.1  # s between two looks of the observer
 SAMPLING = 0.2  # s: a pose is up to 0.1 s old, and so is what the observer saw
 
 
@@ -66,7 +68,7 @@ class Observer:
             thread.join()
 
     def _run(self, ended: threading.Event) -> None:
-        while not ended.wait(0.1):
+        while not ended.wait(LOOKING):
             before, began = time.time_ns(), time.monotonic()
             deployments = self.api.list("Deployment")
             configurations = {each["metadata"]["name"]: each for each in self.api.list("ConfigMap")}
@@ -150,8 +152,9 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
 class Moments:
     """What was seen, in seconds into the drive, and how late it may have been at most.
 
-    A machine that is slow is so for vehicles and observer too: by how much poses were sent late, and by how much
-    longer the API server takes, what comes of them may be late as well.
+    A machine that is slow is so for vehicles and observer too: by how much poses were sent late, by how much longer
+    the API server takes, and for how long the observer itself was kept from looking, what comes of them may be late
+    as well.
     """
 
     seen: list[Seen]
@@ -160,7 +163,14 @@ class Moments:
 
     @property
     def allowed(self) -> float:
-        return EVALUATION + REACTION + self.late_s + REQUESTS * max(each.took_s for each in self.seen)
+        took = max(each.took_s for each in self.seen)
+        return EVALUATION + REACTION + self.late_s + self._kept_s + REQUESTS * took
+
+    @property
+    def _kept_s(self) -> float:
+        """For how long the observer wanted to look and was not let."""
+        pauses = ((after.since_ns - each.since_ns) / 1e9 - each.took_s for each, after in pairwise(self.seen))
+        return max(0.0, max(pauses) - LOOKING)
 
     def __iter__(self) -> Iterator[tuple[float, Seen]]:
         return (((each.since_ns - self.start_ns) / 1e9, each) for each in self.seen)
@@ -172,10 +182,11 @@ def assert_recorders(seen: Moments, spans: dict[tuple[str, str], list[Any]]) -> 
     assert {pair for _, moment in seen for pair in moment.pairs} == spans.keys()
     allowed = seen.allowed
     for at, moment in seen:
+        until = at + moment.took_s  # when within this time it was so, a look does not say
         for pair, its in spans.items():
             exists = pair in moment.pairs
-            must = any(span.start_s + allowed <= at <= (span.end_s or DURATION) - SAMPLING for span in its)
-            may = any(span.start_s - SAMPLING <= at <= (span.end_s or DURATION) + allowed for span in its)
+            must = any(span.start_s + allowed <= at and until <= (span.end_s or DURATION) - SAMPLING for span in its)
+            may = any(span.start_s - SAMPLING <= until and at <= (span.end_s or DURATION) + allowed for span in its)
             assert exists or not must, f"at {at:.2f} s (+ {allowed:.2f} s) there is no recorder for {pair}: {its}"
             assert may or not exists, f"at {at:.2f} s (+ {allowed:.2f} s) there is a recorder for {pair}: {its}"
 
@@ -185,14 +196,17 @@ def assert_fusions(seen: Moments, expected: dict[str, list[Any]]) -> None:
     met = dict.fromkeys(expected, 0)
     allowed = seen.allowed
     for at, moment in seen:
+        until = at + moment.took_s
         for place, states in expected.items():
             sources = moment.sources.get(place)
             due = {
                 tuple(state.sources)
                 for state in states
-                if state.start_s - SAMPLING <= at <= (state.end_s or DURATION) + allowed
+                if state.start_s - SAMPLING <= until and at <= (state.end_s or DURATION) + allowed
             }
-            settled = any(state.start_s + allowed <= at <= (state.end_s or DURATION) - SAMPLING for state in states)
+            settled = any(
+                state.start_s + allowed <= at and until <= (state.end_s or DURATION) - SAMPLING for state in states
+            )
             if sources is None:
                 assert not settled, f"at {at:.2f} s there is no fusion at {place}: {states}"
             else:
