@@ -192,9 +192,10 @@ class Chain(Town):
         return self.detector
 
     def events(self, *subject: str) -> list[Object]:
-        """The events of a client or pair so far, as the detector wrote them."""
+        """The events of a client or pair so far, as the detector wrote them; of a line that is being written, none."""
         file = self.folder / "events.jsonl"
-        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        whole, _, _ = file.read_bytes().rpartition(b"\n") if file.exists() else (b"", b"", b"")
+        lines = whole.decode().splitlines()
         return [event for event in map(json.loads, lines) if event["subject"] == "+".join(subject)]
 
     def wait_events(self, pair: Pair, *kinds: str) -> list[Object]:

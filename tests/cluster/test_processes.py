@@ -71,7 +71,7 @@ def test_a_program_that_does_not_heed_sigterm_is_a_failure_and_killed(processes:
 
 def test_a_killed_program_starts_again_with_the_same_command_line_and_log(processes: Processes) -> None:
     program = start(processes, WAIT_FOR_SIGTERM, "x")
-    program.wait_for_output("started")
+    program.wait_for_output(r"started with \['x'\]")  # all of it: unbuffered, `print` writes each part by itself
     first = program.pid
     program.kill9()
     assert program.returncode == -9
