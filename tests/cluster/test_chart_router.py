@@ -73,6 +73,7 @@ def guarded(helm: Helm, tmp_path: Path) -> Iterator[Guarded]:
     sessions = []
 
     def connected(name: str | None, *, foreign: bool = False) -> zenoh.Session:
+        patience = 60_000 if name is not None and not foreign else 3000  # ms: who is let in is waited for
         mine: dict[str, Any] = {"root_ca_certificate": str(authority.ca), "verify_name_on_connect": True}
         if name is not None:
             signed = (other if foreign else authority).sign(name)
@@ -81,7 +82,11 @@ def guarded(helm: Helm, tmp_path: Path) -> Iterator[Guarded]:
             opened(
                 {
                     "mode": "client",
-                    "connect": {"endpoints": [f"tls/localhost:{port}"], "timeout_ms": 3000, "exit_on_failure": True},
+                    "connect": {
+                        "endpoints": [f"tls/localhost:{port}"],
+                        "timeout_ms": patience,
+                        "exit_on_failure": True,
+                    },
                     "scouting": {"multicast": {"enabled": False}},
                     "transport": {"link": {"tls": mine}},
                 }

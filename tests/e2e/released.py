@@ -82,15 +82,17 @@ def outside(node: Node, api: Api) -> str:
     return f"tls/{node.address}:{port}"
 
 
-def vehicle(endpoint: str, authority: Path, certificate: tuple[Path, Path] | None) -> zenoh.Session:
-    """A session from outside. Raises zenoh.ZError where it is not let in."""
+def vehicle(
+    endpoint: str, authority: Path, certificate: tuple[Path, Path] | None, *, patience: float = PATIENCE
+) -> zenoh.Session:
+    """A session from outside. Raises zenoh.ZError where it is not let in within `patience` seconds."""
     tls: dict[str, Any] = {"root_ca_certificate": str(authority), "verify_name_on_connect": False}
     if certificate is not None:
         tls |= {"connect_certificate": str(certificate[0]), "connect_private_key": str(certificate[1])}
         tls["enable_mtls"] = True
     settings = {
         "mode": "client",
-        "connect": {"endpoints": [endpoint], "timeout_ms": 5000, "exit_on_failure": True},
+        "connect": {"endpoints": [endpoint], "timeout_ms": round(patience * 1000), "exit_on_failure": True},
         "scouting": {"multicast": {"enabled": False}},
         "transport": {"link": {"tls": tls}},
     }

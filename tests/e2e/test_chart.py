@@ -114,7 +114,8 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
         (recorder,) = wait_pods(api, "scene-recorder", ready, "the recorder of the two runs")
         (fusion,) = wait_pods(api, "scene-fusion", ready, "the fusion of their scene runs")
         assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in said(node, recorder)
-        assert said(node, fusion).count(first) == 1, "it was told its configuration, once"
+        told = wait_until(lambda: said(node, fusion), lambda text: first in text, what="it is told its configuration")
+        assert told.count(first) == 1, "once"
 
         running = lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")])
         serving = lives([*of(api, DETECTOR), *of(api, ROUTER)])

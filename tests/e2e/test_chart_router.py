@@ -64,7 +64,7 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
 
     mixed = authority.sign("car1")[0], authority.sign("car2")[1]
     for certificate in (None, foreign.sign("car1"), mixed):
-        with pytest.raises(zenoh.ZError), vehicle(endpoint, authority.ca, certificate):
+        with pytest.raises(zenoh.ZError), vehicle(endpoint, authority.ca, certificate, patience=5):
             pass
 
     with vehicle(endpoint, authority.ca, authority.sign("unknown")):

@@ -70,7 +70,15 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
 
         told = said(recorder["metadata"]["name"])
         assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in told
-        assert configurations() == [sorted([first, second])]
+        # What it writes comes in parts: the heading, then the configuration.
+        written = wait_until(
+            configurations,
+            bool,
+            timeout=PATIENCE,
+            what="the fusion is told",
+            transient=(yaml.YAMLError, TypeError, KeyError),
+        )
+        assert written == [sorted([first, second])]
         tasks = api.wait_list(
             "ApplicationTask",
             lambda found: len(found) == 2 and all(each.get("status", {}).get("phase") == "Ready" for each in found),
@@ -81,7 +89,13 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
         vehicles.put(third, 200)
 
         everybody = sorted([first, second, third])
-        wait_until(configurations, lambda found: found[-1] == everybody, timeout=PATIENCE, what="the fusion is told")
+        wait_until(
+            configurations,
+            lambda found: found[-1] == everybody,
+            timeout=PATIENCE,
+            what="the fusion is told of all",
+            transient=(yaml.YAMLError, TypeError, KeyError),
+        )
         (same,) = applications(api, "scene-fusion")
         assert same["metadata"]["uid"] == fusion["metadata"]["uid"]
         assert same["status"]["containerStatuses"][0]["restartCount"] == 0

@@ -9,6 +9,7 @@ import pytest
 from application_manager.core.objects.sidecars import CONTAINER
 from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import condition
+from tests.cluster.waiting import wait_until
 from tests.e2e.released import MANAGER, PATIENCE, RELEASE, available, image_values
 from tests.e2e.wayside_in_cluster import RESTRICTED, ZENOH_PORT
 from tests.e2e.workloads import deployment, wait_available
@@ -16,6 +17,7 @@ from tests.helm.wayside_chart import CHART, Helm
 from wayside.beginning import ENDED
 
 DETECTOR = "on-board"
+ASKS = {"wayside.dev/detector": DETECTOR}
 DRIVE = f"""
 import json, signal, sys, time, zenoh
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -100,13 +102,19 @@ def asking(api: Api, image: str, helm: Helm) -> None:
         timeout=PATIENCE,
         what="the accounts have their rights",
     )
+    probe = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "probe", "labels": ASKS}}
+    wait_until(
+        lambda: api.apply(probe | {"spec": pod_spec(image, WAIT)}, dry_run=True)["spec"].get("initContainers"),
+        bool,
+        timeout=PATIENCE,
+        what="the API server asks about pods, and reaches who answers",
+    )
 
 
 def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     api: Api, image: str, asking: None
 ) -> None:
-    labels = {"wayside.dev/detector": DETECTOR}
-    pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "car", "labels": labels}}
+    pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "car", "labels": ASKS}}
     api.create(pod | {"spec": pod_spec(image, DRIVE)})
     api.patch("Namespace", api.namespace, {"metadata": {"labels": {"pod-security.kubernetes.io/enforce": None}}})
     (task,) = api.wait_list(
@@ -134,7 +142,7 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
 
 
 def test_a_job_with_a_detector_completes(api: Api, image: str, asking: None) -> None:
-    template = {"metadata": {"labels": {"wayside.dev/detector": DETECTOR}}, "spec": pod_spec(image, "print('done')")}
+    template = {"metadata": {"labels": ASKS}, "spec": pod_spec(image, "print('done')")}
     template["spec"]["restartPolicy"] = "Never"
     job = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "nightly"}}
     api.create(job | {"spec": {"template": template}})

@@ -139,6 +139,8 @@ class Heard:
         wait_until(lambda: self.kinds(pair), lambda found: found == list(kinds), timeout=PATIENCE, what=what)
 
     def __enter__(self) -> Heard:
+        # It connects in the background, and what is published before, nobody hears.
+        wait_until(self._session.info.peers_zid, bool, timeout=PATIENCE, what="the detector is connected")
         return self
 
     def __exit__(self, *_: object) -> None:
