@@ -71,7 +71,7 @@ class Child:
         self._kill_group()
         return code
 
-    def terminate(self, patience: float = 30) -> int:
+    def terminate(self, patience: float = 60) -> int:
         """Send SIGTERM and wait for the end; return the exit code.
 
         Raises:

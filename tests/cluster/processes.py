@@ -47,7 +47,7 @@ class Process:
         """The exit code of the present run, negative for a signal; None while it goes on."""
         return self._child.returncode
 
-    def terminate(self, patience: float = 30) -> int:
+    def terminate(self, patience: float = 60) -> int:
         """Send SIGTERM, wait for the end, return the exit code; TimeoutError (and SIGKILL) after `patience` seconds."""
         return self._child.terminate(patience)
 

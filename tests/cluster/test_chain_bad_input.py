@@ -40,6 +40,7 @@ from tests.cluster.chain import (
 )
 from tests.cluster.managed_world import condition
 from tests.cluster.processes import BIN, Process, Processes
+from tests.cluster.waiting import PATIENCE
 from tests.unit.ros_messages import cdr, pose_stamped
 
 HOUR = 3600  # s
@@ -271,7 +272,7 @@ def command(*arguments: str, folder: Path | None = None) -> subprocess.Completed
         [str(BIN / "detector"), *arguments],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         cwd=folder,
         env=environment,
         check=False,

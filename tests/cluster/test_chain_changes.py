@@ -46,7 +46,7 @@ def vehicles(chain: Chain) -> Iterator[Vehicles]:
 
 
 def test_a_rule_that_means_something_else_ends_its_episodes_and_begins_anew(chain: Chain, vehicles: Vehicles) -> None:
-    chain.apply(template(linger="8s"))
+    chain.apply(template(linger="20s"))
     chain.start()
     vehicles.place(CARS, NEAR)
     vehicles.place(VANS, 140.0)

@@ -32,7 +32,7 @@ from tests.cluster.chain import (
 )
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.processes import Processes
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 from wayside.times import parse_time
 
 SECOND = 10**9  # ns
@@ -203,7 +203,7 @@ def test_the_intake_of_a_killed_detector_can_be_replayed_up_to_the_cut(
     done = subprocess.run(
         [sys.executable, "-m", "detector.cli", "replay", str(intake), "--output", str(replayed)],
         check=True,
-        timeout=60,
+        timeout=PATIENCE,
         capture_output=True,
         text=True,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -18,7 +19,7 @@ from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import config, start_manager, template
 from tests.cluster.processes import BIN, Process, Processes
-from tests.cluster.waiting import wait_until
+from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_port
 
 
@@ -119,7 +120,8 @@ def kubectl_apply(control_plane: ControlPlane, manifest: Object, namespace: str,
         input=json.dumps(manifest),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
+        env=os.environ | {"KUBECACHEDIR": str(control_plane.folder / "kubectl")},
         check=False,
     )
     return done.returncode, done.stderr

@@ -11,6 +11,7 @@ for new kinds only every 30 s, and would leave the children of an ApplicationIns
 
 from __future__ import annotations
 
+import os
 import secrets
 import shutil
 import subprocess
@@ -65,6 +66,11 @@ class ControlPlane:
     def url(self) -> str:
         """Where the API server listens; the same after a restart."""
         return f"https://{self._setup.site.address}:{self._setup.api_port}"
+
+    @property
+    def controller_manager(self) -> Child | None:
+        """The one that runs now."""
+        return self._controller_manager
 
     def api(self, namespace: str = "default") -> Api:
         """Return an administrator's client whose default namespace is `namespace`."""
@@ -168,7 +174,11 @@ class ControlPlane:
             RuntimeError: it failed; with its stderr.
         """
         command = [str(self.binaries.kubectl), f"--kubeconfig={self.kubeconfig}", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        # What it remembers of an API server goes by the port, which another run's may have had.
+        environment = os.environ | {"KUBECACHEDIR": str(self.folder / "kubectl")}
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=2 * PATIENCE, check=False
+        )
         if done.returncode != 0:
             raise RuntimeError(f"kubectl {' '.join(arguments)}: exit code {done.returncode}\n{done.stderr}")
         return done.stdout
