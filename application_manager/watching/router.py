@@ -181,10 +181,12 @@ class Router:
             return
         key = (name[0], holder)
         at = self.world.healthy.elapsed
-        before = self.world.leases.view(key, at)
+        first, before = not self.world.leases.seen(key), self.world.leases.view(key, at)
         renewed = self.world.leases.observe(key, raw, at)
-        if renewed and (not before.renewed or before.unchanged >= before.duration):
+        returns = renewed and (not before.renewed or before.unchanged >= before.duration)
+        if returns:
             log.info("holder %s/%s renews its Lease", *key)
+        if first or returns:  # only now is it known how long it lasts
             self._ask_all(self.world.claims.holders().get(key, ()))
 
     def _rules(self, namespace: str) -> None:

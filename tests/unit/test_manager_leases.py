@@ -82,6 +82,25 @@ def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
     assert book.view(KEY, 6.0).unchanged == 0.0
 
 
+def test_the_first_look_at_a_lease_is_no_sign_of_life_though_somebody_asked_before() -> None:
+    book = LeaseBook()
+    assert book.view(KEY, 1.0).unchanged == 0.0
+    assert not book.seen(KEY)
+    assert book.due(KEY, 1.0)
+    assert book.observe(KEY, lease("a"), 2.0) is False
+    assert book.seen(KEY)
+    assert book.view(KEY, 2.0) == LeaseView(0.0, 3.0, renewed=False)
+    assert book.observe(KEY, lease("b"), 4.0) is True
+
+
+def test_a_lease_that_was_looked_for_and_appears_is_a_sign_of_life() -> None:
+    book = LeaseBook()
+    book.view(KEY, 1.0)
+    book.observe(KEY, None, 2.0)
+    assert book.observe(KEY, lease("a"), 3.0) is True
+    assert book.view(KEY, 3.0).renewed
+
+
 def test_a_holder_without_a_lease_counts_from_when_we_first_heard_of_it() -> None:
     book = LeaseBook()
     assert book.view(KEY, 7.0) == LeaseView(0.0, DEFAULT_DURATION, renewed=False)

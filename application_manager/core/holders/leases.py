@@ -70,6 +70,7 @@ class _Observation:
     looked: float  # healthy seconds at which it was seen last
     duration: float = DEFAULT_DURATION
     renewed: bool = False
+    seen: bool = True  # else it was only asked for: what is seen first is neither old nor a renewal
 
 
 @dataclass(slots=True)
@@ -85,7 +86,10 @@ class LeaseBook:
         if known is None:
             self._observed[key] = _Observation(identity, at, at, _duration(lease))
             return False
-        known.looked = at
+        if not known.seen and lease is not None:
+            self._observed[key] = _Observation(identity, at, at, _duration(lease))
+            return False
+        known.looked, known.seen = at, True
         if identity == known.identity:
             return False
         # A Lease that disappears is no sign of life; one that appears or changes is.
@@ -100,7 +104,7 @@ class LeaseBook:
 
         A holder never heard of counts as observed, without a Lease, from `at` on.
         """
-        known = self._observed.setdefault(key, _Observation(_identity(None), at, at))
+        known = self._observed.setdefault(key, _Observation(_identity(None), at, at, seen=False))
         return LeaseView(known.looked - known.since, known.duration, known.renewed)
 
     def due(self, key: HolderKey, at: float) -> bool:
@@ -110,10 +114,15 @@ class LeaseBook:
         Lease was seen to be overdue, the rarer the looks, so that many lost holders cost little.
         """
         known = self._observed.get(key)
-        if known is None:
+        if known is None or not known.seen:
             return True
         overdue = known.looked - known.since - known.duration
         return at - known.since >= known.duration and at - known.looked >= min(RAREST_LOOK, overdue * _RARER)
+
+    def seen(self, key: HolderKey) -> bool:
+        """Whether the holder's Lease was ever looked at, be it there or not."""
+        known = self._observed.get(key)
+        return known is not None and known.seen
 
     def forget_except(self, keys: Iterable[HolderKey]) -> None:
         """Drop what concerns no holder of interest any more."""
