@@ -34,4 +34,5 @@ def wait_left(node: Node, before: set[Found], kinds: set[str], timeout: float) -
         lambda new: {kind for kind, _, _ in new} <= kinds,
         timeout=timeout,
         what=f"nothing new is left but {', '.join(sorted(kinds)) or 'nothing'}",
+        transient=(RuntimeError,),  # a kind went between the question which there are and that for its objects
     )

@@ -42,6 +42,8 @@ DETECTOR_SPEC = yaml.safe_load((EXAMPLE / "detector.yaml").read_text(encoding="u
 OURS = {f"{plural}.wayside.dev" for plural in (
     "applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"
 )}  # fmt: skip
+AS_THE_GUIDE = ("--wait", "--timeout", "5m")
+"""So that all of the API server knows the kinds before a hook makes the Detectors of the values."""
 WRONG: Object = {
     "apiVersion": "wayside.dev/v1alpha1",
     "kind": "ApplicationTemplate",
@@ -98,7 +100,7 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
     first, second = (each.name for each in LIDAR_VEHICLES[:2])
     given["router"]["accessControl"]["clients"][0]["commonNames"] = [first, second]
     where = ("--namespace", api.namespace)
-    helm("install", RELEASE, str(CHART), *where, values=given)
+    helm("install", RELEASE, str(CHART), *where, *AS_THE_GUIDE, values=given)
     wait_installed(api)
     helm("test", RELEASE, *where, "--timeout", "5m")
     with pytest.raises(ApiError, match=r"not declared|there"):
@@ -160,7 +162,7 @@ def test_a_release_that_was_never_upgraded_leaves_no_detector_behind(
     before = inventory(node)
     apply_certificates(bare, Authority(tmp_path))
     given = values(bare.namespace, image, DETECTOR_SPEC) | {"crds": {"keep": keep}}
-    helm("install", RELEASE, str(CHART), "--namespace", bare.namespace, values=given)
+    helm("install", RELEASE, str(CHART), "--namespace", bare.namespace, *AS_THE_GUIDE, values=given)
     wait_installed(bare)
     helm("uninstall", RELEASE, "--namespace", bare.namespace)
     for name in ("router-tls", "town-tls"):
