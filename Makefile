@@ -38,7 +38,7 @@ tutorial: $(BIN)/.installed-dev ## the run that docs/tutorial.md tells of, step 
 examples: $(BIN)/.installed-dev ## all use cases: what must be detected and done, and what is; without a cluster
 	@$(BIN)/python -m examples.running --output out/examples
 
-test: lint unit process cluster ## everything that CI runs
+test: lint unit process cluster e2e ## everything that CI runs
 
 lint: $(BIN)/.installed-dev ## style, types and the direction of the imports
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check --quiet . && $(BIN)/mypy && $(BIN)/lint-imports
