@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import yaml
 
-from tests.cluster.api import Api, ApiError, Object
+from tests.cluster.api import Api, ApiError, Object, Unreachable
 from tests.cluster.waiting import PATIENCE, wait_until
 
 CRDS = Path(__file__).parents[2] / "crds"
+CRD_NAMES = frozenset(
+    f"{plural}.wayside.dev"
+    for plural in ("applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules")
+)
+_TOUCH_EVERY = 2.0  # s
 
 
 def apply_crds(api: Api, folder: Path = CRDS, timeout: float = PATIENCE) -> Mapping[str, ApiError]:
@@ -38,6 +45,36 @@ def apply_crds(api: Api, folder: Path = CRDS, timeout: float = PATIENCE) -> Mapp
         lambda: sorted(kinds - api.discover()), lambda rest: not rest, timeout=timeout, what=f"{kinds} are served"
     )
     return refused
+
+
+def remove_crds(api: Api, names: Iterable[str], timeout: float = 2 * PATIENCE) -> None:
+    """Delete those of the CRDs that there are, and wait until none is left. Raises TimeoutError."""
+    names = list(names)
+    for name in names:
+        if api.find("CustomResourceDefinition", name) is not None:
+            api.delete("CustomResourceDefinition", name)
+    for name in names:
+        wait_crd_gone(api, name, timeout)
+
+
+def wait_crd_gone(api: Api, name: str, timeout: float = 2 * PATIENCE) -> None:
+    """Wait until a CRD that is being deleted is gone. Raises TimeoutError.
+
+    Of one that was made or changed just before, the API server finds that its "storage is (re)initializing", and looks
+    again when the CRD changes, else only minutes later. So it is changed.
+    """
+    touched = time.monotonic()
+
+    def look() -> Object | None:
+        nonlocal touched
+        found = api.find("CustomResourceDefinition", name)
+        if found is not None and time.monotonic() - touched > _TOUCH_EVERY:
+            touched = time.monotonic()
+            with suppress(ApiError):  # it went just now
+                api.patch("CustomResourceDefinition", name, {"metadata": {"annotations": {"touched": str(touched)}}})
+        return found
+
+    wait_until(look, lambda found: found is None, timeout=timeout, what=f"{name} is gone", transient=(Unreachable,))
 
 
 def is_established(crd: Object) -> bool:

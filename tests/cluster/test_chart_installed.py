@@ -13,6 +13,7 @@ import pytest
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.crds import CRD_NAMES, remove_crds, wait_crd_gone
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.namespaces import fresh_namespace
 from tests.cluster.processes import Processes
@@ -79,9 +80,7 @@ def helm(bare: ControlPlane, there: Api, tmp_path: Any) -> Iterator[Helm]:
     made = Helm(ensure_tools().helm, tmp_path / "home", bare.kubeconfig)
     yield made
     made("uninstall", RELEASE, "--namespace", there.namespace, "--ignore-not-found")
-    for crd in ours(there, "CustomResourceDefinition"):
-        there.delete("CustomResourceDefinition", crd["metadata"]["name"])
-        there.wait_gone("CustomResourceDefinition", crd["metadata"]["name"])
+    remove_crds(there, CRD_NAMES)
 
 
 def ours(api: Api, *kinds: str) -> list[Object]:
@@ -139,7 +138,8 @@ def test_what_an_install_made_goes_as_well_where_no_upgrade_came_between(helm: H
 def test_crds_that_are_not_kept_go_too(helm: Helm, there: Api) -> None:
     install(helm, there, {"crds": {"keep": False}})
     helm("uninstall", RELEASE, "--namespace", there.namespace)
-    there.wait_gone("CustomResourceDefinition", "eventrules.wayside.dev")
+    for name in CRD_NAMES:
+        wait_crd_gone(there, name)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from tests.cluster.api import Api, ApiError, Object, Objects
-from tests.cluster.crds import apply_crds
+from tests.cluster.crds import CRD_NAMES, apply_crds, remove_crds, wait_crd_gone
 from tests.cluster.waiting import wait_until
 from tests.e2e.inventory import inventory, wait_left
 from tests.e2e.node import Node
@@ -39,9 +39,6 @@ from cooperative_recording.standing import Standing
 from cooperative_recording.vehicles import LIDAR_VEHICLES
 
 DETECTOR_SPEC = yaml.safe_load((EXAMPLE / "detector.yaml").read_text(encoding="utf-8"))["spec"]
-OURS = {f"{plural}.wayside.dev" for plural in (
-    "applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"
-)}  # fmt: skip
 AS_THE_GUIDE = ("--wait", "--timeout", "5m")
 """So that all of the API server knows the kinds before a hook makes the Detectors of the values."""
 WRONG: Object = {
@@ -55,22 +52,14 @@ WRONG: Object = {
 @pytest.fixture
 def bare(node: Node, api: Api) -> Iterator[Api]:
     """The test's namespace, under the restricted Pod Security Standard, on a node that does not know our kinds."""
-    remove_crds(api)
+    remove_crds(api, CRD_NAMES)
     api.patch(
         "Namespace", api.namespace, {"metadata": {"labels": {"pod-security.kubernetes.io/enforce": "restricted"}}}
     )
     api.wait_for("ConfigMap", "kube-root-ca.crt", lambda _: True, what="the namespace has all that each one gets")
     yield node.api(api.namespace)
-    remove_crds(api)
+    remove_crds(api, CRD_NAMES)
     apply_crds(api)
-
-
-def remove_crds(api: Api) -> None:
-    for name in OURS:
-        if api.find("CustomResourceDefinition", name) is not None:
-            api.delete("CustomResourceDefinition", name)
-    for name in OURS:
-        api.wait_gone("CustomResourceDefinition", name, timeout=PATIENCE)
 
 
 def of(api: Api, name: str) -> Objects:
@@ -145,7 +134,7 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
         api.delete("Secret", name)
     helm("uninstall", RELEASE, *where)
     left = wait_left(node, before, {"CustomResourceDefinition"}, PATIENCE)
-    assert {name for _, _, name in left} == OURS, "the CRDs are kept"
+    assert {name for _, _, name in left} == CRD_NAMES, "the CRDs are kept"
 
 
 def said(node: Node, pod: Object) -> str:
@@ -167,4 +156,6 @@ def test_a_release_that_was_never_upgraded_leaves_no_detector_behind(
     helm("uninstall", RELEASE, "--namespace", bare.namespace)
     for name in ("router-tls", "town-tls"):
         bare.delete("Secret", name)
+    for name in () if keep else CRD_NAMES:
+        wait_crd_gone(bare, name)
     wait_left(node, before, {"CustomResourceDefinition"} if keep else set(), PATIENCE)
