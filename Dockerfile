@@ -4,7 +4,8 @@
 #
 # The base is pinned by its digest (Python 3.13 on Debian 13), what is installed by docker/requirements.txt, with hashes.
 # Files bear no times of the build, so the same source gives the same layers (BuildKit: also give
-# --build-arg SOURCE_DATE_EPOCH=0 and --output type=image,rewrite-timestamp=true).
+# --build-arg SOURCE_DATE_EPOCH=0 and --output type=image,rewrite-timestamp=true; buildah: --timestamp 0). Where the base
+# comes from a registry of your own: --build-arg BASE=<a Debian with Python 3.11 to 3.13, venv and pip>.
 ARG BASE=docker.io/library/python:3.13-slim-trixie@sha256:9d2e5553305c7c7b0097999bb17187c69b921ccd6bc9d40e4bb5ebe652c00285
 
 FROM ${BASE} AS build
