@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import copy
+import itertools
 import os
 import re
 import subprocess
@@ -82,14 +83,10 @@ def wait_in_force(account: Path, namespace: str, manifests: list[Object]) -> Non
 
     def lacks() -> list[Verb]:
         return [
-            (group, resource, verb)
-            for role in manifests
-            for rule in role.get("rules", [])
-            for group in rule["apiGroups"]
-            for resource in rule["resources"]
-            for verb in rule["verbs"]
+            verb
+            for rule, verb in verbs(manifests)
             for name in rule.get("resourceNames", [""])
-            if not may(client, namespace, group, resource, verb, name)
+            if not may(client, namespace, *verb, name)
         ]
 
     wait_until(lacks, lambda found: not found, what="the roles are in force")
@@ -119,14 +116,15 @@ def used(seen: list[Seen], namespace: str) -> Iterator[Verb]:
 
 
 def granted(manifests: list[Object]) -> set[Verb]:
-    return {
-        (group, resource, verb)
-        for role in manifests
-        for rule in role.get("rules", [])
-        for group in rule["apiGroups"]
-        for resource in rule["resources"]
-        for verb in rule["verbs"]
-    }
+    return {verb for _, verb in verbs(manifests)}
+
+
+def verbs(manifests: list[Object]) -> Iterator[tuple[Object, Verb]]:
+    """All that the roles give, each with its rule."""
+    for role in manifests:
+        for rule in role.get("rules", []):
+            for each in itertools.product(rule["apiGroups"], rule["resources"], rule["verbs"]):
+                yield rule, each
 
 
 def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
