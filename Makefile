@@ -7,6 +7,12 @@ PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do $$eac
 VENV ?= .venv
 BIN := $(VENV)/bin
 
+# Hundreds of tests start programs: compiling them each time would double the time of the tests.
+unexport PYTHONDONTWRITEBYTECODE
+
+# Tests that wait on other processes: three a core keep it busy.
+WAITING := $(BIN)/python -m pytest -n 6 --dist loadgroup
+
 .PHONY: help demo demo-cluster tutorial examples test unit cluster e2e lint bench requirements crds clean
 
 help: ## what can be made
@@ -38,27 +44,33 @@ tutorial: $(BIN)/.installed-dev ## the run that docs/tutorial.md tells of, step 
 examples: $(BIN)/.installed-dev ## all use cases: what must be detected and done, and what is; without a cluster
 	@$(BIN)/python -m examples.running --output out/examples
 
-test: lint unit process cluster e2e ## everything that CI runs
+# What is built once is built beside what needs none of it; then all that waits on other processes waits side by side.
+test: $(BIN)/.installed-dev ## everything that CI runs
+	@mkdir -p out; $(BIN)/python -m tests.builds >out/builds.log 2>&1 & \
+	trap "kill $$! 2>/dev/null" EXIT; $(MAKE) --no-print-directory lint unit && \
+	{ wait $$! || { cat out/builds.log; exit 1; }; } && $(WAITING) tests/process tests/cluster tests/e2e
 
 lint: $(BIN)/.installed-dev ## style, types and the direction of the imports
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check --quiet . && $(BIN)/mypy && $(BIN)/lint-imports
 
 unit: $(BIN)/.installed-dev ## the tests of what is pure, and of files
-	@$(BIN)/python -m pytest tests/unit
+	@$(BIN)/python -m pytest tests/unit -n 2 --dist worksteal
 
 process: $(BIN)/.installed-dev ## the tests with a detector's processes, Zenoh, MQTT, HTTP and a database's server
 	@$(BIN)/python -m tests.mongodb
 	@$(BIN)/python -m tests.helm
-	@$(BIN)/python -m pytest tests/process
+	@$(WAITING) tests/process
 
 cluster: $(BIN)/.installed-dev ## the tests against a real control plane; builds it first where it is missing
 	@$(BIN)/python -m tests.cluster.binaries
 	@$(BIN)/python -m tests.helm
-	@$(BIN)/python -m pytest tests/cluster
+	@$(WAITING) tests/cluster
 
 e2e: $(BIN)/.installed-dev ## the tests on a real node with containers, as root; builds it first where it is missing
+	@$(BIN)/python -m tests.cluster.binaries
+	@$(BIN)/python -m tests.helm
 	@$(BIN)/python -m tests.e2e.programs
-	@$(BIN)/python -m pytest tests/e2e
+	@$(WAITING) tests/e2e
 
 bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its baseline
 	@for each in $(basename $(notdir $(wildcard benchmarks/*.py))); do echo "== $$each"; $(BIN)/python -m benchmarks.$$each || exit 1; done

@@ -1,6 +1,12 @@
 """What holds for all tests."""
 
+from collections.abc import Iterator
+
+import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.failures import shorten
+from tests.sharing import run_folder
 
 # How long an example takes says more about what else the machine does than about the code, and how many of the first
 # ones are too large or left out is a matter of luck; where no example is left, that is an error all the same.
@@ -10,3 +16,17 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
 )
 settings.load_profile("wayside")
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)  # the outermost: it sees what the folders' own hooks add
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    report = yield
+    if isinstance(report, pytest.TestReport) and report.failed:
+        shorten(report, run_folder(item.config._tmp_path_factory) / "failures")
+    return report
+
+
+@pytest.hookimpl(trylast=True)  # once the folders' own hooks have made the groups
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that stay on one worker come first: begun last, the others would wait for them."""
+    items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)

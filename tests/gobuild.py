@@ -11,9 +11,10 @@ import hashlib
 import os
 import platform
 import subprocess
+import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,41 +73,44 @@ class GoModule:
         folder.mkdir(parents=True, exist_ok=True)
         with locked(folder / ".lock"):
             missing = [name for name in names or self.packages if not (folder / name).is_file()]
-            for number, name in enumerate(missing, start=1):
-                self._build(name, folder, f"{number} of {len(missing)}", console)
+            if missing:
+                self._build(missing, folder, console)
         return folder
 
-    def _build(self, name: str, folder: Path, which: str, console: Console) -> None:
+    def _build(self, names: Sequence[str], folder: Path, console: Console) -> None:
+        """Build all at once: Go compiles what they share only once, and links one while it compiles the next."""
+        what = ", ".join(names)
         try:
             go = find_go(cache() / "controlplane" / "go", console)
         except GoUnavailableError as error:
-            raise BuildError(f"{name} has to be built, which needs Go: {error}") from error
-        unfinished = folder / f".{name}.{os.getpid()}"
-        command = [str(go), "build", *self.flags, "-o", str(unfinished), self.packages[name]]
+            raise BuildError(f"{what} must be built, which needs Go: {error}") from error
         environment = os.environ | {"CGO_ENABLED": "0", "GOTOOLCHAIN": "local", "GOWORK": "off"}
         began = time.monotonic()
-        try:
-            with (
-                _progress(f"building {name} ({which}, once; the largest takes minutes)", console),
-                subprocess.Popen(
-                    command,
-                    cwd=self.source,
-                    env=environment,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT,
-                    text=True,
-                ) as build,
-            ):
-                output, _ = build.communicate()
-            if build.returncode != 0:
-                raise BuildError(
-                    f"building {name} failed (exit code {build.returncode}; needs the Go module proxy or a filled "
-                    f"module cache, about 2 GB of memory and 4 GB of disk):\n{output.strip()[-4000:]}"
-                )
-            unfinished.rename(folder / name)
-        finally:
-            unfinished.unlink(missing_ok=True)
-        console.print(f"built {name} ({which}) in {time.monotonic() - began:.0f} s", highlight=False)
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as unfinished:
+            # A program has the name of its package's folder, so those that want another name are built one by one.
+            together = [name for name in names if self.packages[name].rpartition("/")[2] == name]
+            commands = [[f"{unfinished}/", *(self.packages[name] for name in together)]] if together else []
+            commands += [[f"{unfinished}/{name}", self.packages[name]] for name in names if name not in together]
+            with _progress(f"building {what} (once, for minutes)", console):
+                for command in commands:
+                    done = subprocess.run(
+                        [str(go), "build", *self.flags, "-o", *command],
+                        cwd=self.source,
+                        env=environment,
+                        stdout=subprocess.PIPE,
+                        stderr=subprocess.STDOUT,
+                        text=True,
+                        check=False,
+                    )
+                    if done.returncode != 0:
+                        raise BuildError(
+                            f"building {what} failed (exit code {done.returncode}; needs the Go module proxy or a "
+                            "filled module cache, about 2 GB of memory and 4 GB of disk):\n"
+                            f"{done.stdout.strip()[-4000:]}"
+                        )
+            for name in names:
+                (Path(unfinished) / name).rename(folder / name)
+        console.print(f"built {what} in {time.monotonic() - began:.0f} s", highlight=False)
 
 
 def cache(environment: Mapping[str, str] = os.environ) -> Path:
@@ -120,6 +124,12 @@ def locked(path: Path) -> Iterator[None]:
     with path.open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield
+
+
+def apt_lock() -> AbstractContextManager[None]:
+    """Keep two runs of apt-get of ours apart: the lists of packages have a lock that apt-get does not wait for."""
+    cache().mkdir(parents=True, exist_ok=True)
+    return locked(cache() / ".apt")
 
 
 @contextmanager

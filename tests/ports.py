@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import random
 import socket
 
-# Below Linux's range for outgoing connections (32768 and up): while a server is down, no client's end takes its port.
-CANDIDATES = range(20_000, 32_000)
+FIRST, LAST = 20_000, 32_000
+"""Below Linux's range for outgoing connections (32768 and up): while a server is down, no client takes its port."""
+
+
+def candidates() -> range:
+    """The ports of this worker: each worker of a test run has its own, so no two find the same one free."""
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    return range(FIRST + worker, LAST, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
 
 def free_ports(count: int) -> list[int]:
     """Return different loopback TCP ports on which nothing listens now."""
     found: list[int] = []
-    for port in random.SystemRandom().sample(CANDIDATES, k=len(CANDIDATES)):
+    ports = candidates()
+    for port in random.SystemRandom().sample(ports, k=len(ports)):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
             try:
                 probe.bind(("127.0.0.1", port))
@@ -21,7 +29,7 @@ def free_ports(count: int) -> list[int]:
         found.append(port)
         if len(found) == count:
             return found
-    raise RuntimeError(f"no {count} free loopback ports between {CANDIDATES.start} and {CANDIDATES.stop}")
+    raise RuntimeError(f"no {count} free loopback ports between {FIRST} and {LAST}")
 
 
 def free_port() -> int:

@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from tests.gobuild import cache
+from tests.gobuild import apt_lock, cache
 
 _PACKAGE = "prometheus"
 
@@ -22,7 +22,9 @@ def find_promtool() -> Path:
     if (there := shutil.which("promtool")) is not None:
         return Path(there)
     cached = cache() / "promtool" / "promtool"
-    if not cached.is_file():
+    with apt_lock():
+        if cached.is_file():
+            return cached
         cached.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cached.parent) as folder:
             _unpack(Path(folder))

@@ -17,6 +17,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
+from tests.programs import PROGRAMS, Program
+
 _register_lock = threading.Lock()
 _reaper: subprocess.Popen[str] | None = None
 
@@ -25,18 +27,25 @@ class Child:
     """One process, from its start to its end; stdout and stderr go to the end of `log`."""
 
     def __init__(self, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str] | None = None):
-        """Start `command` with exactly this `environment` (default: that of the test run)."""
+        """Start `command` with exactly this `environment` (default: that of the test run).
+
+        A command that begins with the bare name of one of our programs is forked (see `tests.programs`).
+        """
         self.name = name
         self.log = log
-        with log.open("ab") as output:
-            self._process = subprocess.Popen(
-                list(command),
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+        self._process: Program | subprocess.Popen[bytes]
+        if command[0] in PROGRAMS:
+            self._process = Program(command, log, environment=environment)
+        else:
+            with log.open("ab") as output:
+                self._process = subprocess.Popen(
+                    list(command),
+                    env=environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                )
         _register(f"+{self.pid}")
 
     @property
@@ -87,6 +96,7 @@ class Child:
     def kill9(self) -> None:
         """Send SIGKILL to the whole process group, as a crash of its container would, and wait for the end."""
         self._kill_group()
+        self._process.kill()  # the group may be missing: a process that was just forked is in that of its parent
         self._process.wait()
 
     def resident_bytes(self) -> int:
@@ -101,13 +111,18 @@ class Child:
     def tail(self, lines: int = 40) -> str:
         """Return the last lines of the log under a heading, for messages."""
         state = "running" if self.alive else f"exit code {self.returncode}"
-        text = self.log.read_text(errors="replace").splitlines()[-lines:] if self.log.exists() else []
-        return "\n".join([f"--- {self.name} ({state}), end of {self.log}", *(text or ["(empty)"])])
+        return f"--- {self.name}: {state}\n{log_tail(self.log, lines)}"
 
     def _kill_group(self) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
         _register(f"-{self.pid}")
+
+
+def log_tail(log: Path, lines: int = 40) -> str:
+    """Return the last lines of a log under a heading, for messages."""
+    text = log.read_text(errors="replace").splitlines()[-lines:] if log.exists() else []
+    return "\n".join([f"--- end of {log}", *(text or ["(empty)"])])
 
 
 def remove_afterwards(folder: Path) -> None:

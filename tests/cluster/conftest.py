@@ -1,6 +1,7 @@
-"""The fixtures of the cluster tests: one control plane a session, one namespace a test.
+"""The fixtures of the cluster tests: one control plane for all workers of a run, one namespace a test.
 
-Every test in this folder has the marker `cluster`. When one fails, the ends of the logs of its processes are part of
+Every test in this folder has the marker `cluster`. Those with the marker `own_control_plane` run on one of their own,
+one after the other on one worker. When one fails, the ends of the logs of its processes are part of
 the report.
 """
 
@@ -12,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from tests.cluster.api import Api
-from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
-from tests.cluster.namespaces import fresh_namespace
+from tests.cluster.namespaces import new_namespace
 from tests.cluster.pods import kubelet as playing_kubelet
 from tests.cluster.processes import Processes
+from tests.sharing import run_folder, shared
 
 HERE = Path(__file__).parent
 
@@ -26,6 +27,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.cluster)
+            if item.get_closest_marker("own_control_plane") is not None:
+                item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -43,24 +46,39 @@ def pytest_runtest_makereport(
 
 
 @pytest.fixture(scope="session")
-def control_plane(request: pytest.FixtureRequest) -> Iterator[ControlPlane]:
-    """A running control plane with Wayside's CRDs, the same for all tests of the session."""
-    capture = request.config.pluginmanager.getplugin("capturemanager")
-    if capture is None:
-        binaries = ensure_binaries()
-    else:
-        with capture.global_and_fixture_disabled():  # the first build takes minutes, which nobody should wait blindly
-            binaries = ensure_binaries()
-    with ControlPlane(binaries, CRDS) as running:
+def shared_control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
+    """A running control plane with Wayside's CRDs, the same for all tests of the run but those marked otherwise."""
+    folder = run_folder(tmp_path_factory)
+    with shared(folder, "control-plane", lambda: ControlPlane(crds=CRDS, logs=folder / "control-plane")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def own_control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
+    """One for the marked tests of a module: they stop it, or do what every namespace notices."""
+    with ControlPlane(crds=CRDS, logs=tmp_path_factory.mktemp("control-plane")) as running:
         yield running
 
 
 @pytest.fixture
-def namespace(control_plane: ControlPlane, request: pytest.FixtureRequest) -> Iterator[str]:
-    """A fresh namespace that has its default service account; deleted afterwards without waiting."""
-    control_plane.recover()
-    with fresh_namespace(control_plane.api(), request.node.name) as name:
-        yield name
+def control_plane(request: pytest.FixtureRequest) -> ControlPlane:
+    """The control plane of the test: the shared one or, with the marker, one of its own."""
+    own = request.node.get_closest_marker("own_control_plane") is not None
+    plane = request.getfixturevalue("own_control_plane" if own else "shared_control_plane")
+    assert isinstance(plane, ControlPlane)
+    if own:
+        plane.recover()  # from what the test before left stopped
+    return plane
+
+
+@pytest.fixture
+def namespace(control_plane: ControlPlane, request: pytest.FixtureRequest) -> str:
+    """A fresh namespace that has its default service account.
+
+    It goes with the control plane. Deleting hundreds of them would keep the controllers busy for minutes, and with them
+    the tests that wait for what Kubernetes collects.
+    """
+    return new_namespace(control_plane.api(), request.node.name)
 
 
 @pytest.fixture

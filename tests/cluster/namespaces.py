@@ -10,14 +10,20 @@ from contextlib import contextmanager
 from tests.cluster.api import Api, ApiError, Unreachable
 
 
-@contextmanager
-def fresh_namespace(api: Api, test: str) -> Iterator[str]:
-    """A namespace named after the test, with its default service account; deleted afterwards without waiting."""
+def new_namespace(api: Api, test: str) -> str:
+    """Make a namespace named after the test, with its default service account; return its name."""
     readable = re.sub(r"[^a-z0-9]+", "-", test.removeprefix("test_").lower()).strip("-")[:40].rstrip("-")
     name = f"{readable}-{secrets.token_hex(3)}"
     api.create({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}})
     # Admission refuses pods until their account exists.
     api.wait_for("ServiceAccount", "default", lambda _: True, namespace=name, what=f"{name} has its service account")
+    return name
+
+
+@contextmanager
+def fresh_namespace(api: Api, test: str) -> Iterator[str]:
+    """The same, deleted after the block without waiting: on a node its pods run, and benchmarks want it quiet."""
+    name = new_namespace(api, test)
     yield name
     try:
         api.delete("Namespace", name)

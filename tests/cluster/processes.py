@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 from tests.cluster.children import Child
 from tests.cluster.waiting import PATIENCE, wait_until
-
-BIN = Path(sys.executable).parent
+from tests.programs import BIN, PROGRAMS
 
 
 class Process:
@@ -128,7 +126,7 @@ class Processes:
         if name in self._all:
             raise ValueError(f"a process {name!r} exists already: give another name, or restart that one")
         script = BIN / command[0]
-        argv = [str(script) if script.exists() else command[0], *command[1:]]
+        argv = [str(script) if script.exists() and command[0] not in PROGRAMS else command[0], *command[1:]]
         # A program's own output must not sit in a buffer while a test waits for it.
         everything = os.environ | {"PYTHONUNBUFFERED": "1"} | self.environment | dict(environment or {})
         process = Process(name, argv, self.folder / f"{name}.log", everything)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 
+from tests import programs
 from tests.cluster.api import Api, Object
 from tests.cluster.controlplane import ControlPlane
 
@@ -20,13 +19,8 @@ def rule(name: str, classification: dict[str, list[str]] | None) -> Object:
 
 
 def catalog(kubeconfig: Path, namespace: str, *options: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "detector.cli", "catalog", "--cluster", "--namespace", namespace, *options],
-        env={**os.environ, "KUBECONFIG": str(kubeconfig)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = ("detector", "catalog", "--cluster", "--namespace", namespace, *options)
+    return programs.run(*command, environment={"KUBECONFIG": str(kubeconfig)})
 
 
 def test_the_rules_of_the_namespace_are_listed_and_those_of_others_are_not(

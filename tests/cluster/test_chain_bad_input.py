@@ -19,6 +19,7 @@ from random import Random
 import pytest
 import yaml
 
+from tests import programs
 from tests.cluster.api import Api, Object
 from tests.cluster.chain import (
     BETWEEN,
@@ -39,8 +40,7 @@ from tests.cluster.chain import (
     untouched,
 )
 from tests.cluster.managed_world import condition
-from tests.cluster.processes import BIN, Process, Processes
-from tests.cluster.waiting import PATIENCE
+from tests.cluster.processes import Process, Processes
 from tests.unit.ros_messages import cdr, pose_stamped
 
 HOUR = 3600  # s
@@ -267,13 +267,4 @@ def test_a_detector_that_is_not_in_the_cluster_is_waited_for_and_that_is_said(ch
 
 def command(*arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run `detector` to its end, without a cluster."""
-    environment = {**os.environ, "KUBECONFIG": os.devnull}
-    return subprocess.run(
-        [str(BIN / "detector"), *arguments],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        cwd=folder,
-        env=environment,
-        check=False,
-    )
+    return programs.run("detector", *arguments, environment={"KUBECONFIG": os.devnull}, folder=folder)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +11,7 @@ import pytest
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import read_intake
+from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.chain import (
     BETWEEN,
@@ -32,7 +31,7 @@ from tests.cluster.chain import (
 )
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.processes import Processes
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
 from wayside.times import parse_time
 
 SECOND = 10**9  # ns
@@ -98,6 +97,7 @@ def test_after_its_lease_a_killed_detectors_demand_is_released_and_counts_again_
     chain.settled()
 
 
+@pytest.mark.own_control_plane
 def test_an_outage_of_the_api_server_releases_nothing_and_loses_nothing(
     chain: Chain, vehicles: Vehicles, control_plane: ControlPlane
 ) -> None:
@@ -129,6 +129,7 @@ def test_an_outage_of_the_api_server_releases_nothing_and_loses_nothing(
     assert running.alive
 
 
+@pytest.mark.own_control_plane
 def test_a_detector_ends_and_starts_while_the_api_server_is_away(
     chain: Chain, vehicles: Vehicles, control_plane: ControlPlane
 ) -> None:
@@ -200,13 +201,7 @@ def test_the_intake_of_a_killed_detector_can_be_replayed_up_to_the_cut(
     wait_until(lambda: newest(intake), lambda time: time > until, what="the intake file has the end of the episode")
     running.kill9()
     replayed = tmp_path / "replayed"
-    done = subprocess.run(
-        [sys.executable, "-m", "detector.cli", "replay", str(intake), "--output", str(replayed)],
-        check=True,
-        timeout=PATIENCE,
-        capture_output=True,
-        text=True,
-    )
+    done = programs.run("detector", "replay", intake, "--output", replayed, check=True)
     assert "its detector was killed" in done.stderr
     live = (chain.folder / "events.jsonl").read_bytes()
     assert (replayed / "events.jsonl").read_bytes() == live

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import os
 import re
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ import yaml
 from application_manager.core.objects.detectors import detector_objects
 from application_manager.core.objects.poddefaults import PodDefaults, parse_environment
 from application_manager.core.objects.sidecars import SIDECAR_LABEL, addition
-from tests.cluster.processes import BIN
+from tests import programs
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import CHART, Helm, HelmError, Rendered, Values
 from wayside.api import Detector
@@ -38,13 +36,8 @@ def helm(tmp_path_factory: pytest.TempPathFactory) -> Helm:
 
 
 def printed(command: str, *arguments: str) -> list[Object]:
-    done = subprocess.run(
-        [str(BIN / "application-manager"), command, *arguments],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"KUBECONFIG": "/nonexistent"},
-    )
+    environment = {"KUBECONFIG": "/nonexistent"}
+    done = programs.run("application-manager", command, *arguments, check=True, environment=environment)
     return list(yaml.safe_load_all(done.stdout))
 
 

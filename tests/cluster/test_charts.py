@@ -19,7 +19,7 @@ VALUES = {"sources": "${parameters.sources}", "image": "app:2"}
 
 
 @pytest.fixture(scope="session")
-def tools(control_plane: object) -> Tools:
+def tools() -> Tools:
     return ensure_tools()
 
 

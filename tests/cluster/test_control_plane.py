@@ -179,12 +179,14 @@ class TestRoleBasedAccess:
 
 
 class TestOutage:
+    @pytest.mark.own_control_plane
     def test_the_data_outlives_the_api_server(self, control_plane: ControlPlane, api: Api) -> None:
         before = api.create(configmap("there"))
         with control_plane.outage(), pytest.raises(Unreachable):
             api.get("ConfigMap", "there")
         assert api.get("ConfigMap", "there") == before
 
+    @pytest.mark.own_control_plane
     def test_the_controllers_go_on_soon_after_it(self, control_plane: ControlPlane, api: Api) -> None:
         before = control_plane.controller_manager
         with control_plane.outage():
@@ -193,6 +195,7 @@ class TestOutage:
         api.apply(deployment("app"))
         api.wait_list("Pod", lambda pods: len(pods) == 2, what="the controllers make pods again")
 
+    @pytest.mark.own_control_plane
     def test_what_a_failed_test_left_stopped_is_started_for_the_next(
         self, control_plane: ControlPlane, api: Api
     ) -> None:

@@ -184,6 +184,7 @@ def test_one_that_was_taken_over_holds_no_more(
     wait_until(lambda: caplog.text, lambda text: "pod-2 has taken over" in text, what="it is said")
 
 
+@pytest.mark.own_control_plane
 def test_an_outage_does_not_take_it_away(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:

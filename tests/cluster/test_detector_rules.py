@@ -142,6 +142,7 @@ def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
     assert following.rules.problems == {}
 
 
+@pytest.mark.own_control_plane
 def test_what_changed_during_an_outage_is_seen_after_it(
     control_plane: ControlPlane, api: Api, following: Following
 ) -> None:

@@ -190,6 +190,7 @@ def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: Run
     assert not running.counts.refused
 
 
+@pytest.mark.own_control_plane
 def test_an_outage_delays_starts_and_ends_and_loses_none(
     control_plane: ControlPlane, api: Api, namespace: str, running: Running
 ) -> None:
@@ -209,6 +210,7 @@ def test_an_outage_delays_starts_and_ends_and_loses_none(
             assert task["spec"]["endTime"] == "2026-01-01T00:00:01.123456789Z"
 
 
+@pytest.mark.own_control_plane
 def test_an_end_that_a_stopped_detector_could_not_tell_is_told_by_the_next(
     control_plane: ControlPlane, api: Api, namespace: str
 ) -> None:

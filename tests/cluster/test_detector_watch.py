@@ -80,6 +80,7 @@ def test_all_is_listed_again_after_the_resync_period(api: Api, namespace: str, l
     assert following.data == {"a": "1"}
 
 
+@pytest.mark.own_control_plane
 def test_what_happens_around_an_outage_is_not_missed(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:
@@ -97,6 +98,7 @@ def test_what_happens_around_an_outage_is_not_missed(
     following.wait(b="2")
 
 
+@pytest.mark.own_control_plane
 def test_history_that_the_server_no_longer_has_is_told_as_such(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 from typing import Any
 
 import pytest
 
 from application_manager.core.claims.claims import instance_name
+from tests import programs
 from tests.cluster.api import Api, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import start_manager, task, template, wait_settled
@@ -51,9 +50,8 @@ def columns(control_plane: ControlPlane, api: Api, what: str, name: str) -> dict
 
 
 def explain(control_plane: ControlPlane, api: Api, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "application_manager.cli", "explain", *arguments, "-n", api.namespace]
     environment = {"KUBECONFIG": str(control_plane.kubeconfig)}
-    return subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+    return programs.run("application-manager", "explain", *arguments, "-n", api.namespace, environment=environment)
 
 
 def wait_column(control_plane: ControlPlane, api: Api, what: str, name: str, **cells: str) -> None:

@@ -13,13 +13,15 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import condition, config, deployment, start_manager, task, template, wait_settled
 from tests.cluster.processes import Process, Processes
 
+pytestmark = pytest.mark.own_control_plane  # the manager here serves all namespaces
+
 BAD = instance_name("bad", "north")
 
 
 @pytest.fixture(scope="module")
-def manager(control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
+def manager(own_control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     """One for all these tests and their namespaces: that it survives each of them is part of what they show."""
-    processes = Processes(tmp_path_factory.mktemp("logs"), {"KUBECONFIG": str(control_plane.kubeconfig)})
+    processes = Processes(tmp_path_factory.mktemp("logs"), {"KUBECONFIG": str(own_control_plane.kubeconfig)})
     yield start_manager(processes)
     processes.kill_all()
 

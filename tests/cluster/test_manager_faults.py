@@ -92,6 +92,7 @@ def test_a_manager_killed_amid_a_hundred_tasks_finishes_when_it_is_back(api: Api
     api.wait_list("Deployment", lambda found: len(found) == 40, what="the demanded 40 are there and no more")
 
 
+@pytest.mark.own_control_plane
 def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process, control_plane: ControlPlane) -> None:
     api.create(template())
     # In the end the holder's Lease lapses after 25 s; the outage takes 30, in which it cannot be renewed.

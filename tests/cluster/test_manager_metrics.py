@@ -6,6 +6,7 @@ import urllib.error
 import urllib.request
 from datetime import UTC, datetime, timedelta
 
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from application_manager.measures import PREFIX
@@ -69,6 +70,7 @@ def test_what_becomes_of_tasks_is_counted_and_timed_from_their_events(
     assert found["api_reached",] == 1
 
 
+@pytest.mark.own_control_plane
 def test_while_the_api_server_is_away_the_manager_is_healthy_but_not_ready(
     processes: Processes, namespace: str, api: Api, control_plane: ControlPlane
 ) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 import copy
 import itertools
-import os
 import re
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -21,12 +19,13 @@ from application_manager.cluster.entitlement import lacking
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.objects.policy import DEFAULT_PLURALS, Policy
 from application_manager.core.objects.rights import lease_rights, rights, roles
+from tests import programs
 from tests.cluster.api import Api, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import Seen, faulty_proxy
 from tests.cluster.managed_world import condition, config, deployment, end, start_manager, task, template, wait_settled
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
-from tests.cluster.processes import BIN, Processes
+from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 
 KINDS = ("apps/v1/Deployment", "v1/ConfigMap")
@@ -40,10 +39,8 @@ Verb = tuple[str, str, str]
 
 def printed(*arguments: str) -> list[Object]:
     """What the command prints, without any cluster at hand."""
-    command = [str(BIN / "application-manager"), "rbac", *arguments]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=True, env=os.environ | {"KUBECONFIG": "/nonexistent"}
-    )
+    environment = {"KUBECONFIG": "/nonexistent"}
+    done = programs.run("application-manager", "rbac", *arguments, check=True, environment=environment)
     return list(yaml.safe_load_all(done.stdout))
 
 
@@ -191,6 +188,7 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
     assert asked <= granted(manifests)
 
 
+@pytest.mark.own_control_plane
 def test_it_lives_on_a_cluster_role(
     api: Api, processes: Processes, namespace: str, account: Path, control_plane: ControlPlane
 ) -> None:

@@ -7,6 +7,7 @@ import signal
 from pathlib import Path
 
 from application_manager.watchdog import STALLED
+from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.managed_world import start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
@@ -27,7 +28,7 @@ def test_a_manager_whose_event_loop_hangs_ends_and_another_takes_over(
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(HANGING)
     path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
-    command = ("application-manager", "run", "--namespace", namespace, "--stalled-after", "5s")
+    command = (programs.script("application-manager"), "run", "--namespace", namespace, "--stalled-after", "5s")
     hanging = processes.start(*command, "--metrics-port", str(free_port()), environment={"PYTHONPATH": path})
     hanging.wait_for_output("active: holds the Lease")
     standby = start_manager(processes, namespace)

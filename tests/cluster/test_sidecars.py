@@ -18,6 +18,7 @@ import yaml
 from application_manager.core.objects.detectors import object_name, sidecar_roles
 from application_manager.core.objects.rights import sidecar_rights
 from application_manager.core.objects.sidecars import CONTAINER
+from tests import programs
 from tests.cluster.api import Api, Object
 from tests.cluster.chain import CARS, FAR, HOLDER, NEAR, Vehicles
 from tests.cluster.controlplane import ControlPlane
@@ -391,8 +392,7 @@ def status_of(folder: Path, endpoint: str) -> list[str]:
     (file := folder / "detector.yaml").write_text(
         yaml.safe_dump(sidecar_detector("vehicle", zenoh={"mode": "peer", "listen": [endpoint]}))
     )
-    command = [str(BIN / "detector"), "status", "--detector", str(file), "--json", "--timeout", "30"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = programs.run("detector", "status", "--detector", file, "--json", "--timeout", "30", check=True)
     return [json.loads(line)["holder"] for line in done.stdout.splitlines()]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +9,12 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.chain import BUSES, CARS, FAR, HOLDER, NEAR, Chain, Vehicles, detector, rule, template
 from tests.cluster.managed_world import end, start_manager
 from tests.cluster.processes import Processes
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
 from tests.otlp import Received, Receiver
 from tests.ports import free_ports
 from wayside.times import parse_time
@@ -50,8 +49,7 @@ def wait_spans(receiver: Receiver, *names: str) -> dict[str, Received]:
 
 
 def replayed(intake: Path, output: Path, environment: dict[str, str]) -> str:
-    command = [sys.executable, "-m", "detector.cli", "replay", str(intake), "--output", str(output)]
-    subprocess.run(command, check=True, timeout=PATIENCE, env=environment)
+    programs.run("detector", "replay", intake, "--output", output, check=True, environment=environment)
     return (output / "events.jsonl").read_text(encoding="utf-8")
 
 

@@ -15,10 +15,11 @@ import yaml
 
 from application_manager.admission.authority import make_certificates
 from application_manager.core.findings.webhooks import Place, injection_configuration, webhook_configuration
+from tests import programs
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import config, start_manager, template
-from tests.cluster.processes import BIN, Process, Processes
+from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_port
 
@@ -106,8 +107,7 @@ class Webhook:
 
 def printed(*arguments: str) -> Object:
     """The object that `application-manager` prints."""
-    command = [str(BIN / "application-manager"), *arguments]
-    done: Any = yaml.safe_load(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    done: Any = yaml.safe_load(programs.run("application-manager", *arguments, check=True).stdout)
     assert isinstance(done, dict)
     return done
 

@@ -1,4 +1,4 @@
-"""The fixtures of the tests on a real node: one node a session, one namespace a test.
+"""The fixtures of the tests on a real node: one node, one namespace a test, one test at a time.
 
 Every test in this folder has the marker `e2e`. They are skipped where the machine does not let us have a node: where
 the tests do not run as root, or in a container without privileges. Elsewhere, what cannot be had is a failure.
@@ -33,6 +33,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.e2e)
+            item.add_marker(pytest.mark.xdist_group("node"))
             if (reason := why_no_node()) is not None:
                 item.add_marker(pytest.mark.skip(reason=reason))
 

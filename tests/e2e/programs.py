@@ -10,13 +10,13 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
-from tests.cluster.binaries import BinariesUnavailableError, ensure_binaries
-from tests.gobuild import KUBERNETES, BuildError, GoModule
+from tests.gobuild import KUBERNETES, BuildError, GoModule, apt_lock
 
 MODULES = Path(__file__).parent / "modules"
 CONTAINERD = "github.com/containerd/containerd/v2/cmd"
@@ -37,7 +37,7 @@ CONTAINERS = GoModule(
 NODE = GoModule(
     "node",
     MODULES / "kubernetes",
-    {name: f"k8s.io/kubernetes/cmd/{name}" for name in ("kube-scheduler", "kube-proxy", "kubelet")},
+    {name: f"k8s.io/kubernetes/cmd/{name}" for name in ("kube-proxy", "kubelet")},
     KUBERNETES,
 )
 COREDNS = GoModule("coredns", MODULES / "coredns", {"coredns": "."})
@@ -82,7 +82,7 @@ def ensure_programs(console: Console | None = None) -> Programs:
         ProgramsUnavailableError: something cannot be had, with the remedy.
     """
     console = console or Console(stderr=True)
-    _install(console)
+    install(console)
     try:
         folders = [module.ensure(console) for module in (CONTAINERS, NODE, COREDNS, PAUSE)]
     except BuildError as error:
@@ -90,10 +90,15 @@ def ensure_programs(console: Console | None = None) -> Programs:
     return Programs(*folders[:2], folders[2] / "coredns", folders[3] / "pause")
 
 
-def _install(console: Console) -> None:
-    missing = sorted(package for name, package in PACKAGES.items() if shutil.which(name, path=SYSTEM_PATH) is None)
-    if not missing:
-        return
+def install(console: Console) -> None:
+    """Install those of Debian's packages that are missing. Raises ProgramsUnavailableError."""
+    with apt_lock():
+        missing = sorted(package for name, package in PACKAGES.items() if shutil.which(name, path=SYSTEM_PATH) is None)
+        if missing:
+            _install(missing, console)
+
+
+def _install(missing: Sequence[str], console: Console) -> None:
     told = f"the node needs {', '.join(missing)}: apt-get install {' '.join(missing)} as root, or your system's own way"
     if os.geteuid() != 0 or shutil.which("apt-get") is None:
         raise ProgramsUnavailableError(told)
@@ -109,16 +114,15 @@ def _install(console: Console) -> None:
 
 
 def main() -> int:
-    """Provide all that `make e2e` runs; nothing where there can be no node."""
+    """Provide what a node runs beside its control plane; nothing where there can be no node."""
     from tests.e2e.privileges import why_no_node  # which looks at the node's enclosure, and that is above us
 
     if (reason := why_no_node()) is not None:
         print(f"nothing is built for the tests on a real node, which are skipped: {reason}")
         return 0
     try:
-        ensure_binaries()
         print(ensure_programs().containers.parent.parent)
-    except (BinariesUnavailableError, ProgramsUnavailableError) as error:
+    except ProgramsUnavailableError as error:
         print(error, file=sys.stderr)
         return 1
     return 0

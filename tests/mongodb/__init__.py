@@ -10,15 +10,13 @@ Where it comes from, in this order:
 
 from __future__ import annotations
 
-import hashlib
 import os
-import platform
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,12 +25,10 @@ import pymongo
 from pymongo.errors import PyMongoError
 from rich.console import Console
 
-from tests.cluster.toolchain import GoUnavailableError, find_go
-from tests.gobuild import locked
+from tests.gobuild import BuildError, GoModule
 from tests.ports import free_port
 
-MODULE = Path(__file__).parent / "server"
-BUILD_FLAGS = ("-trimpath", "-buildvcs=false", "-ldflags", "-s -w")
+SERVER = GoModule("mongodb", Path(__file__).parent / "server", {"mongodb": "."})
 
 
 class ServerUnavailableError(Exception):
@@ -95,51 +91,11 @@ def _wait(server: MongoServer, process: subprocess.Popen[bytes], log: Path) -> N
 
 def ensure_server(console: Console | None = None) -> Path:
     """The program, built if it is not in the cache. Raises ServerUnavailableError."""
-    console = console or Console(stderr=True)
-    program = cache_folder() / "mongodb"
-    if program.is_file():
-        return program
-    program.parent.mkdir(parents=True, exist_ok=True)
-    with locked(program.parent / ".lock"):
-        if not program.is_file():
-            _build(program, console)
-    return program
-
-
-def cache_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """The folder of the program that is built from the present source, flags and platform."""
-    digest = hashlib.sha256()
-    for part in (
-        *((MODULE / name).read_bytes() for name in ("go.mod", "go.sum", "main.go")),
-        "\0".join(BUILD_FLAGS).encode(),
-        f"{platform.system()}/{platform.machine()}".encode(),
-    ):
-        digest.update(len(part).to_bytes(8, "big") + part)
-    base = environment.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "wayside" / "mongodb" / digest.hexdigest()[:16]
-
-
-def _build(program: Path, console: Console) -> None:
-    remedy = "set MONGODB_URI to a server that you have, or put mongod on the PATH"
     try:
-        go = find_go(program.parent.parent.parent / "controlplane" / "go", console)
-    except GoUnavailableError as error:
-        raise ServerUnavailableError(
-            f"a MongoDB server has to be built, which needs Go ({error}); or {remedy}"
-        ) from error
-    unfinished = program.with_name(f".mongodb.{os.getpid()}")
-    console.print("building a MongoDB server (FerretDB, once; about a minute)", highlight=False)
-    began = time.monotonic()
-    environment = os.environ | {"CGO_ENABLED": "0", "GOTOOLCHAIN": "local", "GOWORK": "off"}
-    command = [str(go), "build", *BUILD_FLAGS, "-o", str(unfinished), "."]
-    try:
-        done = subprocess.run(command, cwd=MODULE, env=environment, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise ServerUnavailableError(f"building it failed; {remedy}:\n{(done.stdout + done.stderr)[-4000:]}")
-        unfinished.rename(program)
-    finally:
-        unfinished.unlink(missing_ok=True)
-    console.print(f"built it in {time.monotonic() - began:.0f} s", highlight=False)
+        return SERVER.ensure(console or Console(stderr=True)) / "mongodb"
+    except BuildError as error:
+        remedy = "set MONGODB_URI to a server that you have, or put mongod on the PATH"
+        raise ServerUnavailableError(f"there is no MongoDB server; {remedy}. {error}") from error
 
 
 def main() -> int:

@@ -11,11 +11,12 @@ import pytest
 
 from tests.mongodb import MongoServer, running
 from tests.mongodb.way import Way
+from tests.sharing import run_folder, shared
 
 
 @pytest.fixture(scope="session")
-def mongodb() -> Iterator[MongoServer]:
-    with running() as started:
+def mongodb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MongoServer]:
+    with shared(run_folder(tmp_path_factory), "mongodb", running) as started:
         yield started
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Callable
@@ -17,6 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from detector.status.model import Status, read_status
 from detector.streams.asking import NoAnswerError, ask
+from tests import programs
 from tests.ports import free_port
 from tests.unit.driving import a_detector
 from wayside.api import Kind
@@ -45,10 +44,7 @@ class Process:
 
     def start(self, *options: str) -> None:
         files = [*options, "--detector", "detector.yaml", "--rules", "rules.yaml", "--metrics-port", str(self.port)]
-        log = (self.folder / "log").open("w")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "detector.cli", "run", *files], cwd=self.folder, stderr=log
-        )
+        self.process = programs.Program(["detector", "run", *files], self.folder / "log", folder=self.folder)
         self.status_when(lambda status: bool(status.rules))
         config = zenoh.Config()
         for key, value in (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests import programs
 from tests.helm import ensure_tools
 from tests.helm.charts import APPLICATION, HOOK, write_chart
 
@@ -44,8 +44,7 @@ def render(folder: Path, helm: str, manifests: list[Mapping[str, Any]]) -> subpr
     (folder / "app.yaml").write_text(yaml.safe_dump_all(manifests))
     files = ["--templates", "app.yaml", "--tasks", "app.yaml"]
     options = ["--helm", helm, "--chart-folder", str(folder / "charts"), "--chart-cache", str(folder / "cache")]
-    command = [sys.executable, "-m", "application_manager.cli", "render", *files, *options]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    return programs.run("application-manager", "render", *files, *options, folder=folder)
 
 
 def test_what_a_chart_makes_of_the_merged_values_is_printed(helm: Path, tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 
 from detector.status.model import RuleState, Status, read_status
 from detector.streams.asking import NoAnswerError, ask
+from tests import programs
 from tests.process.running import PATIENCE, Process
 from tests.unit.driving import a_rule, a_stream
 
@@ -66,13 +66,7 @@ def test_a_rule_is_asked_paused_and_resumed_by_commands(process: Process) -> Non
     process.status_when(lambda s: len(s.rules) == 2 and s.streams[1].samples == 1)
 
     def command(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "detector.cli", *words, "--detector", "detector.yaml"],
-            cwd=process.folder,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        return programs.run("detector", *words, "--detector", "detector.yaml", folder=process.folder)
 
     answer = json.loads(command("evaluate", "asked").stdout)
     assert (answer["subject"], answer["when"], answer["values"]) == ("car1", True, {"v": 20})

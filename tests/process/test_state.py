@@ -7,8 +7,6 @@ import json
 import logging
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,6 +25,7 @@ from detector.engine.episodes.subjects import Subject
 from detector.restoring import what_was_open
 from detector.state import StateFile, state_file
 from detector.streams.zenoh import open_session
+from tests import programs
 from tests.ports import free_endpoint
 from tests.unit.driving import Drive, a_deploy, a_detector, a_rule, arrival, at
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -247,14 +246,9 @@ def wait_for(reached: Callable[[], bool], what: str) -> None:
 
 
 @contextmanager
-def running(folder: Path, *options: str) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "detector.cli", "run", "--detector", str(folder / "detector.yaml")]
-    with (folder / "log").open("ab") as log:
-        process = subprocess.Popen(
-            [*command, "--rules", str(folder / "rules.yaml"), "--output", str(folder / "out"), *options],
-            stdout=log,
-            stderr=log,
-        )
+def running(folder: Path, *options: str) -> Iterator[programs.Program]:
+    files = ("--detector", folder / "detector.yaml", "--rules", folder / "rules.yaml", "--output", folder / "out")
+    process = programs.Program(["detector", "run", *map(str, files), *options], folder / "log")
     try:
         yield process
     finally:
@@ -299,8 +293,7 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
     assert ended["data"]["reason"] == "Until"
     for field in ("episode", "onsetTime", "startTime"):
         assert started["data"][field] == ended["data"][field]
-    command = [sys.executable, "-m", "detector.cli", "replay", str(tmp_path / "intake.mcap")]
-    subprocess.run([*command, "--output", str(tmp_path / "again")], check=True, capture_output=True)
+    programs.run("detector", "replay", tmp_path / "intake.mcap", "--output", tmp_path / "again", check=True)
     assert events_in(tmp_path / "again" / "events.jsonl") == events_in(events)[1:]
 
 

@@ -24,7 +24,7 @@ from types import TracebackType
 
 from tests.cluster.api import Api, ApiError, Unreachable
 from tests.cluster.binaries import Binaries, ensure_binaries
-from tests.cluster.children import Child, remove_afterwards
+from tests.cluster.children import Child, log_tail, remove_afterwards
 from tests.cluster.controlplane import commands
 from tests.cluster.controlplane.kubeconfig import new_token, write_kubeconfig
 from tests.cluster.controlplane.site import LOOPBACK, Site
@@ -39,19 +39,35 @@ class ControlPlane:
     """A control plane with data of its own; a context manager that starts and removes it.
 
     Attributes:
-        folder: its data, certificates and logs (`*.log`); gone after `stop()`.
+        folder: its data and certificates; gone after `stop()`.
+        logs: the folder of the programs' logs (`*.log`).
         kubeconfig: for an administrator (group system:masters).
         binaries: where its programs are, kubectl among them.
         refused_crds: why, by file name; empty unless a CRD is wrong.
         started_in: seconds that each program took to be ready.
     """
 
-    def __init__(self, binaries: Binaries | None = None, crds: Path | None = None, site: Site = LOOPBACK):
-        """Prepare; nothing runs yet. `crds`: the folder to install CRDs from; `site`: where it is to run."""
+    def __init__(
+        self,
+        binaries: Binaries | None = None,
+        crds: Path | None = None,
+        site: Site = LOOPBACK,
+        logs: Path | None = None,
+    ):
+        """Prepare; nothing runs yet.
+
+        Args:
+            binaries: its programs.
+            crds: the folder to install CRDs from.
+            site: where it is to run.
+            logs: a folder for the logs, which are kept; by default they go with its data.
+        """
         self.binaries = binaries or ensure_binaries()
         self.crds = crds
         self.folder = Path(tempfile.mkdtemp(prefix="wayside-controlplane-"))
         remove_afterwards(self.folder)
+        self.logs = logs or self.folder
+        self.logs.mkdir(exist_ok=True, parents=True)
         self.kubeconfig = self.folder / "kubeconfig"
         self.refused_crds: Mapping[str, ApiError] = {}
         self.started_in: dict[str, float] = {}
@@ -61,6 +77,10 @@ class ControlPlane:
         self._etcd: Child | None = None
         self._api_server: Child | None = None
         self._controller_manager: Child | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """A copy in another process is a way to what runs here: it can neither stop nor restart it."""
+        return self.__dict__ | {"_etcd": None, "_api_server": None, "_controller_manager": None}
 
     @property
     def url(self) -> str:
@@ -106,7 +126,7 @@ class ControlPlane:
         return self._child("etcd", commands.etcd(self._setup))
 
     def _child(self, name: str, command: list[str]) -> Child:
-        return Child(name, [*self._setup.site.enter, *command], self.folder / f"{name}.log")
+        return Child(name, [*self._setup.site.enter, *command], self.logs / f"{name}.log")
 
     def start_api_server(self) -> None:
         """Start the API server, on the same port and data as before, and wait until it is ready.
@@ -201,8 +221,7 @@ class ControlPlane:
 
     def tails(self, lines: int = 40) -> str:
         """Return the ends of all logs, for messages."""
-        children = (self._etcd, self._api_server, self._controller_manager)
-        return "\n".join(child.tail(lines) for child in children if child is not None)
+        return "\n".join(log_tail(log, lines) for log in sorted(self.logs.glob("*.log")))
 
     def memory(self) -> dict[str, int]:
         """Return the resident bytes of each running program."""

@@ -57,10 +57,10 @@ def pause_archive(program: Path, folder: Path) -> Path:
 def wayside_archive(folder: Path, console: Console | None = None) -> Path:
     """Write the image of the project as it is now, named WAYSIDE_IMAGE; return the archive. Raises ImageError."""
     console = console or Console(stderr=True)
+    base, libraries = lasting_layers(console)
     with tempfile.TemporaryDirectory(prefix="wayside-wheel-") as work:
         wheel = build_wheel(Path(work))
-        base = _base_layer(console)
-        layers = [base, _libraries_layer(console, base), _project_layer(wheel, Path(work), folder, base)]
+        layers = [base, libraries, _project_layer(wheel, Path(work), folder, base)]
     config = {
         "Env": ["PATH=/usr/local/bin:/usr/bin:/bin", "HOME=/tmp", "PYTHONUNBUFFERED=1", "PYTHONDONTWRITEBYTECODE=1"],
         "User": NOBODY,
@@ -83,6 +83,12 @@ def build_wheel(folder: Path) -> Path:
     _run([sys.executable, "-m", "pip", "wheel", *options, str(source)])
     (wheel,) = folder.glob("wayside-*.whl")
     return wheel
+
+
+def lasting_layers(console: Console) -> tuple[Layer, Layer]:
+    """The layers that do not change with the project: from the cache, or made. Raises ImageError."""
+    base = _base_layer(console)
+    return base, _libraries_layer(console, base)
 
 
 def _base_layer(console: Console) -> Layer:

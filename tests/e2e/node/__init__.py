@@ -251,7 +251,7 @@ class Node:
         scheduler = self._kubeconfig("kube-scheduler")
         self._start(
             "kube-scheduler",
-            str(programs / "kube-scheduler"),
+            str(self.binaries.kube_scheduler),
             f"--kubeconfig={scheduler}",
             f"--authentication-kubeconfig={scheduler}",
             f"--authorization-kubeconfig={scheduler}",

@@ -1,0 +1,48 @@
+"""All that the tests build once, side by side: `python -m tests.builds`.
+
+`make test` runs it beside lint and the unit tests, which need none of it. What takes longest starts first.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+from rich.console import Console
+
+from tests import helm, mongodb
+from tests.cluster import binaries
+from tests.e2e import programs
+from tests.e2e.images import ImageError, lasting_layers
+from tests.e2e.privileges import why_no_node
+
+AT_ONCE = 2  # each compiles on all cores; a second one works while the first one links
+
+
+def image() -> int:
+    """Make the layers of the project's image that last; nothing where there can be no node to run it."""
+    if why_no_node() is not None:
+        return 0
+    console = Console(stderr=True)
+    try:
+        programs.install(console)
+        lasting_layers(console)
+    except (ImageError, programs.ProgramsUnavailableError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+BUILDS: tuple[Callable[[], int], ...] = (binaries.main, programs.main, image, helm.main, mongodb.main)
+"""Each prints what it provides, or why it cannot, and returns an exit code."""
+
+
+def main() -> int:
+    """Provide everything; 1 where something cannot be had."""
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        return max(pool.map(lambda build: build(), BUILDS))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
