@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -19,6 +20,8 @@ from application_manager.core.holders.leases import LeaseView
 from tests.unit.demand.test_manager_places import Manager
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask
+from wayside.api.applicationinstance import ApplicationInstanceStatus
+from wayside.api.base import Condition
 from wayside.times import format_seconds
 
 FULL: dict[str, Any] = {
@@ -96,22 +99,20 @@ def test_what_is_suspended_has_all_the_time_and_so_has_what_has_no_timeout() -> 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 100)), min_size=1, max_size=12))
 def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[tuple[bool, int]]) -> None:
     """Ready or not for so many seconds, one after the other; looked at each second, by a new manager each time."""
-    now, known, said = NOW, runs(), []
-    ready_since, previous = NOW, False
-    known = with_conditions(known, "False", NOW, [])
+    of, app, status = template(**FULL), runs(), ApplicationInstanceStatus()
+    now, ready_since, previous = NOW, NOW, False
+    timed_out: list[Condition] = []
+    said = []
     for is_ready, seconds in series:
         if is_ready != previous:
             previous, ready_since = is_ready, now
+        ready = condition("Ready", is_ready, ready_since)
         for _ in range(seconds):
-            status = [each for each in (known.status.conditions if known.status else []) if each.type == "TimedOut"]
-            known = with_conditions(known, "True" if is_ready else "False", ready_since, status)
-            beyond = bool(overdue(known, template(**FULL), now)[0])
+            seen = status.model_copy(update={"conditions": [ready, *timed_out]})
+            beyond = bool(overdue(app.model_copy(update={"status": seen}), of, now)[0])
             said.append((beyond, is_ready, now - ready_since))
-            if beyond or status:
-                flag = "True" if beyond else "False"
-                made = runs(TimedOut=(flag, 0)).status
-                assert made is not None
-                known = with_conditions(known, "True" if is_ready else "False", ready_since, made.conditions)
+            if beyond or timed_out:
+                timed_out = [condition("TimedOut", beyond, NOW)]
             now += 1
     for (before, _, _), (after, is_ready, lasts) in pairwise(said):
         if before != after:
@@ -119,10 +120,9 @@ def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[t
             assert is_ready == before  # it recovers while it is ready, and is overdue while it is not
 
 
-def with_conditions(of_: ApplicationInstance, ready: str, since: float, others: list[Any]) -> ApplicationInstance:
-    made = runs(Ready=(ready, NOW - since)).status
-    assert made is not None
-    return of_.model_copy(update={"status": made.model_copy(update={"conditions": [*made.conditions, *others]})})
+@cache
+def condition(type_: str, holds: bool, since: float) -> Condition:
+    return Condition(type=type_, status=str(holds), reason="R", last_transition_time=format_seconds(since))
 
 
 # --- What the demand turns to

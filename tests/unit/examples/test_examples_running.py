@@ -10,58 +10,55 @@ from pathlib import Path
 
 import pytest
 
-from examples.running.cases import folder_of, run, scenario_of, use_cases
+from detector import cli
+from examples.running.cases import Ran, folder_of, run, scenario_of, use_cases
 from examples.running.demanding import Running, unlike
 from examples.running.judging import judge
 from examples.running.playing import Played, play
 from examples.running.recording import write_recording
 from examples.running.scenario import Episode, Moment, Scenario
+from wayside import commandline
 
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.parametrize("name", use_cases())
-def test_a_use_case_gives_what_its_truth_says(name: str, tmp_path: Path) -> None:
-    ran = run(name, tmp_path)
+@pytest.fixture(scope="module", params=use_cases())
+def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """A use case that was run."""
+    return run(request.param, tmp_path_factory.mktemp(request.param))
+
+
+def test_a_use_case_gives_what_its_truth_says(ran: Ran) -> None:
     assert ran.verdict.problems == []
     assert ran.verdict.expected == ran.verdict.found > 0
     assert ran.verdict.actions_expected == ran.verdict.actions_done > 0
 
 
-@pytest.mark.parametrize("name", use_cases())
-def test_it_is_told_where_nothing_comes_of_a_use_case(name: str, tmp_path: Path) -> None:
-    scenario = scenario_of(name)
-    problems = judge(scenario, Played(tmp_path), folder_of(name)).problems
+def test_it_is_told_where_nothing_comes_of_a_use_case(ran: Ran, tmp_path: Path) -> None:
+    problems = judge(ran.scenario, Played(tmp_path), folder_of(ran.name)).problems
     assert {each.split(" of ")[0] for each in problems if " starts never; expected: " in each} == {
-        each.rule for each in scenario.episodes
+        each.rule for each in ran.scenario.episodes
     }
     assert {each.split(" was done 0 times")[0] for each in problems if " was done 0 times" in each} == {
-        *scenario.actions
+        *ran.scenario.actions
     }
 
 
-@pytest.mark.parametrize("name", use_cases())
-def test_a_use_case_is_told_with_its_picture_and_files(name: str) -> None:
-    folder = folder_of(name)
+def test_a_use_case_is_told_with_its_picture_and_files(ran: Ran) -> None:
+    folder, picture = folder_of(ran.name), ran.scenario.picture_file
     readme = (folder / "README.md").read_text(encoding="utf-8")
-    scenario = scenario_of(name)
-    assert f"]({scenario.picture_file})" in readme
-    assert f"examples.running {name}" in readme
-    assert (folder / scenario.picture_file).read_text(encoding="utf-8") == scenario.picture()
+    assert f"]({picture})" in readme
+    assert f"examples.running {ran.name}" in readme
+    assert (folder / picture).read_text(encoding="utf-8") == ran.scenario.picture()
 
 
 @pytest.mark.parametrize("name", use_cases())
-def test_its_files_are_accepted_without_a_word(name: str) -> None:
+def test_its_files_are_accepted_without_a_word(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     files = sorted(map(str, folder_of(name).glob("*.yaml")))
-    done = subprocess.run(
-        [sys.executable, "-m", "detector.cli", "check", *files],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert (done.returncode, done.stdout) == (0, "")
-    assert "nothing wrong" in done.stderr
+    assert commandline.run(cli.app, "detector", (), ["check", *files]) == 0
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "nothing wrong" in said.err
 
 
 def test_the_guide_tells_of_all_of_them() -> None:
