@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import random
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from application_manager.core.claims.operations import Standing
 from application_manager.core.demand.demand import Outcome, demand
@@ -136,60 +133,6 @@ def test_numbers_equal_by_value_agree_and_merge_into_one_item() -> None:
     )
     assert only(outcome).parameters["n"] == 1
     assert only(outcome).parameters["list"] == [None, False, True, 1, "1", [2], {"k": 0}]
-
-
-values = st.fixed_dictionaries(
-    {"region": st.sampled_from(["n", "s"])},
-    optional={
-        "sources": st.lists(st.sampled_from("abcd"), max_size=3),
-        "rateHz": st.sampled_from([1, 2.5, 30, 50.0]),
-        "delay": st.integers(-3, 3),
-        "mode": st.sampled_from(["x", "y"]),
-        "model": st.sampled_from(["small", "large"]),
-    },
-)
-task_lists = st.lists(st.tuples(values, st.integers(0, 2), st.integers(0, 3)), max_size=8).map(
-    lambda rows: [task(f"t{i}", row, priority=p, created=c) for i, (row, p, c) in enumerate(rows)]
-)
-
-
-@given(task_lists, st.randoms())
-def test_the_order_of_arrival_does_not_matter(tasks: list[Any], source: random.Random) -> None:
-    shuffled = list(tasks)
-    source.shuffle(shuffled)
-    assert of(*shuffled) == of(*tasks)
-
-
-@given(task_lists, values)
-def test_a_task_that_comes_and_goes_leaves_nothing_behind(tasks: list[Any], extra: dict[str, Any]) -> None:
-    before = of(*tasks)
-    instances = [
-        instance(each.name, key=each.key, parameters=dict(each.parameters or {})) for each in before.instances.values()
-    ]
-    ended = task("extra", extra, priority=2, ended=True)
-    after = of(*tasks, ended, instances=instances)
-    assert {name: each.parameters for name, each in after.instances.items()} == {
-        name: each.parameters for name, each in before.instances.items()
-    }
-
-
-@given(task_lists)
-def test_the_same_demand_twice_changes_no_value(tasks: list[Any]) -> None:
-    twins = [each.model_copy(update={"metadata": each.metadata.model_copy(update={"name": f"{each.name}-twin"})})
-             for each in tasks]  # fmt: skip
-    once, twice = of(*tasks), of(*tasks, *twins)
-    assert {n: d.parameters for n, d in once.instances.items()} == {n: d.parameters for n, d in twice.instances.items()}
-
-
-@given(task_lists)
-def test_every_live_task_is_either_served_or_told_why_not(tasks: list[Any]) -> None:
-    outcome = of(*tasks)
-    serving = {name: each.name for each in outcome.instances.values() for name in each.tasks}
-    for each in tasks:
-        verdict = outcome.verdicts[each.name]
-        assert (verdict.standing is Standing.COUNTS) == (each.name in serving)
-        assert verdict.instance == serving.get(each.name)
-        assert verdict.message
 
 
 # --- Refusals

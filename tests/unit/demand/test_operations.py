@@ -26,6 +26,7 @@ FUSION: dict[str, Any] = {
         "region": {"type": "string", "required": True},
         "sources": {"type": "array", "items": "string", "merge": "Union"},
         "rateHz": {"type": "number", "default": 10, "maximum": 50, "merge": "Max"},
+        "delay": {"type": "integer", "merge": "Min"},
         "load": {"type": "integer", "merge": "Sum", "maximum": 9},
         "model": {"type": "string"},
         "mode": {"type": "string", "merge": "HighestPriority"},
@@ -236,6 +237,7 @@ parameters = st.fixed_dictionaries(
     optional={
         "sources": st.lists(st.sampled_from("abc"), max_size=2),
         "rateHz": st.sampled_from([1, 2.5, 50]),
+        "delay": st.integers(-3, 3),
         "load": st.integers(0, 6),
         "model": st.sampled_from(["small", "large"]),
         "mode": st.sampled_from(["x", "y"]),
@@ -325,6 +327,12 @@ def test_every_task_is_told_what_became_of_it_and_none_but_deploy_makes_anything
     outcome = of(*live)
     assert outcome.verdicts.keys() == {each.name for each in live}
     assert all(each.message for each in outcome.verdicts.values())
+    serving = {name: each.name for each in outcome.instances.values() for name in each.tasks}
+    for each in live:
+        if each.spec.operation == "Deploy":
+            verdict = outcome.verdicts[each.name]
+            assert (verdict.standing is Standing.COUNTS) == (each.name in serving)
+            assert verdict.instance == serving.get(each.name)
     deployed = {each.spec.parameters["region"] for each in live if each.spec.operation == "Deploy"}
     assert {each.key for each in outcome.instances.values()} <= deployed
     for each in outcome.instances.values():

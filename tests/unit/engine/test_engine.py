@@ -173,12 +173,6 @@ def test_an_episode_whose_condition_stays_unknown_ends_as_unknown() -> None:
     assert told[0] == ["r car started 1", "r car Unknown 33"]  # by default, the Detector's clientTimeout
 
 
-def test_where_when_and_until_both_hold_nothing_starts() -> None:
-    drive = Drive(a_detector(), speeding(until="speed > 15"))
-    assert drive.take(speed(0.5, 20), until=3) == []
-    assert drive.take(speed(3.5, 12), until=4) == ["r car started 4"]
-
-
 # Changed rules
 
 

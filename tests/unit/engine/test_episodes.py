@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from detector.engine.episodes.episodes import (
@@ -136,41 +136,6 @@ def histories(draw: st.DrawFn) -> list[Moment]:
     return history
 
 
-@given(histories(), timings)
-def test_episodes_are_those_of_the_rules_read_over_the_whole_history(history: list[Moment], timing: Timing) -> None:
-    assert run(history, timing) == read(history, timing)
-
-
-@given(histories(), timings)
-def test_no_onset_falls_inside_the_cooldown_and_starts_and_ends_take_turns(
-    history: list[Moment], timing: Timing
-) -> None:
-    happenings = run(history, timing)
-    rests_until = 0
-    for index, (time, what) in enumerate(happenings):
-        assert what.startswith("started") == (index % 2 == 0)
-        if what.startswith("started"):
-            onset = int(what.split()[1])
-            assert rests_until <= onset <= time - timing.hold
-        else:
-            rests_until = time + timing.cooldown
-
-
-@given(histories(), timings)
-def test_where_when_and_until_both_hold_nothing_starts(history: list[Moment], timing: Timing) -> None:
-    both_hold = [Moment(m.time, replace(m.seen, when=True, until=True)) for m in history]
-    assert run(both_hold, timing) == []
-
-
-@given(histories(), timings)
-def test_nothing_starts_or_ends_at_a_moment_that_is_unknown_before_the_timeout(
-    history: list[Moment], timing: Timing
-) -> None:
-    unknown = {m.time for m in history if m.seen.in_scope is not False and m.seen.until is UNKNOWN}
-    patient = replace(timing, unknown_timeout=10**6)
-    assert not unknown & {time for time, _ in run(history, patient)}
-
-
 SEEN = Observation(in_scope=True, near=True, when=True, until=False)
 """An episode may start and go on."""
 
@@ -179,52 +144,34 @@ def seen(**fields: Truth) -> Observation:
     return replace(SEEN, **fields)
 
 
-def happened(timing: Timing, *observations: Observation) -> list[Happening]:
-    return run([Moment(time, each) for time, each in enumerate(observations)], timing)
+def second_by_second(*observations: Observation) -> list[Moment]:
+    return [Moment(time, each) for time, each in enumerate(observations)]
 
 
-def test_an_episode_starts_once_the_condition_has_held_and_tells_since_when() -> None:
-    assert happened(Timing(2, 0, 9), seen(when=False), *[SEEN] * 3) == [(3, "started 1")]
+UNDECIDED, LASTS = seen(when=UNKNOWN), seen(until=UNKNOWN)
+ENDS = seen(until=True)
 
 
-def test_an_unknown_as_long_as_for_keeps_the_onset_and_a_longer_one_does_not() -> None:
-    unknown = seen(when=UNKNOWN)
-    assert happened(Timing(2, 0, 9), SEEN, unknown, unknown, unknown, SEEN) == [(4, "started 0")]
-    assert happened(Timing(2, 0, 9), SEEN, *[unknown] * 4, SEEN, SEEN, SEEN) == [(7, "started 5")]
+@given(histories(), timings)
+@example(second_by_second(seen(when=False), SEEN, SEEN, SEEN), Timing(2, 0, 9))
+@example(second_by_second(SEEN, *[UNDECIDED] * 3, SEEN), Timing(2, 0, 9))
+@example(second_by_second(SEEN, *[UNDECIDED] * 4, SEEN, SEEN, SEEN), Timing(2, 0, 9))
+@example(second_by_second(SEEN, seen(near=UNKNOWN), SEEN), Timing(2, 0, 9))
+@example(second_by_second(SEEN, seen(near=False), SEEN), Timing(2, 0, 9))
+@example(second_by_second(SEEN, seen(near=False), ENDS), Timing(0, 0, 9))
+@example(second_by_second(SEEN, seen(in_scope=False, until=True)), Timing(0, 0, 9))
+@example(second_by_second(SEEN, seen(in_scope=UNKNOWN, until=True)), Timing(0, 0, 9))
+@example(second_by_second(SEEN, seen(in_scope=UNKNOWN), SEEN), Timing(0, 0, 9))
+@example(second_by_second(SEEN, LASTS, LASTS, SEEN, LASTS, LASTS, LASTS), Timing(0, 0, 2))
+@example(second_by_second(SEEN, SEEN, ENDS, *[SEEN] * 5), Timing(1, 3, 9))
+@example(second_by_second(*[ENDS] * 3), Timing(0, 0, 9))
+def test_episodes_are_those_of_the_rules_read_over_the_whole_history(history: list[Moment], timing: Timing) -> None:
+    assert run(history, timing) == read(history, timing)
 
 
-def test_an_unknown_distance_is_not_out_of_reach() -> None:
-    assert happened(Timing(2, 0, 9), SEEN, seen(near=UNKNOWN), SEEN) == [(2, "started 0")]
-    assert happened(Timing(2, 0, 9), SEEN, seen(near=False), SEEN) == []
-
-
-def test_reach_gates_only_the_start() -> None:
-    assert happened(Timing(0, 0, 9), SEEN, seen(near=False), seen(until=True)) == [(0, "started 0"), (2, "Until")]
-
-
-@pytest.mark.parametrize(
-    ("last", "reason"),
-    [
-        (seen(in_scope=False, until=True), Reason.OUT_OF_SCOPE),
-        (seen(until=True), Reason.UNTIL),
-        (seen(in_scope=UNKNOWN, until=True), Reason.UNTIL),
-    ],
-)
-def test_why_an_episode_ends(last: Observation, reason: Reason) -> None:
-    assert happened(Timing(0, 0, 9), SEEN, last) == [(0, "started 0"), (1, reason.value)]
-
-
-def test_an_unknown_that_lasts_ends_the_episode_and_one_that_is_interrupted_does_not() -> None:
-    unknown = seen(until=UNKNOWN)
-    assert happened(Timing(0, 0, 2), SEEN, unknown, unknown, SEEN, unknown, unknown, unknown) == [
-        (0, "started 0"),
-        (6, "Unknown"),
-    ]
-
-
-def test_the_cooldown_counts_from_the_end_and_an_onset_may_fall_on_its_last_moment() -> None:
-    history = [SEEN, seen(until=True), *[SEEN] * 5]
-    assert happened(Timing(1, 3, 9), SEEN, *history) == [(1, "started 0"), (2, "Until"), (6, "started 5")]
+def test_an_episode_from_its_onset_to_the_end_of_its_cooldown() -> None:
+    history = second_by_second(SEEN, SEEN, ENDS, *[SEEN] * 5)
+    assert run(history, Timing(1, 3, 9)) == [(1, "started 0"), (2, "Until"), (6, "started 5")]
 
 
 def test_after_a_gap_what_was_pending_begins_anew_and_what_is_open_stays_open() -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from detector import cli
+from examples.running.__main__ import main
 from examples.running.cases import Ran, folder_of, run, scenario_of, use_cases
 from examples.running.demanding import Running, unlike
 from examples.running.judging import judge
@@ -104,21 +104,17 @@ def test_what_runs_otherwise_is_told() -> None:
     assert list(unlike(dataclasses.replace(moment, suspended=["driving/b"]), asleep)) == []
 
 
-def test_the_command_says_what_differs_with_its_exit_code(tmp_path: Path) -> None:
-    def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "examples.running", *arguments],
-            check=False,
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=600,
-        )
+def test_the_command_says_what_differs_with_its_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def command(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["examples.running", *arguments])
+        return main()
 
-    unknown = command("no-such")
-    assert (unknown.returncode, unknown.stdout) == (2, "")
-    assert "no such use case: no-such" in unknown.stderr
-    right = command("battery-health", "--output", str(tmp_path))
-    assert right.returncode == 0, right.stdout + right.stderr
-    assert "as it must be" in right.stdout
+    assert command("no-such") == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "no such use case: no-such" in said.err
+    assert command("battery-health", "--output", str(tmp_path)) == 0
+    assert "as it must be" in capsys.readouterr().out
     assert (tmp_path / "battery-health" / "events.jsonl").is_file()
