@@ -151,6 +151,7 @@ def _write(file: Path, text: str) -> None:
 
 def _run(tests: Iterable[str], copy: Path) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(copy)}  # the copy's packages, also in processes that tests start
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # compiling everything each time takes longer than most tests
     return subprocess.run(
         [*_PYTEST, *tests], cwd=copy, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         check=False,

@@ -10,10 +10,11 @@ import yaml
 from detector.actions.notify import Notify
 from detector.checking import check_documents
 from tests.driving import a_detector
+from tests.guides import guide, yaml_blocks
 from wayside.api.actions.notify import Notify as Parameters
 from wayside.api.documents import DocumentError, load_documents
 
-GUIDE = Path(__file__).parents[3] / "docs" / "notify.md"
+GUIDE = guide("notify")
 HEAD = "apiVersion: wayside.dev/v1alpha1\nkind: EventRule\nmetadata: {name: r}\nspec:\n"
 SIGNAL = "  signals: [{name: v, stream: speed, value: msg.v}]\n  when: v > 1\n  actions:\n    - name: a\n      notify: "
 
@@ -29,7 +30,7 @@ def problems(folder: Path, rule: str) -> list[str]:
 
 
 def test_the_guides_rule_has_nothing_wrong(tmp_path: Path) -> None:
-    (example,) = (block.split("```")[0] for block in GUIDE.read_text().split("```yaml\n")[1:])
+    (example,) = yaml_blocks(GUIDE)
     assert len(yaml.safe_load(example)["actions"]) == 3
     assert problems(tmp_path, HEAD + "".join(f"  {line}\n" for line in example.splitlines())) == []
 

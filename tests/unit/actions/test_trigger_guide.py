@@ -9,13 +9,14 @@ import yaml
 
 from detector.actions.trigger.services import KNOWN
 from detector.checking import check_documents
+from tests.guides import guide, yaml_blocks
 from wayside.api.documents import load_documents
 
-GUIDE = (Path(__file__).parents[3] / "docs" / "trigger.md").read_text()
+GUIDE = guide("trigger")
 
 
 def test_the_examples_are_accepted(tmp_path: Path) -> None:
-    blocks = [block.split("```")[0] for block in GUIDE.split("```yaml\n")[1:]]
+    blocks = yaml_blocks(GUIDE)
     rule: dict[str, Any] = yaml.safe_load(blocks[0])
     for block in blocks[2:]:
         rule["spec"]["actions"] += yaml.safe_load(block)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +19,7 @@ from application_manager.core.objects.rights import detector_rights, merged, rig
 from application_manager.core.statuses.rulestatus import detector_status
 from application_manager.core.statuses.running import NOT_RUN, running
 from tests.cluster.manifests import DETECTOR
+from tests.guides import guide, yaml_blocks
 from tests.unit.manager_objects import NOW
 from wayside.api import Detector
 
@@ -235,8 +235,8 @@ def test_the_condition_goes_with_the_mode() -> None:
 
 
 def test_the_guide_shows_a_detector_that_keeps_its_files_and_what_resources_are_the_default() -> None:
-    guide = (Path(__file__).parents[3] / "docs" / "detectors.md").read_text(encoding="utf-8")
-    shown = yaml.safe_load(guide.partition("```yaml\n")[2].partition("```")[0])
+    text = guide("detectors")
+    shown = yaml.safe_load(yaml_blocks(text)[0])
     shown["metadata"] |= {"namespace": "site", "uid": "u-1"}
     one = Detector.model_validate(shown)
     assert mounted(one) == {
@@ -247,4 +247,4 @@ def test_the_guide_shows_a_detector_that_keeps_its_files_and_what_resources_are_
     }
     (container,) = pod(detector())["containers"]
     assert container["resources"] == {"requests": {"cpu": "100m", "memory": "256Mi"}, "limits": {"memory": "1Gi"}}
-    assert "requests of 100m and 256Mi, a limit of 1Gi" in guide
+    assert "requests of 100m and 256Mi, a limit of 1Gi" in text

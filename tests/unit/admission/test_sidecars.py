@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import copy
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,6 +22,7 @@ from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import CONTAINER, added, addition, patch, sidecar_pods
 from application_manager.core.statuses.running import carried
 from tests.cluster.manifests import DETECTOR
+from tests.guides import guide, yaml_blocks
 from wayside.api import Detector
 
 IMAGE = "wayside:1"
@@ -189,8 +189,8 @@ def test_its_folders_secrets_and_resources_are_as_of_a_standalone_detectors_pod(
 
 
 def test_the_guides_pod_gets_the_guides_detector() -> None:
-    section = Path("docs/detectors.md").read_text(encoding="utf-8").partition("## As a sidecar")[2]
-    of, asked = yaml.safe_load_all(section.partition("```yaml\n")[2].partition("```")[0])
+    section = guide("detectors").partition("## As a sidecar")[2]
+    of, asked = yaml.safe_load_all(yaml_blocks(section)[0])
     found = injection(asked["metadata"], asked["spec"], "default", Detector.model_validate(of), DEFAULTS)
     assert found.why_not is None
     assert found.addition is not None

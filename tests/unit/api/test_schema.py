@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from tests.guides import ROOT
 from wayside.api.__main__ import crd_files
 from wayside.api.classification import Classification
 
-CRDS = Path(__file__).parents[3] / "crds"
+CRDS = ROOT / "crds"
 
 FILES = crd_files()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 import yaml
@@ -15,6 +14,7 @@ from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.entitlement import judge
 from application_manager.core.objects.policy import DEFAULT_PLURALS, KindKey
 from application_manager.core.objects.rights import merged, rights, roles
+from tests.guides import guide
 
 DEPLOYMENT: KindKey = ("apps/v1", "Deployment")
 ACCOUNT = ("system", "manager")
@@ -96,10 +96,10 @@ def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.
 
 
 def test_the_guides_command_gives_what_the_guides_manager_needs() -> None:
-    guide = (Path(__file__).parents[3] / "docs" / "manager.md").read_text().replace("\\\n", " ")
+    text = guide("manager").replace("\\\n", " ")
     command, run = (
         shlex.split(line.partition("|")[0])[2:]
-        for line in guide.splitlines()
+        for line in text.splitlines()
         if re.match(r"\$ application-manager r[bu]", line)
     )
     assert (command[0], run[0]) == ("rbac", "run")

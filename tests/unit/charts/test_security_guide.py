@@ -10,9 +10,10 @@ import yaml
 
 from charts.generate import FILES
 from detector.status.metrics import DETECTOR
+from tests.guides import ROOT, guide
 
-TESTS = Path(__file__).parents[2]
-GUIDE = (TESTS.parent / "docs" / "security.md").read_text()
+TESTS = ROOT / "tests"
+GUIDE = guide("security")
 NAMED = re.findall(r"\b((?:unit|process|cluster|e2e)/[\w/]+\.py)::(\w+)", GUIDE)
 
 

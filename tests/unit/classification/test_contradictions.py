@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from detector.cli import app
 from tests.driving import POSITION, a_detector, a_rule, a_stream
+from tests.guides import guide
 from wayside import commandline
 from wayside.api.classification import Classification
 from wayside.api.scheme import SCHEME
@@ -29,7 +30,7 @@ DETECTOR = a_detector(
     database={"uriVariable": "WAYSIDE_DATABASE"},
 )
 
-GUIDE = Path(__file__).parents[3].joinpath("docs", "classification.md").read_text()
+GUIDE = guide("classification")
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
 PAIRS = {"pairs": {"position": POSITION, "within": 100}}

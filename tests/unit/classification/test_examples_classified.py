@@ -12,9 +12,10 @@ from detector.catalog.catalog import catalog
 from detector.catalog.document import json_view
 from detector.catalog.files import read_files
 from detector.checking import findings
+from tests.guides import ROOT
 from wayside.api.documents import load_documents
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
+EXAMPLES = ROOT / "examples"
 
 DIMENSIONS = (
     "Overarching Purpose",

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 import yaml
 from pydantic import ValidationError
 
+from tests.guides import guide, yaml_blocks
 from wayside.api.classification import Classification
 from wayside.api.scheme import SCHEME
 
-GUIDE = Path(__file__).parents[3].joinpath("docs", "classification.md").read_text()
+GUIDE = guide("classification")
 
 WORDS = {
     "Overarching Purpose": "safety, efficiency, user satisfaction",
@@ -58,7 +56,7 @@ def test_the_guides_table_is_the_scheme() -> None:
 
 
 def test_the_guides_example_is_a_classification() -> None:
-    (example,) = re.findall(r"^```yaml\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
+    (example,) = yaml_blocks(GUIDE)
     given = yaml.safe_load(example)["spec"]["classification"]
     assert Classification.model_validate(given).to_json() == given
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.demand import demand
+from tests.guides import guide, yaml_blocks
 from tests.unit.manager_objects import NOW, instance, task
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.times import format_seconds
 
-GUIDE = Path(__file__).parents[3] / "docs" / "limits.md"
-
 
 def documents() -> list[Any]:
-    blocks = GUIDE.read_text().split("```yaml\n")[1:]
-    return [yaml.safe_load(each.partition("```")[0]) for each in blocks]
+    return [yaml.safe_load(block) for block in yaml_blocks(guide("limits"))]
 
 
 def test_the_guides_template_serves_as_many_as_it_says_in_the_order_that_it_says() -> None:

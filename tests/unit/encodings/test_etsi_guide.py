@@ -9,13 +9,14 @@ from pathlib import Path
 from detector.checking import check_documents
 from detector.streams.codecs.etsi.messages import KINDS, PREFIX
 from detector.streams.codecs.etsi.quantities import UNITS
+from tests.guides import guide, yaml_blocks
 from wayside.api.documents import load_documents
 
-GUIDE = Path(__file__).parents[3] / "docs" / "etsi.md"
+GUIDE = guide("etsi")
 
 
 def rows(header: str) -> list[list[str]]:
-    table = GUIDE.read_text().partition(f"| {header} |")[2].partition("\n\n")[0]
+    table = GUIDE.partition(f"| {header} |")[2].partition("\n\n")[0]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
 
 
@@ -34,7 +35,7 @@ def test_the_table_of_messages_is_the_codes() -> None:
 
 
 def test_the_example_is_accepted(tmp_path: Path) -> None:
-    example = GUIDE.read_text().partition("```yaml\n")[2].partition("```")[0]
+    example = yaml_blocks(GUIDE)[0]
     file = tmp_path / "example.yaml"
     file.write_text(example)
     documents = load_documents([file])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.ros import types_with
 from detector.testing import run
 from tests.driving import Drive, a_detector, a_rule, at
+from tests.guides import guide, yaml_blocks
 from tests.unit.encodings import hostile
 from wayside.api import Detector
 from wayside.api.documents import DocumentError, load_documents
@@ -381,8 +381,7 @@ def test_a_definition_of_the_recording_that_lacks_a_part_is_told(tmp_path: Path)
 
 
 def test_the_documentation_s_examples_are_streams_that_run() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "encodings.md").read_text(encoding="utf-8")
-    examples = [yaml.safe_load(example) for example in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
+    examples = [yaml.safe_load(example) for example in yaml_blocks(guide("encodings"))]
     streams = [example for example in examples if "streams" in example]
     assert len(streams) >= 2
     for example in streams:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from tests.driving import Drive, a_detector, a_stream, arrival
+from tests.guides import guide, yaml_blocks
 from wayside.api import Detector, EventRule
 from wayside.rules import dependency_problems
-
-_PAGE = Path(__file__).parents[3] / "docs" / "evaluation.md"
 
 
 def documents(section: str) -> list[dict[str, Any]]:
     """The YAML documents of a section of the page, all blocks together."""
-    text = _PAGE.read_text().split(f"\n## {section}\n")[1].split("\n## ")[0]
-    blocks = [block.split("\n```")[0] for block in text.split("```yaml\n")[1:]]
-    return [document for block in blocks for document in yaml.safe_load_all(block)]
+    text = guide("evaluation").split(f"\n## {section}\n")[1].split("\n## ")[0]
+    return [document for block in yaml_blocks(text) for document in yaml.safe_load_all(block)]
 
 
 def detector() -> Detector:

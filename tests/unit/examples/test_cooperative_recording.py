@@ -23,6 +23,7 @@ from rosbags.highlevel import AnyReader
 
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
+from tests.guides import ROOT
 from tests.networks import PATIENCE
 from tests.ports import free_endpoint
 from tests.unit.manager_objects import instance
@@ -30,7 +31,7 @@ from wayside.api import ApplicationTemplate, Detector, EventRule, Kind
 from wayside.api.documents import load_documents
 from wayside.rules import compile_rule
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "cooperative-recording"
+EXAMPLE = ROOT / "examples" / "cooperative-recording"
 sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no package of ours
 
 from cooperative_recording.expected import (  # noqa: E402

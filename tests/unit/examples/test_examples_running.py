@@ -17,9 +17,8 @@ from examples.running.judging import judge
 from examples.running.playing import Played, play
 from examples.running.recording import write_recording
 from examples.running.scenario import Episode, Moment, Scenario
+from tests.guides import guide
 from wayside import commandline
-
-ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module", params=use_cases())
@@ -62,10 +61,10 @@ def test_its_files_are_accepted_without_a_word(name: str, capsys: pytest.Capture
 
 
 def test_the_guide_tells_of_all_of_them() -> None:
-    guide = (ROOT / "docs" / "use-cases.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"\(\.\./examples/([a-z-]+)\)", guide)) == set(use_cases())
+    text = guide("use-cases")
+    assert set(re.findall(r"\(\.\./examples/([a-z-]+)\)", text)) == set(use_cases())
     fields = {each.name for each in dataclasses.fields(Scenario)}
-    assert set(re.findall(r"^\| `(\w+)` \|", guide, re.MULTILINE)) <= fields
+    assert set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) <= fields
 
 
 def test_what_differs_is_told(tmp_path: Path) -> None:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 
 from application_manager.core.objects.following import ANNOTATION, behind, fingerprint, selectors
+from tests.guides import ROOT
 
-FILE = Path(__file__).parents[3] / "examples" / "live-configuration" / "follow.py"
+FILE = ROOT / "examples" / "live-configuration" / "follow.py"
 
 
 def pod(volume: dict[str, Any], *, told: str = "", **more: Any) -> dict[str, Any]:

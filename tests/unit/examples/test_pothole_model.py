@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import importlib
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnxruntime
 import pytest
 
-FOLDER = Path(__file__).parents[3] / "examples" / "pothole-detection"
+from tests.guides import ROOT
+
+FOLDER = ROOT / "examples" / "pothole-detection"
 
 
 @pytest.fixture(scope="module")

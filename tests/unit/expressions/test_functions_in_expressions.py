@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.guides import guide
 from wayside.expressions import UNKNOWN, Environment, EvaluationError, ExpressionError, Kind, Reason
 from wayside.expressions.functions import FUNCTIONS
 
@@ -173,7 +173,7 @@ def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str
 
 
 def test_every_function_is_documented_as_it_is_called_and_nothing_else() -> None:
-    text = Path(__file__).parents[3].joinpath("docs", "rules.md").read_text()
+    text = guide("rules")
     section = text.split("## Functions", 1)[1].split("\n## ", 1)[0]
     rows = re.findall(r"^\| `((\w+)\([^|]*\))` \|", section, re.MULTILINE)
     documented = {name: calls.replace("`, `", " or ") for calls, name in rows}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[3]
-GUIDE = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+from tests.guides import ROOT, guide
+
+GUIDE = guide("operations")
 SECTION = GUIDE.partition("## What happens when…\n")[2].partition("\n## ")[0]
 CASES = re.split(r"^(?=\*\*… )", SECTION, flags=re.MULTILINE)[1:]
 NAMED = re.compile(r"^- `(tests/\S+\.py)::(test_\w+)`$", re.MULTILINE)

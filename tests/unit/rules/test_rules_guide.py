@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
 from tests.driving import a_detector, a_rule, a_stream
+from tests.guides import guide, yaml_blocks
 from wayside.expressions import UNKNOWN, Environment, Kind
 from wayside.rules import CompiledRule, compile_rule
 
-GUIDE = Path(__file__).parents[3].joinpath("docs", "rules.md").read_text()
+GUIDE = guide("rules")
 STREAMS = ("pose", "speed", "camera-objects", "lidar-objects", "odometry", "scan", "image", "can")
 DETECTOR = a_detector(*({**a_stream(name), "key": f"v/${{client:*}}/{name}/${{sensor:*}}"} for name in STREAMS))
 MINE = ("Signals", "Parameters", "Functions")
@@ -26,7 +26,7 @@ def examples() -> list[tuple[str, dict[str, Any]]]:
         (title, yaml.safe_load(block))
         for section in sections
         if (title := section.partition("\n")[0]) in MINE
-        for block in re.findall(r"^```yaml\n(.*?)^```", section, re.MULTILINE | re.DOTALL)
+        for block in yaml_blocks(section)
     ]
 
 

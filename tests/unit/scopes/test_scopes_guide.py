@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival
+from tests.guides import guide, yaml_blocks
 from wayside.rules import compile_rule
 
-GUIDE = Path(__file__).parents[3].joinpath("docs", "scopes.md").read_text(encoding="utf-8")
+GUIDE = guide("scopes")
 STREAMS = [a_stream(name) for name in ("pose", "gnss", "odometry")]
 EXAMPLES: dict[str, dict[str, Any]] = {
     section.partition("\n")[0]: yaml.safe_load(block)
     for section in re.split(r"^## ", GUIDE, flags=re.MULTILINE)
-    for block in re.findall(r"^```yaml\n(.*?)^```", section, re.MULTILINE | re.DOTALL)
+    for block in yaml_blocks(section)
 }
 RULES = ("Pairs", "Fleet", "Each", "Parameters that follow")
 

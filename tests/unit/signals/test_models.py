@@ -18,6 +18,7 @@ from detector.checking import check_documents
 from detector.engine.samples.sample import Arrival
 from tests import onnx_models
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
+from tests.guides import guide, yaml_blocks
 from wayside.api import Detector, EventRule
 from wayside.api.documents import load_documents
 
@@ -342,8 +343,7 @@ def test_the_same_samples_give_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_the_documentations_example_is_a_rule_that_runs(tmp_path: Path) -> None:
-    text = Path("docs/models.md").read_text()
-    spec = yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])
+    spec = yaml.safe_load(yaml_blocks(guide("models"))[0])
     shapes = {"state": ["n", 2], "history": ["n", 20]}
     nodes = [
         helper.make_node("ReduceMean", ["state"], ["s"], axes=[1], keepdims=1),

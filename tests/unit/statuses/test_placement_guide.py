@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import yaml
 
 from application_manager.core.demand.demand import demand
@@ -11,15 +9,16 @@ from application_manager.core.demand.drafting import draft
 from application_manager.core.health.placement import misplaced
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
+from tests.guides import guide, yaml_blocks
 from tests.unit.manager_objects import NOW, task
 from wayside.api import ApplicationTemplate
 
-GUIDE = (Path(__file__).parents[3] / "docs" / "placement.md").read_text()
+GUIDE = guide("placement")
 NODES = {name: {"kubernetes.io/hostname": name} for name in ("rsu-1", "rsu-2")}
 
 
 def test_the_guides_template_is_placed_by_its_parameters() -> None:
-    raw = yaml.safe_load(GUIDE.split("```yaml\n")[1].partition("```")[0])
+    raw = yaml.safe_load(yaml_blocks(GUIDE)[0])
     raw["metadata"]["namespace"] = "site"
     template = ApplicationTemplate.model_validate(raw)
     live = task("a", {"node": "rsu-9"}, of=template.name)

@@ -1,6 +1,5 @@
 """The Detectors in docs/sources.md can run, as far as their examples go."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,12 +8,9 @@ import yaml
 from detector.assembly import inlets
 from detector.sources.registry import plugin_problems
 from tests.driving import a_detector
+from tests.guides import guide, yaml_blocks
 
-GUIDE = Path(__file__).parents[3] / "docs" / "sources.md"
-
-SPECS = [
-    yaml.safe_load(block.split("```")[0])["spec"] for block in GUIDE.read_text(encoding="utf-8").split("```yaml\n")[1:]
-]
+SPECS = [yaml.safe_load(block)["spec"] for block in yaml_blocks(guide("sources"))]
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=["zenoh", "plugins"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -13,13 +12,14 @@ from application_manager.commands.offline import render_objects
 from application_manager.core.objects.policy import Policy
 from detector.engine.episodes.demands import to_task
 from tests.driving import Drive, a_detector, a_stream, arrival
+from tests.guides import guide, yaml_blocks
 from tests.unit.manager_objects import NOW
 from wayside.api import ApplicationTask, EventRule
 from wayside.api.documents import parse_object
 from wayside.api.parameter import Merge, Parameter
 
-GUIDE = Path(__file__).parents[3].joinpath("docs", "templates.md").read_text()
-BLOCKS = re.findall(r"^```yaml\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
+GUIDE = guide("templates")
+BLOCKS = yaml_blocks(GUIDE)
 OBJECTS = [parse_object(each) for block in BLOCKS for each in yaml.safe_load_all(block)]
 
 
