@@ -21,6 +21,9 @@ START = 1_767_225_600 * 10**9
 
 SECOND = 10**9
 
+SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
+"""A signal."""
+
 POSITION = {"stream": "pose", "x": "msg.x", "y": "msg.y"}
 
 
@@ -59,6 +62,16 @@ def arrival(seconds: float, client: str, value: Any, stream: str = "speed") -> A
     """A JSON message of a client, or a payload as it is where `value` is bytes."""
     payload = value if isinstance(value, bytes) else json.dumps(value).encode()
     return Arrival(at(seconds), stream, f"vehicles/{client}/{stream}", payload)
+
+
+def speed(seconds: float, value: Any, client: str = "car") -> Arrival:
+    """A sample of stream speed."""
+    return arrival(seconds, client, {"v": value})
+
+
+def place(seconds: float, client: str, x: float, y: float = 0.0) -> Arrival:
+    """A sample of stream pose."""
+    return arrival(seconds, client, {"x": x, "y": y}, "pose")
 
 
 def compiled(detector: Detector, *rules: EventRule) -> list[CompiledRule]:

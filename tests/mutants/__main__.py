@@ -24,7 +24,10 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 LIST = Path(__file__).parent / "mutants.yaml"
-_PYTEST = (sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--hypothesis-seed=0", "--no-header")
+_PYTEST = (
+    *(sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider"),
+    *("--hypothesis-seed=0", "--hypothesis-profile=unshrunk"),
+)
 _PASSED, _FAILED = 0, 1
 """Exit codes of pytest. All others say that it could not run the tests."""
 

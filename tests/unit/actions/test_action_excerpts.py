@@ -74,7 +74,7 @@ def message(seconds: float, client: str, stream: str, value: float, late: float 
 
 messages = st.lists(
     st.tuples(
-        st.integers(0, 79),
+        st.integers(1, 159),
         st.sampled_from(["car1", "car2"]),
         st.sampled_from(["speed", "load"]),
         st.sampled_from([0.0, 1.0]),
@@ -88,15 +88,23 @@ messages = st.lists(
 @settings(deadline=None, max_examples=60)
 @given(drawn=messages, cuts=st.lists(st.integers(1, 59), max_size=8), on_data=st.booleans())
 @example(
-    drawn=[(10, "car1", "speed", 1.0, 0), (20, "car1", "speed", 0.0, 0), (24, "car1", "load", 0.0, 0)],
+    drawn=[(21, "car1", "speed", 1.0, 0), (41, "car1", "speed", 0.0, 0), (49, "car1", "load", 0.0, 0)],
     cuts=[],
     on_data=False,
+)
+@example(  # at the borders of both windows: the episode starts at 2 s and ends at 3 s
+    drawn=[
+        *[(tick, "car1", "load", 0.0, 0) for tick in (20, 40, 60, 64, 74)],
+        *[(39, "car1", "speed", 1.0, 0), (59, "car1", "speed", 0.0, 0)],
+    ],
+    cuts=[],
+    on_data=True,
 )
 def test_each_sample_of_a_window_is_told_once_and_no_other(
     drawn: list[tuple[int, str, str, float, int]], cuts: list[int], on_data: bool
 ) -> None:
     arrivals = [
-        message(0.05 + tick / 10, client, stream, value, late / 10 if on_data else 0.0)
+        message(tick / 20, client, stream, value, late / 10 if on_data else 0.0)
         for tick, client, stream, value, late in drawn
     ]
     arrivals.sort(key=lambda each: each.received)

@@ -7,22 +7,26 @@ from typing import Any
 
 import pytest
 
+from detector.assembly import inlets, make_engine
 from detector.engine.episodes.demands import Demand
-from tests.driving import POSITION, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at, compiled
-
-SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
+from tests.driving import (
+    POSITION,
+    SPEED,
+    Drive,
+    a_deploy,
+    a_detector,
+    a_rule,
+    a_stream,
+    arrival,
+    at,
+    compiled,
+    place,
+    speed,
+)
 
 
 def speeding(name: str = "r", **spec: Any) -> Any:
     return a_rule(name, **{"signals": [SPEED], "when": "speed > 10", **spec})
-
-
-def speed(seconds: float, value: float, client: str = "car") -> Any:
-    return arrival(seconds, client, {"v": value})
-
-
-def place(seconds: float, client: str, x: float, y: float = 0.0) -> Any:
-    return arrival(seconds, client, {"x": x, "y": y}, "pose")
 
 
 def test_an_episode_tells_when_its_condition_began_to_hold_and_when_it_started_and_ended() -> None:
@@ -36,6 +40,16 @@ def test_an_episode_tells_when_its_condition_began_to_hold_and_when_it_started_a
     assert second.onset_time == at(8)  # the cooldown lasts to 8
     assert first.values == {"speed": 20}
     assert last.values == {"speed": 5}
+
+
+def test_two_detectors_that_see_the_same_have_episodes_of_their_own() -> None:
+    episodes = set()
+    for holder in ("north", "south"):
+        engine = make_engine(a_detector(), inlets(a_detector()), holder=holder, start=at(0))
+        engine.set_rules(compiled(a_detector(), speeding()))
+        (event,) = engine.advance([speed(0.5, 20)], at(1))
+        episodes.add(event.episode)
+    assert len(episodes) == 2
 
 
 def test_a_condition_may_use_the_clients_name_labels_and_streams() -> None:

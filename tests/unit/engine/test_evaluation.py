@@ -26,6 +26,7 @@ from detector.rules.selection import RuleSet
 from tests.driving import (
     POSITION,
     SECOND,
+    SPEED,
     START,
     Drive,
     a_detector,
@@ -35,21 +36,13 @@ from tests.driving import (
     at,
     compiled,
     lines,
+    place,
+    speed,
 )
-
-SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
 
 
 def fast(name: str = "r", **spec: Any) -> Any:
     return a_rule(name, **{"signals": [SPEED], "when": "speed > 10", "evaluation": {"onSample": "speed"}, **spec})
-
-
-def speed(seconds: float, value: float, client: str = "car") -> Arrival:
-    return arrival(seconds, client, {"v": value})
-
-
-def place(seconds: float, client: str, x: float) -> Arrival:
-    return arrival(seconds, client, {"x": x, "y": 0}, "pose")
 
 
 def test_with_on_sample_a_rule_is_evaluated_at_the_time_of_each_sample() -> None:
@@ -178,12 +171,12 @@ def test_more_episodes_than_a_client_may_start_within_an_hour_are_left_out_and_c
     blinks = [
         speed(n + 0.5, 20 if n % 2 else 5, client) for n in range(8) for client in ("a", "b") if client == "a" or n < 3
     ]
-    told = drive.take(*blinks, speed(3700.5, 5, "a"), speed(3701.5, 20, "a"), until=3702)
+    told = drive.take(*blinks, speed(3600.5, 5, "a"), speed(3601.5, 20, "a"), until=3602)
     assert [each for each in told if "started" in each] == [
         "r a started 2",
         "r b started 2",
         "r a started 4",
-        "r a started 3702",
+        "r a started 3602",  # an hour after the first one
     ]
     assert drive.engine.counters.rule("r").suppressed == 2
 

@@ -8,10 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from detector.assembly import RuleBook
-from tests.driving import POSITION, Drive, a_detector, a_rule, arrival, at, compiled
+from tests.driving import POSITION, SPEED, Drive, a_detector, a_rule, arrival, at, compiled
 from wayside.rules import dependency_problems, in_order
-
-SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
 
 
 def over(rule: str, name: str = "it", **fields: Any) -> dict[str, Any]:

@@ -7,19 +7,10 @@ from typing import Any
 import pytest
 
 from detector.engine.episodes.demands import from_task, to_task
-from tests.driving import POSITION, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at
+from tests.driving import POSITION, SPEED, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at, place, speed
 
-SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
 ROLES = [{"name": name, "labels": {"role": name[:-1]}} for name in ("bus1", "bus2", "car1", "car2")]
 EARTH = {"stream": "pose", "latitude": "msg.lat", "longitude": "msg.lon"}
-
-
-def speed(seconds: float, value: Any, client: str = "car") -> Any:
-    return arrival(seconds, client, {"v": value})
-
-
-def place(seconds: float, client: str, x: float, y: float = 0.0) -> Any:
-    return arrival(seconds, client, {"x": x, "y": y}, "pose")
 
 
 def pairs(name: str = "p", *, scope: dict[str, Any] | None = None, **spec: Any) -> Any:

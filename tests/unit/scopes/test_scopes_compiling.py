@@ -7,10 +7,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from tests.driving import POSITION, a_detector, a_rule, a_stream
+from tests.driving import POSITION, SPEED, a_detector, a_rule, a_stream
 from wayside.rules import RuleError, compile_rule
 
-SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
 EACH = {"as": "site", "of": [{"name": "north", "x": 1}, {"name": "south", "y": 2}]}
 
 

@@ -17,12 +17,11 @@ from detector.assembly import RuleBook, inlets, make_engine
 from detector.checking import check_documents
 from detector.engine.samples.sample import Arrival
 from tests import onnx_models
-from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
+from tests.driving import SPEED, Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.guides import guide, yaml_blocks
 from wayside.api import Detector, EventRule
 from wayside.api.documents import load_documents
 
-SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
 GAP = {"name": "gap", "stream": "pose", "value": "msg.x"}
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
