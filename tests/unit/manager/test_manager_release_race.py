@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any, cast
+from typing import Any
 
-from application_manager.cluster.apply import Applier
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.store import Entry, Name
-from application_manager.core.objects.policy import Policy
+from application_manager.cluster.client import Resource
+from application_manager.cluster.store import Name
 from application_manager.knowledge.world import INSTANCE, World
-from application_manager.work.instances import InstanceWork
-from application_manager.work.recorder import Recorder
-from application_manager.work.suspending import Suspending
+from tests.unit.manager.memory_server import a_world, raw, work_on
 from tests.unit.manager_objects import NOW, instance, task, template
-from wayside.api.base import API_VERSION
 
 NAME = ("site", "app-0000000000")
 KEYED = {"key": "${parameters.place}", "parameters": {"place": {"type": "string"}}}
@@ -42,31 +37,11 @@ class GoingServer:
 
 
 def test_an_instance_that_goes_while_its_release_is_checked_stays_gone_while_its_holder_is_lost() -> None:
-    world = World(Policy())
-    for version, model in enumerate((template(**KEYED), instance(NAME[1], key="west", release_at=NOW - 1e8)), start=1):
-        raw = {"apiVersion": API_VERSION, **model.to_json()}
-        raw["metadata"] = {**raw["metadata"], "uid": f"uid-{version}", "resourceVersion": str(version)}
-        assert world.store.put(raw) is not None
     lost = task("a", {"place": "west"}, holder="town", accepted_condition=("False", "HolderLost", NOW - 100))
-    world.claims.note(("site", "a"), Entry(lost.to_json(), lost), world.template(("site", "app")))
+    going = instance(NAME[1], key="west", release_at=NOW - 1e8)
+    world = a_world(raw(template(**KEYED), 1), raw(going, 2), task=lost)
     server = GoingServer(world)
-    client = cast("Client", server)
     absent: list[Name] = []
-    applier, instances = Applier(client, world.store, {}), Resource(API_VERSION, "ApplicationInstance", "instances")
-    work = InstanceWork(
-        world=world,
-        client=client,
-        applier=applier,
-        recorder=Recorder(client),
-        suspending=Suspending(client, applier, instances, lambda raw: None),
-        instances=instances,
-        tasks=Resource(API_VERSION, "ApplicationTask", "applicationtasks"),
-        again=lambda name, at: None,
-        done=lambda name: None,
-        absent=lambda name, decision: absent.append(name),
-        observe=lambda raw: None,
-        configured=lambda name: None,
-    )
-    asyncio.run(work.reconcile(NAME))
+    asyncio.run(work_on(world, server, absent).reconcile(NAME))
     assert server.written == []
     assert absent == [NAME]
