@@ -10,5 +10,10 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
 )
 # For whoever wants to know only whether a test fails: the smallest example is not searched for.
-settings.register_profile("unshrunk", settings.get_profile("wayside"), phases=[Phase.explicit, Phase.generate])
+settings.register_profile(
+    "unshrunk",
+    settings.get_profile("wayside"),
+    phases=[Phase.explicit, Phase.generate],
+    report_multiple_bugs=False,
+)
 settings.load_profile("wayside")

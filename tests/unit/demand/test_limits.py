@@ -117,6 +117,14 @@ def test_what_lingers_yields_first_and_the_one_that_would_go_first() -> None:
     assert going(of(wants("b"), instances=[*lingering], limit=2)) == set()
 
 
+def test_what_is_being_deleted_has_its_place_until_it_is_gone() -> None:
+    there = runs("a")
+    metadata = there.metadata.model_copy(update={"deletion_timestamp": format_seconds(NOW)})
+    outcome = of(wants("b"), instances=[there.model_copy(update={"metadata": metadata})])
+    assert running(outcome) == set()
+    assert f"starts as soon as {there.name} is gone" in outcome.verdicts["b"].message
+
+
 def test_a_lower_limit_stops_the_last_in_order() -> None:
     tasks = [wants("a"), wants("b", created=1), wants("c", created=2)]
     outcome = of(*tasks, instances=[runs(each) for each in "abc"], limit=2)
