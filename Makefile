@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests that wait on other processes: three a core keep it busy.
 WAITING := $(BIN)/python -m pytest -n 6 --dist loadgroup
 
-.PHONY: help demo demo-cluster tutorial examples test unit cluster e2e lint bench requirements crds clean
+.PHONY: help demo demo-cluster tutorial examples test unit cluster e2e lint bench mutants requirements crds clean
 
 help: ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -74,6 +74,9 @@ e2e: $(BIN)/.installed-dev ## the tests on a real node with containers, as root;
 
 bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its baseline
 	@for each in $(basename $(notdir $(wildcard benchmarks/*.py))); do echo "== $$each"; $(BIN)/python -m benchmarks.$$each || exit 1; done
+
+mutants: $(BIN)/.installed-dev ## small wrong changes, one by one: for each, a test must fail
+	@$(BIN)/python -m tests.mutants
 
 crds: $(BIN)/.installed ## write crds/ anew from the models, and what of the chart follows from the code
 	@$(BIN)/python -m wayside.api crds

@@ -27,10 +27,10 @@ from mcap.writer import CompressionType, Writer
 
 from detector.actions.episode import Completion, EpisodeSample
 from detector.streams.codecs.ros import standard
+from tests.driving import a_rule, a_stream, at
 from tests.process.running import Process
-from tests.unit.driving import a_rule, a_stream, at
-from tests.unit.recording_bench import Bench, an_episode
-from tests.unit.ros_messages import cdr, point_cloud
+from tests.recording_bench import Bench, an_episode
+from tests.ros_messages import cdr, point_cloud
 
 POINTS = a_stream("points", encoding="cdr", type="sensor_msgs/msg/PointCloud2")
 CLOUD = cdr(point_cloud(83_000))

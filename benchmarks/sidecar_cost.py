@@ -43,7 +43,7 @@ time.sleep(10**6)
 """
 PUBLISH = """
 import json, sys, time, zenoh
-from tests.unit.ros_messages import cdr, pose_stamped
+from tests.ros_messages import cdr, pose_stamped
 config = zenoh.Config.from_json5(json.dumps({
     "mode": "client", "connect": {"endpoints": [sys.argv[1]], "timeout_ms": -1},
 }))

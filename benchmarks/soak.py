@@ -55,8 +55,8 @@ from benchmarks.soaking.traffic import (
     Sent,
     traffic,
 )
+from tests.onnx_models import mean_of, weighted
 from tests.process.mqtt_broker import broker, publisher
-from tests.unit.onnx_models import mean_of, weighted
 
 SOAKING = Path(__file__).parent / "soaking"
 SEED = 3528

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 
 from tests.failures import shorten
 from tests.sharing import run_folder
@@ -14,6 +14,13 @@ settings.register_profile(
     "wayside",
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
+)
+# For whoever wants to know only whether a test fails: the smallest example is not searched for.
+settings.register_profile(
+    "unshrunk",
+    settings.get_profile("wayside"),
+    phases=[Phase.explicit, Phase.generate],
+    report_multiple_bugs=False,
 )
 settings.load_profile("wayside")
 

@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from detector.streams.zenoh import Put
-from tests.unit.certificates import Authority
+from tests.certificates import Authority
 from wayside.api.stream import Encoding, Stream
 
 PATIENCE = 60.0

@@ -20,7 +20,7 @@ from tests.cluster.managed_world import condition, start_manager, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_endpoint
-from tests.unit.ros_messages import cdr, pose_stamped
+from tests.ros_messages import cdr, pose_stamped
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 NEAR, BETWEEN, FAR = 100.0, 175.0, 250.0

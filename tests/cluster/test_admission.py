@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from application_manager.core.findings.webhooks import TIMEOUT
+from tests.certificates import Authority
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import condition, config, deployment, end, start_manager, task, template
@@ -26,7 +27,6 @@ from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from tests.cluster.webhook import Webhook, kubectl_apply, printed
-from tests.unit.certificates import Authority
 
 LABELS = {"site": "intersection-a"}
 

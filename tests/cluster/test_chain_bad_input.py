@@ -41,7 +41,7 @@ from tests.cluster.chain import (
 )
 from tests.cluster.managed_world import condition
 from tests.cluster.processes import Process, Processes
-from tests.unit.ros_messages import cdr, pose_stamped
+from tests.ros_messages import cdr, pose_stamped
 
 HOUR = 3600  # s
 

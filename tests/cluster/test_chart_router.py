@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 import zenoh
 
+from tests.certificates import Authority
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import Helm, HelmError
 from tests.networks import wait_for
 from tests.ports import free_port
-from tests.unit.certificates import Authority
 
 CLIENTS = [
     {"name": "vehicles", "commonNames": ["car1", "car2"], "publish": ["vehicles/{commonName}/**"]},

@@ -10,9 +10,9 @@ from typing import Any
 
 import zenoh
 
+from tests.certificates import Authority
 from tests.cluster.api import Api
 from tests.e2e.node import Node
-from tests.unit.certificates import Authority
 
 RELEASE = "wayside"
 MANAGER, ROUTER, DETECTOR = f"{RELEASE}-manager", f"{RELEASE}-router", "detector-town"

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.certificates import Authority
 from tests.cluster.api import Api, ApiError, Object, Objects
 from tests.cluster.crds import CRD_NAMES, apply_crds, remove_crds, wait_crd_gone
 from tests.cluster.waiting import wait_until
@@ -31,7 +32,6 @@ from tests.e2e.released import (
 from tests.e2e.test_cooperative_recording import TELL, applications, ready, wait_pods
 from tests.e2e.wayside_in_cluster import EXAMPLE, example_documents
 from tests.helm.wayside_chart import CHART, Helm
-from tests.unit.certificates import Authority
 
 sys.path.insert(0, str(EXAMPLE))
 

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 import zenoh
 
+from tests.certificates import Authority
 from tests.cluster.api import Api
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
 from tests.e2e.released import PATIENCE, RELEASE, ROUTER, apply_certificates, outside, values, vehicle, wait_installed
 from tests.e2e.workloads import deployment
 from tests.helm.wayside_chart import CHART, Helm
-from tests.unit.certificates import Authority
 
 RULE = {
     "signals": [{"name": "speed", "stream": "speed", "value": "msg.value"}],

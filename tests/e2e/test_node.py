@@ -7,12 +7,12 @@ import subprocess
 import urllib.request
 from pathlib import Path
 
+from tests.certificates import Authority
 from tests.cluster.api import Api, ApiError
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
 from tests.e2e.programs import SYSTEM_PATH
 from tests.e2e.workloads import deployment, running_pods, service, wait_available
-from tests.unit.certificates import Authority
 
 SERVE = ("python3", "-c", "import http.server as h; h.test(h.SimpleHTTPRequestHandler, port=8000)")
 FETCH = "import sys, urllib.request as r; print(r.urlopen(sys.argv[1], timeout=5).status)"

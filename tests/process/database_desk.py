@@ -14,7 +14,7 @@ from typing import Any
 from detector.actions import Completion, Episode, EpisodeSample, Outcome, OutcomeState, Setting, Surroundings
 from detector.actions.database import Database
 from detector.assembly import inlets
-from tests.unit.driving import START, a_detector, a_rule, a_stream, at
+from tests.driving import START, a_detector, a_rule, a_stream, at
 from wayside.api.actions.database import DatabaseAction
 
 

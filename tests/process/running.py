@@ -16,8 +16,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from detector.status.model import Status, read_status
 from detector.streams.asking import NoAnswerError, ask
 from tests import programs
+from tests.driving import a_detector
 from tests.ports import free_port
-from tests.unit.driving import a_detector
 from wayside.api import Kind
 from wayside.api.zenoh import Zenoh, ZenohMode
 

@@ -16,9 +16,9 @@ import zenoh
 from detector.engine.samples.liveliness import LIVELINESS, Token
 from detector.streams.session import open_session
 from detector.streams.zenoh import Network
+from tests.certificates import Authority
 from tests.networks import PATIENCE, Arrivals, guarded_router, stream, wait_for
 from tests.ports import free_endpoint
-from tests.unit.certificates import Authority
 from wayside.api.zenoh import Zenoh
 
 LOOK_EVERY = 0.05

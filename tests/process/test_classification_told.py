@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.driving import a_deploy, a_rule, a_stream
 from tests.mongodb.way import Way
 from tests.process.database_desk import wait_until
 from tests.process.running import PATIENCE, Process
-from tests.unit.driving import a_deploy, a_rule, a_stream
-from tests.unit.recording_bench import mcap_files, metadata_of
+from tests.recording_bench import mcap_files, metadata_of
 
 GIVEN = {"overarchingPurpose": ["Safety"], "incidence": ["Rare"], "typeOfAction": ["DataCollection", "Deployment"]}
 

@@ -12,9 +12,9 @@ import pytest
 
 from detector.actions import ActionError, EpisodeSample, OutcomeState
 from detector.actions.database.server import Redactor
+from tests.driving import START, a_stream
 from tests.mongodb.way import Way
 from tests.process.database_desk import Desk, speeds, spooled, wait_until
-from tests.unit.driving import START, a_stream
 
 SPEEDS = "json/speed"
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
+from tests.driving import a_rule, a_stream
 from tests.mongodb import MongoServer
 from tests.mongodb.way import Way
 from tests.process.database_desk import wait_until
 from tests.process.running import PATIENCE, Process
-from tests.unit.driving import a_rule, a_stream
-from tests.unit.recording_bench import mcap_files, read_with_mcap
+from tests.recording_bench import mcap_files, read_with_mcap
 
 AWAY = 60.0
 """Seconds, and at 100 Hz from two clients more than the memory has room for beside the smaller spool."""

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from detector.streams.codecs.cdr import CdrDecoder
+from tests.driving import a_rule, a_stream
 from tests.mongodb.way import Way
 from tests.process.database_desk import spooled, wait_until
 from tests.process.running import PATIENCE, Process
-from tests.unit.driving import a_rule, a_stream
-from tests.unit.recording_bench import mcap_files, read_with_mcap
-from tests.unit.ros_messages import cdr, point_cloud
+from tests.recording_bench import mcap_files, read_with_mcap
+from tests.ros_messages import cdr, point_cloud
 
 CLOUDS = a_stream("points", encoding="cdr", type="sensor_msgs/msg/PointCloud2")
 READ = CdrDecoder("sensor_msgs/msg/PointCloud2")

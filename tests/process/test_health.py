@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.driving import a_rule, a_stream
 from tests.networks import router_process, wait_for
 from tests.ports import free_endpoint
 from tests.process.running import PATIENCE, Process
-from tests.unit.driving import a_rule, a_stream
 
 ALWAYS = a_rule("r", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 10")
 

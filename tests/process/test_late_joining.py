@@ -10,9 +10,9 @@ from zenoh import ext
 from detector.assembly import DetectorError, inlets
 from detector.streams.tally import Cause, Tally
 from detector.streams.zenoh import Network
+from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, router, stream, wait_for
 from tests.ports import free_endpoint
-from tests.unit.driving import a_detector, a_stream
 from wayside.api.base import PositiveDuration
 from wayside.api.stream import History, Stream
 from wayside.api.zenoh import Zenoh, ZenohMode

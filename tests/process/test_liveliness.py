@@ -19,9 +19,9 @@ from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.streams.zenoh import Network
+from tests.driving import SECOND, START, Drive, a_detector, a_rule, a_stream, arrival, at, lines
 from tests.networks import Arrivals, router, stream, wait_for
 from tests.ports import free_endpoint
-from tests.unit.driving import SECOND, START, Drive, a_detector, a_rule, a_stream, arrival, at, lines
 from wayside.api import Detector
 from wayside.api.detector import Clock
 from wayside.api.zenoh import Zenoh, ZenohMode

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from application_manager.work.publishing import Publisher, settings
+from tests.certificates import Authority
 from tests.networks import guarded_router, wait_for
 from tests.ports import free_endpoint
-from tests.unit.certificates import Authority
 
 SHORT = datetime.timedelta(seconds=20)
 

@@ -12,10 +12,10 @@ from paho.mqtt.client import Client
 from detector.sources.mqtt import topic_filter
 from detector.sources.supervision import SourceThread, State
 from detector.streams.tally import Cause, Tally
+from tests.certificates import Authority
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from tests.ports import free_port
 from tests.process.mqtt_broker import PASSWORD, broker, publisher
-from tests.unit.certificates import Authority
 from wayside.api.source import DataSource
 
 

@@ -21,10 +21,10 @@ from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
+from tests.certificates import Authority
+from tests.driving import a_detector
 from tests.networks import PATIENCE, Arrivals, router, router_process, stream, wait_for
 from tests.ports import free_endpoint
-from tests.unit.certificates import Authority
-from tests.unit.driving import a_detector
 from wayside.api.access import Access
 from wayside.api.zenoh import Zenoh, ZenohMode
 

@@ -14,7 +14,7 @@ import pytest
 from detector.actions import Completion, OutcomeState
 from detector.actions.notify import alerts
 from tests.http_servers import Endpoint, answers, endpoint, hangs, holds
-from tests.unit.notifying import a_desk, an_episode
+from tests.notifying import a_desk, an_episode
 from wayside.times import parse_time
 
 NOBODY = "alerts that nobody heard of"

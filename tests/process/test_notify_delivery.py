@@ -27,8 +27,8 @@ from tests.http_servers import (
     nobody,
     sends,
 )
+from tests.notifying import a_desk, an_episode
 from tests.ports import free_endpoint
-from tests.unit.notifying import a_desk, an_episode
 
 LOST = "events that nobody was told of"
 

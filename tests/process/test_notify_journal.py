@@ -14,12 +14,12 @@ import pytest
 from detector.actions.notify.dead_letters import DeadLetters
 from detector.actions.notify.journal import Journal, JournalError
 from tests.http_servers import answers, endpoint, hangs
-from tests.unit.notifying import a_desk
+from tests.notifying import a_desk
 
 _KILLED = """
 import sys
 from pathlib import Path
-from tests.unit.notifying import a_desk, an_episode
+from tests.notifying import a_desk, an_episode
 desk = a_desk({"http": {"url": sys.argv[1], "timeout": "2m"}, "text": "x"}, state=Path(sys.argv[2]))
 for number in range(20):
     desk.run(an_episode(f"e{number}", rendered={"text": f"number {number}"}))

@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from tests.driving import a_rule
 from tests.http_servers import Endpoint, Received, answers, endpoint, hangs
 from tests.process.database_desk import wait_until
 from tests.process.running import Process
-from tests.unit.driving import a_rule
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
 

@@ -26,8 +26,8 @@ from detector.replay.intake_writer import IntakeWriter
 from detector.replay.replaying import replay_intake
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
-from tests.unit.driving import a_detector
-from tests.unit.plugin_rules import plugin_rule, plugins
+from tests.driving import a_detector
+from tests.plugins.rules import plugin_rule, plugins
 from wayside.api import EventRule
 
 __all__ = ["plugins"]  # a fixture

@@ -18,8 +18,8 @@ from detector.engine.samples.sample import Arrival
 from detector.plugins.instances import LocalHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost
-from tests.unit.driving import a_detector, arrival
-from tests.unit.plugin_rules import PluginDrive, plugin_rule, plugins
+from tests.driving import a_detector, arrival
+from tests.plugins.rules import PluginDrive, plugin_rule, plugins
 
 __all__ = ["plugins"]  # a fixture
 

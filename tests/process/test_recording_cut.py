@@ -31,8 +31,8 @@ from detector.actions.worker import Worker
 from detector.engine.consequences.consequences import Begun, Completed, Run, Sampled
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.rendering import Rendered
-from tests.unit.driving import at
-from tests.unit.recording_bench import (
+from tests.driving import at
+from tests.recording_bench import (
     Bench,
     a_sample,
     an_episode,
@@ -53,7 +53,7 @@ MEGABYTE = os.urandom(1_000_000)
 KILLED = """
 import sys, time
 from pathlib import Path
-from tests.unit.recording_bench import Bench, an_episode
+from tests.recording_bench import Bench, an_episode
 from tests.process.test_recording_cut import SAMPLES
 from detector.actions.episode import Completion
 

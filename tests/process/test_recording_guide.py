@@ -16,7 +16,7 @@ from detector.checking import check_documents
 from detector.status.model import read_status
 from detector.streams.asking import ask
 from tests.process.running import PATIENCE, Process
-from tests.unit.recording_bench import mcap_files, metadata_of, read_with_mcap
+from tests.recording_bench import mcap_files, metadata_of, read_with_mcap
 from wayside.api import EventRule
 from wayside.api.documents import load_documents
 

@@ -17,12 +17,12 @@ import zenoh
 from detector.engine.samples.sample import Arrival
 from detector.replay.intake_file import read_intake
 from detector.streams.codecs.cdr import CdrDecoder
+from tests.driving import a_rule, a_stream
 from tests.mongodb.way import Way
 from tests.process.database_desk import wait_until
 from tests.process.running import PATIENCE, Process
-from tests.unit.driving import a_rule, a_stream
-from tests.unit.recording_bench import Recorded, mcap_files, read_with_mcap, read_with_rosbags, seconds
-from tests.unit.ros_messages import cdr, point_cloud
+from tests.recording_bench import Recorded, mcap_files, read_with_mcap, read_with_rosbags, seconds
+from tests.ros_messages import cdr, point_cloud
 from wayside.api import EventRule
 from wayside.times import parse_time
 

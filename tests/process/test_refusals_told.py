@@ -14,9 +14,9 @@ import pytest
 import zenoh
 
 from detector.streams.session import NetworkError, open_session
+from tests.certificates import Authority
 from tests.networks import PATIENCE, wait_for
 from tests.ports import free_endpoint
-from tests.unit.certificates import Authority
 from wayside.api.zenoh import Zenoh
 
 ROUTER = """

@@ -25,10 +25,10 @@ from detector.streams.rmw_zenoh import MisfitError, numbered, split
 from detector.streams.sequences import MAXIMUM_PUBLISHERS, Sequences
 from detector.streams.tally import Cause, Tally
 from detector.streams.zenoh import Network
+from tests.driving import Drive, a_detector, a_rule, at, compiled, lines
 from tests.networks import wait_for
 from tests.ports import free_endpoint
-from tests.unit.driving import Drive, a_detector, a_rule, at, compiled, lines
-from tests.unit.ros_messages import cdr, odometry, pose_stamped
+from tests.ros_messages import cdr, odometry, pose_stamped
 from wayside.api.documents import DocumentError, load_documents
 from wayside.api.zenoh import Zenoh
 

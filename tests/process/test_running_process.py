@@ -13,8 +13,8 @@ import pytest
 from detector.status.model import RuleState, Status, read_status
 from detector.streams.asking import NoAnswerError, ask
 from tests import programs
+from tests.driving import a_rule, a_stream
 from tests.process.running import PATIENCE, Process
-from tests.unit.driving import a_rule, a_stream
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "5m"}
 FAST = a_rule("fast", signals=[SPEED], when="v > 10", evaluation={"every": "100ms"})

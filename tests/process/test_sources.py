@@ -21,8 +21,8 @@ from detector.sources import Feed, Source
 from detector.sources.registry import OFFERS, plugin_problems
 from detector.sources.supervision import Sources, SourceThread, State
 from detector.streams.tally import Cause, Tally
+from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
-from tests.unit.driving import a_detector, a_stream
 from wayside.api import Detector
 from wayside.api.source import DataSource
 

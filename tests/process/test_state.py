@@ -26,8 +26,8 @@ from detector.restoring import what_was_open
 from detector.state import StateFile, state_file
 from detector.streams.zenoh import open_session
 from tests import programs
+from tests.driving import Drive, a_deploy, a_detector, a_rule, arrival, at
 from tests.ports import free_endpoint
-from tests.unit.driving import Drive, a_deploy, a_detector, a_rule, arrival, at
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}

@@ -24,10 +24,10 @@ from detector.actions.trigger.requests import (
 from detector.cli import app
 from detector.streams.answering import status_key
 from detector.streams.session import open_session
+from tests.driving import a_rule
 from tests.networks import router_process, wait_for
 from tests.ports import free_endpoint
 from tests.process.running import PATIENCE, Process
-from tests.unit.driving import a_rule
 from wayside.api import EventRule
 from wayside.api.base import Duration, PositiveDuration
 from wayside.api.zenoh import Zenoh, ZenohMode

@@ -14,8 +14,8 @@ import pytest
 from detector.actions import ActionError, Completion, Episode, Outcome, OutcomeState, Setting, Surroundings
 from detector.actions.trigger import Trigger
 from detector.assembly import inlets
+from tests.driving import a_detector, a_rule
 from tests.http_servers import answers, endpoint, hangs, sends
-from tests.unit.driving import a_detector, a_rule
 from wayside.api.actions import trigger as api
 
 PATIENCE = 60.0

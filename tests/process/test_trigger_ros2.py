@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from detector.checking import check_documents
+from tests.driving import a_detector, a_rule
 from tests.process.ros2_services import HASHES, Node
 from tests.process.running import Process
-from tests.unit.driving import a_detector, a_rule
 from wayside.api import EventRule
 from wayside.api.documents import load_documents
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 
+from tests.certificates import Authority
 from tests.cluster.api import Api, ApiError, Unreachable
 from tests.cluster.binaries import Binaries, ensure_binaries
 from tests.cluster.children import Child, remove_afterwards
@@ -25,7 +26,6 @@ from tests.e2e.images import pause_archive
 from tests.e2e.node import configurations
 from tests.e2e.node.enclosure import Enclosure
 from tests.e2e.programs import Programs, ensure_programs
-from tests.unit.certificates import Authority
 
 NAME = "node"
 READY_TIMEOUT = 300.0  # for each program, on a machine many times slower than usual

@@ -1,0 +1,114 @@
+"""Drives an engine from a test: detectors and rules in a few words, samples at seconds after a start.
+
+Everything is real but the data: keys, decoders and rules come in as `detector run` brings them in.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from detector.assembly import inlets, make_engine
+from detector.engine.engine import Engine
+from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Arrival
+from wayside.api import API_VERSION, Detector, EventRule
+from wayside.rules import CompiledRule, compile_rule
+
+START = 1_767_225_600 * 10**9
+"""A whole second, in nanoseconds since the epoch."""
+
+SECOND = 10**9
+
+SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
+"""A signal."""
+
+POSITION = {"stream": "pose", "x": "msg.x", "y": "msg.y"}
+
+
+def at(seconds: float) -> int:
+    """That many seconds after the start, to the microsecond, in nanoseconds since the epoch."""
+    return START + round(seconds * 1e6) * 1000
+
+
+def a_stream(name: str, **fields: Any) -> dict[str, Any]:
+    return {"name": name, "key": f"vehicles/${{client:*}}/{name}", "encoding": "json", **fields}
+
+
+def a_detector(*streams: Mapping[str, Any], **spec: Any) -> Detector:
+    """A Detector with JSON streams pose and speed, or those given."""
+    return Detector.model_validate(
+        {
+            "apiVersion": API_VERSION,
+            "kind": "Detector",
+            "metadata": {"name": "d"},
+            "spec": {"streams": list(streams or (a_stream("pose"), a_stream("speed"))), **spec},
+        }
+    )
+
+
+def a_rule(name: str = "r", **spec: Any) -> EventRule:
+    return EventRule.model_validate(
+        {"apiVersion": API_VERSION, "kind": "EventRule", "metadata": {"name": name}, "spec": spec}
+    )
+
+
+def a_deploy(name: str, template: str = "app", **fields: Any) -> dict[str, Any]:
+    return {"name": name, "deploy": {"template": template, **fields}}
+
+
+def arrival(seconds: float, client: str, value: Any, stream: str = "speed") -> Arrival:
+    """A JSON message of a client, or a payload as it is where `value` is bytes."""
+    payload = value if isinstance(value, bytes) else json.dumps(value).encode()
+    return Arrival(at(seconds), stream, f"vehicles/{client}/{stream}", payload)
+
+
+def speed(seconds: float, value: Any, client: str = "car") -> Arrival:
+    """A sample of stream speed."""
+    return arrival(seconds, client, {"v": value})
+
+
+def place(seconds: float, client: str, x: float, y: float = 0.0) -> Arrival:
+    """A sample of stream pose."""
+    return arrival(seconds, client, {"x": x, "y": y}, "pose")
+
+
+def compiled(detector: Detector, *rules: EventRule) -> list[CompiledRule]:
+    return [compile_rule(rule, detector) for rule in rules]
+
+
+def an_engine(detector: Detector, *rules: EventRule, start: float = 0.0) -> Engine:
+    engine = make_engine(detector, inlets(detector), holder="h", start=at(start))
+    engine.set_rules(compiled(detector, *rules))
+    return engine
+
+
+class Drive:
+    """An engine and the time that has come."""
+
+    def __init__(self, detector: Detector, *rules: EventRule, start: float = 0.0) -> None:
+        self.detector = detector
+        self.engine = an_engine(detector, *rules, start=start)
+        self.events: list[Event] = []
+
+    def take(self, *arrivals: Arrival, until: float) -> list[str]:
+        """Advance; returns what happened in a few words (see `told`)."""
+        return self.note(self.engine.advance(arrivals, at(until)))
+
+    def note(self, events: Sequence[Event]) -> list[str]:
+        self.events += events
+        return told(events)
+
+
+def told(events: Sequence[Event]) -> list[str]:
+    """Events in a few words: `r car1 started 3`, `r car1 Until 5`; times in seconds after the start."""
+    return [
+        f"{event.rule} {event.subject} {event.reason or 'started'} "
+        f"{((event.end_time if event.end_time is not None else event.start_time) - START) / 1e9:g}"
+        for event in events
+    ]
+
+
+def lines(events: Sequence[Event]) -> list[str]:
+    return [event.to_json() for event in events]

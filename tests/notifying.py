@@ -1,0 +1,136 @@
+"""Notify actions at work without a host: their setting, what they report and lose, and episodes for them."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from detector.actions import Completion, Episode, Outcome, OutcomeState, Setting, Surroundings
+from detector.actions.notify import Notify
+from detector.streams.codecs.ros import standard
+from tests.driving import SECOND, START, a_detector, a_rule
+from wayside.api.actions.notify import Notify as Parameters
+from wayside.times import format_time
+
+WAIT = 60.0
+
+
+class Silent:
+    """No Zenoh session."""
+
+    def publish(self, key: str, payload: bytes, encoding: str) -> None:
+        raise AssertionError("nothing is published here")
+
+    def ask(self, selector: str, payload: bytes | None, timeout: float) -> list[bytes]:
+        raise AssertionError("nobody is asked here")
+
+
+@dataclass
+class Desk:
+    """A notify action, and all that it says."""
+
+    action: Notify
+    closing: threading.Event
+    outcomes: list[tuple[str, Outcome]] = field(default_factory=list)
+    lost: Counter[str] = field(default_factory=Counter)
+    reasons: list[str] = field(default_factory=list)
+    changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def outcome(self, episode: str, state: OutcomeState = OutcomeState.DONE) -> Outcome:
+        """The episode's outcome of that state, once it is reported."""
+        return self.until(lambda: next((o for e, o in self.outcomes if e == episode and o.state is state), None))
+
+    def until(self, get: Callable[[], Any]) -> Any:
+        with self.changed:
+            assert self.changed.wait_for(get, WAIT), (self.outcomes, self.lost, self.reasons)
+            return get()
+
+    def run(self, *episodes: Episode) -> None:
+        """Whole episodes, one after the other."""
+        for episode in episodes:
+            self.action.started(replace(episode, ended=None, end_time=None, reason=None))
+            self.action.ended(episode)
+            self.action.completed(episode, Completion())
+
+    def end(self) -> None:
+        """As when the detector ends."""
+        self.closing.set()
+        self.action.close()
+
+
+def a_desk(notify: Mapping[str, Any], *, state: Path | None = None, messenger: Any = None) -> Desk:
+    parameters = Parameters.model_validate(notify)
+    rule = a_rule("braking", when="true", actions=[{"name": "tell", "notify": dict(notify)}])
+    detector = a_detector(**({} if state is None else {"state": {"path": str(state)}}))
+    desk = Desk.__new__(Desk)
+
+    def report(episode: Episode, outcome: Outcome) -> None:
+        with desk.changed:
+            desk.outcomes.append((episode.id, outcome))
+            desk.changed.notify_all()
+
+    def lose(what: str, count: int, why: str) -> None:
+        with desk.changed:
+            desk.lost[what] += count
+            desk.reasons.append(why)
+            desk.changed.notify_all()
+
+    desk.closing, desk.outcomes, desk.lost, desk.reasons = threading.Event(), [], Counter(), []
+    desk.changed = threading.Condition()
+    setting = Setting(
+        rule=rule,
+        action="tell",
+        holder="h",
+        surroundings=lambda: Surroundings(detector, {}, standard()),
+        messenger=messenger or Silent(),
+        report=report,
+        lose=lose,
+        closing=desk.closing,
+    )
+    desk.action = Notify(parameters, setting)
+    return desk
+
+
+def an_episode(
+    name: str = "e1", client: str = "car1", rendered: Mapping[str, Any] | None = None, **fields: Any
+) -> Episode:
+    """An episode that has ended, five seconds after its start."""
+    times = {"onsetTime": format_time(START), "startTime": format_time(START)}
+    data = {"rule": "braking", "episode": name, "subjects": [client], **times, "values": {"speed": 12.5}}
+    end = START + 5 * SECOND
+    return Episode(
+        id=name,
+        rule="braking",
+        subject=client,
+        clients=(client,),
+        element=None,
+        onset_time=START,
+        start_time=START,
+        values={"speed": 12.5},
+        classification=None,
+        rendered=rendered or {},
+        unrendered=fields.pop("unrendered", {}),
+        started=_event(name, client, "started", START, data),
+        resumed=fields.pop("resumed", False),
+        end_time=end,
+        reason="Until",
+        ended=_event(name, client, "ended", end, {**data, "endTime": format_time(end), "reason": "Until"}),
+        **fields,
+    )
+
+
+def _event(name: str, client: str, what: str, time: int, data: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "specversion": "1.0",
+        "id": f"{name}.{what}",
+        "source": "/detectors/h",
+        "type": f"dev.wayside.event.{what}",
+        "subject": client,
+        "time": format_time(time),
+        "datacontenttype": "application/json",
+        "data": dict(data),
+    }

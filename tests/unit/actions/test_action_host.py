@@ -1,0 +1,285 @@
+"""Actions at work: each on a thread of its own, and what one does wrong costs nobody else anything."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import EntryPoint
+from typing import Any, ClassVar
+
+import pytest
+
+from detector.actions import (
+    Action,
+    ActionError,
+    ActionParameters,
+    Completion,
+    Episode,
+    EpisodeSample,
+    Outcome,
+    OutcomeState,
+    Surroundings,
+    registry,
+)
+from detector.actions.host import ActionHost
+from detector.actions.outcomes import Tally, Which
+from detector.actions.worker import SILENT
+from detector.assembly import inlets
+from detector.engine.engine import Engine
+from tests.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
+from wayside.api import EventRule
+
+DETECTOR = a_detector(a_stream("speed"), clientTimeout="60s")
+SLOW = threading.Event()
+"""Set: the actions that wait for it go on."""
+
+
+class Recorded(Action[ActionParameters]):
+    """Notes what it is told."""
+
+    Parameters = ActionParameters
+    told: ClassVar[list[str]] = []
+    after: ClassVar[Callable[[str, Episode], None]] = staticmethod(lambda what, episode: None)
+
+    def note(self, what: str, episode: Episode) -> None:
+        self.told.append(f"{self.setting.action} {what} {episode.subject}")
+        type(self).after(what, episode)
+
+    def started(self, episode: Episode) -> None:
+        self.note("started", episode)
+
+    def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
+        self.note(f"{len(samples)} samples", episode)
+
+    def ended(self, episode: Episode) -> None:
+        assert episode.end_time is not None
+        self.note(f"ended {episode.reason}", episode)
+
+    def completed(self, episode: Episode, completion: Completion) -> None:
+        self.note(f"completed {completion.cut or 'in time'}", episode)
+        self.setting.report(episode, Outcome(OutcomeState.DONE, missing=completion.missing))
+
+    def close(self) -> None:
+        self.told.append(f"{self.setting.action} closed")
+
+
+class Raises(Recorded):
+    """Fails with what its episodes are about car1."""
+
+    def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
+        if episode.subject == "car1":
+            raise ActionError("the ink is dry")
+        super().samples(episode, samples)
+
+
+class Impossible(Recorded):
+    """Cannot be made."""
+
+    def __init__(self, *_: Any) -> None:
+        raise OSError("no paper")
+
+
+class Hangs(Recorded):
+    """Waits for ever, or until it is let go."""
+
+    def started(self, episode: Episode) -> None:
+        SLOW.wait(120)
+        super().started(episode)
+
+
+class Silent(Recorded):
+    """Never says what became of its work."""
+
+    def completed(self, episode: Episode, completion: Completion) -> None:
+        self.note("completed", episode)
+
+
+class Wakes(Recorded):
+    """Wants to be called again, and fails with it once."""
+
+    calls = 0
+
+    def wake(self) -> float | None:
+        type(self).calls += 1
+        if type(self).calls == 1:
+            raise ValueError("not yet awake")
+        return 0.01
+
+
+KINDS = {
+    "recorded": Recorded,
+    "raises": Raises,
+    "impossible": Impossible,
+    "hangs": Hangs,
+    "wakes": Wakes,
+    "silent": Silent,
+}
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    entries = [EntryPoint(name, f"{__name__}:{kind.__name__}", "wayside.actions") for name, kind in KINDS.items()]
+    monkeypatch.setattr("detector.entrypoints.entry_points", lambda group: entries)
+    Recorded.told.clear()
+    SLOW.clear()
+    before = threading.enumerate()
+    yield
+    SLOW.set()
+    for thread in set(threading.enumerate()).difference(before):
+        thread.join(60)  # what was let go just now is still to note its words, and not among those of the next test
+
+
+class Site:
+    """An engine and a host, and what was published."""
+
+    def __init__(self, *rules: EventRule, **options: Any) -> None:
+        self.engine: Engine = an_engine(DETECTOR)
+        self.engine.consequences.wanted = True
+        self.published: list[tuple[str, bytes]] = []
+        self.host = ActionHost("h", self, now=lambda: 0, **options)
+        self.follow(*rules)
+
+    def publish(self, key: str, payload: bytes, encoding: str) -> None:
+        self.published.append((key, payload))
+
+    def ask(self, *_: Any) -> list[bytes]:
+        raise ActionError("nobody")
+
+    def follow(self, *rules: EventRule) -> None:
+        entries = inlets(DETECTOR)
+        self.host.follow(rules, Surroundings(DETECTOR, entries.decoders, entries.types))
+        self.engine.set_rules(compiled(DETECTOR, *rules))
+        self.host.tell(self.engine.consequences.take(self.engine.now))
+
+    def take(self, *speeds: tuple[float, str, float], until: float) -> None:
+        self.engine.advance([arrival(seconds, client, {"v": v}) for seconds, client, v in speeds], at(until))
+        self.host.tell(self.engine.consequences.take(self.engine.now))
+
+    def tally(self, action: str) -> Tally:
+        return self.host.outcomes.tallies()[Which("fast", action)]
+
+    def when(self, true: Callable[[], bool]) -> None:
+        end = time.monotonic() + 60
+        while not true():
+            assert time.monotonic() < end, (Recorded.told, self.host.outcomes.tallies(), self.host.outcomes.lost())
+            time.sleep(0.005)
+
+
+def fast(**actions: str) -> EventRule:
+    return a_rule(
+        "fast",
+        signals=[{"name": "v", "stream": "speed", "value": "msg.v"}],
+        when="v > 0.5",
+        evaluation={"every": "100ms"},
+        actions=[
+            {"name": name, "plugin": {"name": kind, "window": {"before": "1s"}}} for name, kind in actions.items()
+        ],
+    )
+
+
+def one_episode(site: Site, client: str = "car1", begin: float = 0.0) -> None:
+    site.take((begin + 0.05, client, 1.0), until=begin + 0.5)
+    site.take((begin + 0.55, client, 0.0), until=begin + 1.0)
+
+
+def test_an_action_is_told_of_an_episode_in_order_and_closed_at_last() -> None:
+    site = Site(fast(a="recorded"))
+    one_episode(site)
+    site.host.close()
+    assert Recorded.told == [
+        "a started car1",
+        "a 1 samples car1",
+        "a ended Until car1",
+        "a 1 samples car1",
+        "a completed in time car1",
+        "a closed",
+    ]
+    assert site.tally("a").done == 1
+
+
+def test_what_one_raises_fails_that_episode_and_no_other() -> None:
+    site = Site(fast(a="raises", b="recorded"))
+    one_episode(site)
+    one_episode(site, "car2", begin=2.0)
+    site.host.close()
+    tally = site.tally("a")
+    assert (tally.done, tally.failed, tally.running, tally.last_failure) == (1, 1, 0, "the ink is dry")
+    assert site.tally("b").done == 2
+    assert [text for text in Recorded.told if text.startswith("a") and "car1" in text] == ["a started car1"]
+
+
+def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
+    site = Site(fast(a="impossible", b="recorded"))
+    one_episode(site)
+    site.host.close()
+    assert site.tally("a").last_failure == "the action cannot be had: OSError: no paper"
+    assert site.tally("b").done == 1
+
+
+def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted() -> None:
+    site = Site(fast(a="hangs", b="recorded"), maximum_bytes=1000)
+    site.take((0.05, "car1", 1.0), until=0.5)
+    for step in range(40):
+        site.take((0.6 + step / 10, "car1", 1.0), until=0.65 + step / 10)
+    site.take((5.0, "car1", 0.0), until=5.5)
+    site.when(lambda: site.tally("b").done == 1 and site.tally("a").running == 1)
+    SLOW.set()
+    site.when(lambda: site.tally("a").done == 1)
+    [lost] = [each for each in site.host.outcomes.lost() if each.which.action == "a"]
+    assert lost.what == "samples left out, the action being too slow"
+    counted = sum(int(text.split()[1]) for text in Recorded.told if text.startswith("a ") and "samples" in text)
+    assert site.tally("a").missing == lost.count == 42 - counted > 0
+    site.host.close()
+
+
+def test_one_that_hangs_at_the_end_is_left_behind() -> None:
+    site = Site(fast(a="hangs"))
+    one_episode(site)
+    site.host.close(grace=0.05)
+    assert [each.what for each in site.host.outcomes.lost()] == ["times the action did not end and was left behind"]
+
+
+def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_goes_on() -> None:
+    site = Site(fast(a="recorded"))
+    site.take((0.05, "car1", 1.0), until=0.5)
+    site.when(lambda: "a 1 samples car1" in Recorded.told)
+    site.follow(fast(b="recorded"))
+    site.when(lambda: "b started car1" in Recorded.told and "a closed" in Recorded.told)
+    assert "a completed the action was changed or removed car1" in Recorded.told
+    site.host.close()
+
+
+def test_one_is_woken_when_it_wishes_and_what_it_raises_then_is_counted() -> None:
+    Wakes.calls = 0
+    site = Site(fast(a="wakes"))
+    site.when(lambda: Wakes.calls > 5)
+    assert [(each.what, each.count) for each in site.host.outcomes.lost()] == [("times Wakes.wake failed", 1)]
+    site.host.close()
+
+
+def test_one_that_says_nothing_has_failed_at_the_end() -> None:
+    site = Site(fast(a="silent"))
+    one_episode(site)
+    site.host.close()
+    tally = site.tally("a")
+    assert (tally.running, tally.failed, tally.last_failure) == (0, 1, SILENT)
+
+
+def test_each_outcome_is_told_once() -> None:
+    site = Site(fast(a="recorded", b="raises"))
+    one_episode(site)
+    site.host.close()
+    episode = site.published[0][0].split("/")[4]
+    assert sorted(key for key, _ in site.published) == [
+        f"wayside/actions/h/fast/{episode}/a",
+        f"wayside/actions/h/fast/{episode}/b",
+    ]
+    assert any(b'"type":"dev.wayside.action.failed"' in payload for _, payload in site.published)
+
+
+def test_a_plugin_that_is_not_there_is_said_with_its_place() -> None:
+    rule = fast(a="recordet")
+    [problem] = registry.action_problems(rule, DETECTOR)
+    assert str(problem).startswith("spec.actions[0].plugin.name: ")
+    assert "did you mean recorded?" in str(problem)

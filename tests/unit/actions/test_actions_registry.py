@@ -1,0 +1,104 @@
+"""Actions of installed packages: found, given their parameters, and refused with the place of what is wrong."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from pydantic import BaseModel, ConfigDict, Field
+
+from detector import entrypoints
+from detector.actions import Action
+from detector.actions.registry import OFFERS, action_problems, prepare
+from detector.assembly import RuleBook, inlets
+from detector.checking import check_documents
+from tests.driving import a_detector, a_rule
+from wayside.api.documents import load_documents
+
+
+class LampParameters(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    colour: str
+    seconds: float = Field(default=1, gt=0)
+
+
+class Lamp(Action[LampParameters]):
+    """Switches a lamp on."""
+
+    Parameters: ClassVar[type[BaseModel]] = LampParameters
+
+
+class Bare(Action[Any]):
+    """Has no model of its parameters."""
+
+
+@pytest.fixture(autouse=True)
+def packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The classes above as installed actions."""
+    here = [
+        EntryPoint(name, f"{__name__}:{value}", OFFERS.group)
+        for name, value in (("lamp", "Lamp"), ("bare", "Bare"), ("parameters", "LampParameters"), ("lost", "Absent"))
+    ]
+    monkeypatch.setattr(entrypoints, "entry_points", lambda group: here)
+    entrypoints._load.cache_clear()
+
+
+def rule(name: str, **parameters: Any) -> Any:
+    return a_rule(when="true", actions=[{"name": "a", "plugin": {"name": name, "parameters": parameters}}])
+
+
+def test_an_action_gets_its_parameters_as_its_model() -> None:
+    (action,) = rule("lamp", colour="red").spec.actions
+    assert prepare(action) == (Lamp, LampParameters(colour="red"))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "problem"),
+    [
+        ("lamb", {}, "plugin.name: no action lamb is installed here; did you mean lamp? (docs/actions.md)"),
+        ("xyz", {}, "plugin.name: no action xyz is installed here; there are bare, lamp, lost, parameters"),
+        ("lost", {}, "plugin.name: action lost cannot be loaded: AttributeError"),
+        ("parameters", {}, "which is no complete detector.actions.base.Action (docs/actions.md)"),
+        ("bare", {}, "plugin.name: action bare: give tests.unit.actions.test_actions_registry:Bare a class Parameters"),
+        ("deploy", {}, "plugin.name: deploy is no plugin: write deploy: {…} in place of plugin: {…}"),
+        ("lamp", {}, "plugin.parameters.colour: is missing: give it"),
+        ("lamp", {"colour": "red", "seconds": 0}, "plugin.parameters.seconds: must be greater than 0; given: 0"),
+        ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: there is no such field"),
+    ],
+)
+def test_what_is_wrong_with_an_action_is_told_with_its_field(
+    name: str, parameters: dict[str, Any], problem: str
+) -> None:
+    (found,) = action_problems(rule(name, **parameters), a_detector())
+    assert problem in str(found)
+    assert str(found).startswith("spec.actions[0].plugin.")
+
+
+def test_check_tells_line_and_column(tmp_path: Path) -> None:
+    (tmp_path / "d.json").write_text(a_detector().model_dump_json(by_alias=True, exclude_none=True))
+    (tmp_path / "r.yaml").write_text(
+        "apiVersion: wayside.dev/v1alpha1\nkind: EventRule\nmetadata: {name: r}\nspec:\n  when: 'true'\n"
+        "  actions:\n    - name: a\n      plugin: {name: lamp, parameters: {colour: 3}}\n"
+    )
+    (problem,) = check_documents(load_documents([tmp_path]))
+    assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a text, is 3" in str(problem)
+
+
+def test_a_rule_whose_action_is_refused_goes_on_as_it_last_was() -> None:
+    book, detector = RuleBook(), a_detector()
+    book.compile([rule("lamp", colour="red")], detector, inlets(detector).fields)
+    (kept,), (refusal,) = book.compile([rule("lamp")], detector, inlets(detector).fields)
+    assert kept.name == "r"
+    assert refusal.kept
+    assert "plugin.parameters.colour" in str(refusal)
+
+
+def test_of_two_packages_with_the_same_action_the_detectors_own_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = [EntryPoint("lamp", "detector.actions:Action", OFFERS.group)]
+    monkeypatch.setattr(entrypoints, "_foreign", lambda entry: entry not in own)
+    others = entrypoints.entry_points(group=OFFERS.group)
+    monkeypatch.setattr(entrypoints, "entry_points", lambda group: [*others, *own])
+    assert OFFERS.installed()["lamp"] == own[0]

@@ -1,0 +1,70 @@
+"""The rule in docs/notify.md has nothing wrong, and what is wrong with a notify action is told with its place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from detector.actions.notify import Notify
+from detector.checking import check_documents
+from tests.driving import a_detector
+from tests.guides import guide, yaml_blocks
+from wayside.api.actions.notify import Notify as Parameters
+from wayside.api.documents import DocumentError, load_documents
+
+GUIDE = guide("notify")
+HEAD = "apiVersion: wayside.dev/v1alpha1\nkind: EventRule\nmetadata: {name: r}\nspec:\n"
+SIGNAL = "  signals: [{name: v, stream: speed, value: msg.v}]\n  when: v > 1\n  actions:\n    - name: a\n      notify: "
+
+
+def problems(folder: Path, rule: str) -> list[str]:
+    (folder / "d.json").write_text(a_detector().model_dump_json(by_alias=True, exclude_none=True))
+    (folder / "r.yaml").write_text(rule)
+    try:
+        found = check_documents(load_documents([folder]))
+    except DocumentError as error:
+        found = [*error.problems]
+    return [str(each).removeprefix(f"{folder}/") for each in found]
+
+
+def test_the_guides_rule_has_nothing_wrong(tmp_path: Path) -> None:
+    (example,) = yaml_blocks(GUIDE)
+    assert len(yaml.safe_load(example)["actions"]) == 3
+    assert problems(tmp_path, HEAD + "".join(f"  {line}\n" for line in example.splitlines())) == []
+
+
+def test_the_built_in_action_asks_for_what_the_rule_has() -> None:
+    assert Notify.Parameters is Parameters
+
+
+@pytest.mark.parametrize(
+    ("notify", "told"),
+    [
+        (
+            "{zenoh: {key: a}, title: '${clint}'}",
+            "r.yaml:9:40: spec.actions[0].notify.title: title, line 1, column 3: ",
+        ),
+        (
+            "{zenoh: {key: a}, labels: {x: '${v +}'}}",
+            "spec.actions[0].notify.labels: labels.x, line 1, column 6",
+        ),
+        ("{zenoh: {key: 'a/**'}}", "spec.actions[0].notify.zenoh.key: must be a Zenoh key without wildcards"),
+        ("{}", "give exactly one of http, alertmanager and zenoh"),
+        ("{zenoh: {key: a}, http: {url: 'http://a'}}", "give exactly one of http, alertmanager and zenoh"),
+        ("{http: {}}", "give exactly one of url and urlSecret"),
+        ("{http: {url: 'ftp://a'}}", "spec.actions[0].notify.http.url: must be like https://host:port/path"),
+        ("{http: {url: 'http://ann:pass@a/'}}", "(give credentialsSecret)"),
+        ("{zenoh: {key: a}, labels: {a: b}, grouping: {by: [c]}}", "grouping.by names a label"),
+        ("{alertmanager: {url: 'http://a'}, grouping: {}}", "an Alertmanager groups by itself"),
+        ("{alertmanager: {url: 'http://a'}, events: [Started]}", "an Alertmanager groups by itself"),
+        ("{zenoh: {key: a}, events: [Begun]}", "spec.actions[0].notify.events[0]"),
+        ("{zenoh: {key: a}, rate: {messages: 0}}", "spec.actions[0].notify.rate.messages"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, notify: str, told: str) -> None:
+    found = problems(tmp_path, HEAD + SIGNAL + notify + "\n")
+    assert len(found) == 1, found
+    assert found[0].startswith("r.yaml:9:")
+    assert told in found[0]

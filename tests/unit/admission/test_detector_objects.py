@@ -1,0 +1,250 @@
+"""What a Detector's pod is made of: its folders have volumes, its Secrets are mounted, and nothing else changes it."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from application_manager.cli import app
+from application_manager.core.conditions import find
+from application_manager.core.health.pods import Trouble, TroubleReason
+from application_manager.core.objects.detectors import detector_objects, detector_roles, secrets_of
+from application_manager.core.objects.poddefaults import PodDefaults, PullPolicy
+from application_manager.core.objects.rights import detector_rights, merged, rights
+from application_manager.core.statuses.rulestatus import detector_status
+from application_manager.core.statuses.running import NOT_RUN, running
+from tests.cluster.manifests import DETECTOR
+from tests.guides import guide, yaml_blocks
+from tests.unit.manager_objects import NOW
+from wayside.api import Detector
+
+IMAGE = "wayside:1"
+DEFAULTS = PodDefaults(IMAGE)
+
+
+def detector(**spec: Any) -> Detector:
+    raw = copy.deepcopy(DETECTOR)
+    raw["metadata"] |= {"namespace": "site", "uid": "u-1", "generation": 1}
+    raw["spec"] |= {"mode": "Standalone"} | spec
+    return Detector.model_validate(raw)
+
+
+def pod(one: Detector, defaults: PodDefaults = DEFAULTS) -> dict[str, Any]:
+    *_, deployment = detector_objects(one, defaults)
+    spec: dict[str, Any] = deployment["spec"]["template"]["spec"]
+    return spec
+
+
+def mounted(one: Detector) -> dict[str, Any]:
+    """What is mounted, by path."""
+    spec = pod(one)
+    volumes = {each["name"]: each for each in spec["volumes"]}
+    (container,) = spec["containers"]
+    found = {each["mountPath"]: volumes.pop(each["name"]) for each in container["volumeMounts"]}
+    assert not volumes
+    return {path: {key: value for key, value in each.items() if key != "name"} for path, each in found.items()}
+
+
+def test_each_folder_is_in_a_volume_that_lasts_where_a_claim_is_given() -> None:
+    given = detector(
+        state={"path": "/var/lib/wayside"},
+        recordings={"path": "/data/recordings"},
+        database={"uriSecret": "mongo", "spool": {"path": "/data/spool"}, "files": {"path": "/var/lib/wayside/files"}},
+        pod={"volumes": [{"path": "/data", "claim": "town"}, {"path": "/models", "size": "1Gi"}]},
+    )
+    assert mounted(given) == {
+        "/tmp": {"emptyDir": {"sizeLimit": "256Mi"}},
+        "/data": {"persistentVolumeClaim": {"claimName": "town"}},
+        "/models": {"emptyDir": {"sizeLimit": "1Gi"}},
+        "/var/lib/wayside": {"emptyDir": {}},
+        "/etc/wayside/secrets/mongo": {"secret": {"secretName": "mongo", "optional": True}},
+    }
+
+
+def test_a_folder_beside_one_whose_name_it_begins_with_has_a_volume_of_its_own() -> None:
+    given = detector(state={"path": "/data2"}, pod={"volumes": [{"path": "/data", "claim": "town"}]})
+    assert mounted(given)["/data2"] == {"emptyDir": {}}
+
+
+def test_the_secrets_are_those_that_the_detector_names_and_those_that_rules_may_use() -> None:
+    mqtt = {"name": "broker", "plugin": "mqtt", "parameters": {"url": "mqtts://b", "credentialsSecret": "broker"}}
+    given = detector(
+        zenoh={"connect": ["tls/zenoh:7447"], "tlsSecret": "zenoh"},
+        sources=[mqtt],
+        database={"uriSecret": "mongo"},
+        pod={"secrets": ["pager", "mongo"]},
+    )
+    assert secrets_of(given) == ["broker", "mongo", "pager", "zenoh"]
+
+
+def test_what_the_detector_follows_by_itself_does_not_change_the_pod() -> None:
+    changed = detector(clientTimeout="7s", rules={"matchLabels": {"a": "b"}}, buffer={"bytes": "1Gi"})
+    assert detector_objects(changed, DEFAULTS) == detector_objects(detector(), DEFAULTS)
+
+
+def test_all_objects_are_the_detectors_own_and_the_pod_runs_with_its_account() -> None:
+    found = detector_objects(detector(), DEFAULTS)
+    assert [each["kind"] for each in found] == ["ServiceAccount", "Role", "RoleBinding", "Deployment"]
+    for each in found:
+        (owner,) = each["metadata"]["ownerReferences"]
+        assert (owner["kind"], owner["name"], owner["uid"], owner["controller"]) == (
+            "Detector",
+            "intersection-a",
+            "u-1",
+            True,
+        )
+    account, _, binding, deployment = found
+    name = account["metadata"]["name"]
+    assert binding["subjects"] == [{"kind": "ServiceAccount", "namespace": "site", "name": name}]
+    assert deployment["spec"]["template"]["spec"]["serviceAccountName"] == name
+    selector = deployment["spec"]["selector"]["matchLabels"].items()
+    assert selector <= deployment["spec"]["template"]["metadata"]["labels"].items()
+
+
+def test_the_image_and_resources_are_the_detectors_where_it_gives_them() -> None:
+    (container,) = pod(detector())["containers"]
+    assert container["image"] == IMAGE
+    assert container["resources"]["limits"] == {"memory": "1Gi"}
+    own = {"image": "other:2", "resources": {"limits": {"cpu": "2"}}, "nodeSelector": {"site": "a"}}
+    given = pod(detector(pod=own))
+    (container,) = given["containers"]
+    assert container["image"] == "other:2"
+    assert container["resources"]["limits"] == {"cpu": "2"}
+    assert given["nodeSelector"] == {"site": "a"}
+
+
+def test_what_holds_for_all_detectors_is_in_each_pod_and_what_a_detector_says_itself_wins() -> None:
+    environment = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://all:4318", "B": "all"}
+    defaults = PodDefaults(IMAGE, PullPolicy.ALWAYS, ("registry",), environment)
+    key = {"name": "collector", "key": "headers"}
+    own = [{"name": "OTEL_EXPORTER_OTLP_HEADERS", "fromSecret": key}, {"name": "B", "value": "own"}]
+    toleration = {"key": "roadside", "operator": "Exists", "effect": "NoExecute", "tolerationSeconds": 60}
+    given = pod(detector(pod={"env": own, "tolerations": [toleration]}), defaults)
+    (container,) = given["containers"]
+    assert given["imagePullSecrets"] == [{"name": "registry"}]
+    assert given["tolerations"] == [toleration]
+    assert container["imagePullPolicy"] == "Always"
+    assert container["env"][2:] == [
+        {"name": "OTEL_EXPORTER_OTLP_ENDPOINT", "value": "http://all:4318"},
+        {"name": "OTEL_EXPORTER_OTLP_HEADERS", "valueFrom": {"secretKeyRef": key}},
+        {"name": "B", "value": "own"},
+    ]
+    names = [each["name"] for each in container["env"]]
+    assert names[:2] == ["POD_NAME", "POD_UID"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--detector-env", "A=b"], "do nothing without --detector-image"),
+        (["--detector-image", "a", "--detector-env", "A"], "'A' is no variable: write NAME=VALUE"),
+        (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set for each pod by itself"),
+    ],
+)
+def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str], said: str) -> None:
+    refused = CliRunner().invoke(app, ["run", *options])
+    assert refused.exit_code == 2
+    assert said in " ".join(refused.stderr.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ({"state": {"path": "state"}}, "state.path: 'state' is no folder for a volume"),
+        ({"recordings": {"path": "/"}}, "recordings.path: '/' is no folder"),
+        ({"recordings": {"path": "/data/../etc"}}, "give an absolute path"),
+        ({"mode": None, "pod": {}}, "give mode Standalone or Sidecar, or remove pod"),
+        ({"pod": {"volumes": [{"path": "/a", "claim": "b", "size": "1Gi"}]}}, "give claim or size, not both"),
+        ({"pod": {"volumes": [{"path": "/a"}, {"path": "/a"}]}}, "volumes: /a is given twice"),
+        ({"pod": {"env": [{"name": "A", "value": ""}, {"name": "A", "value": "b"}]}}, "env: A is given twice"),
+        ({"pod": {"env": [{"name": "A"}]}}, "give value or fromSecret, one of them"),
+        (
+            {"pod": {"env": [{"name": "POD_UID", "value": "1"}]}},
+            "POD_UID are set for each pod by itself",
+        ),
+        ({"pod": {"tolerations": [{"effect": "NoSchedule"}]}}, "without a key, operator must be Exists"),
+        ({"pod": {"tolerations": [{"key": "a", "operator": "Exists", "value": "b"}]}}, "there is no value"),
+    ],
+)
+def test_what_is_no_pod_is_refused(spec: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValidationError, match="Detector") as refused:
+        detector(**spec)
+    assert said in str(refused.value)
+
+
+def test_without_a_mode_folders_are_the_machines() -> None:
+    assert detector(mode=None, state={"path": "state"}).spec.folders == {"state.path": "state"}
+
+
+def test_the_manager_has_all_that_it_hands_on() -> None:
+    def verbs(rules: list[dict[str, Any]]) -> set[tuple[str, str, str]]:
+        return {
+            (group, resource, verb)
+            for rule in rules
+            for group in rule["apiGroups"]
+            for resource in rule["resources"]
+            for verb in rule["verbs"]
+        }
+
+    unnamed = [rule for rule in merged(rights({}, detectors=True)) if "resourceNames" not in rule]
+    assert verbs(merged(detector_rights("town"))) <= verbs(unnamed)
+    assert not {"escalate", "bind", "*"} & {verb for _, _, verb in verbs(unnamed)}
+    assert verbs(merged(rights({}))) < verbs(unnamed)
+
+
+def test_a_command_prints_the_account_of_a_detector_that_somebody_else_runs() -> None:
+    done = CliRunner().invoke(app, ["detector-rbac", "town", "-n", "site"])
+    assert list(yaml.safe_load_all(done.stdout)) == detector_roles("site", "town")
+    refused = CliRunner().invoke(app, ["detector-rbac", "Town", "-n", "site"])
+    assert refused.exit_code == 2
+    assert "'Town' is no Detector's name" in refused.stderr
+
+
+def deployment(available: int) -> dict[str, Any]:
+    return {
+        "kind": "Deployment",
+        "metadata": {"name": "detector-town", "generation": 1},
+        "spec": {"replicas": 1},
+        "status": {"observedGeneration": 1, "replicas": 1, "updatedReplicas": 1, "availableReplicas": available},
+    }
+
+
+def test_it_runs_when_its_pod_is_ready_and_else_it_is_said_why() -> None:
+    assert running(deployment(1), []).holds
+    assert running(None, []).reason == "NotReady"
+    assert "0 of 1 pods" in running(deployment(0), []).message
+    pulled = running(deployment(0), [Trouble(TroubleReason.IMAGE_PULL_FAILED, "image x cannot be pulled: not found")])
+    assert (pulled.holds, pulled.reason) == (False, "ImagePullFailed")
+    assert "image x cannot be pulled" in pulled.message
+
+
+def test_the_condition_goes_with_the_mode() -> None:
+    said = detector_status(detector(), [], NOW, NOT_RUN)
+    condition = find(said.conditions, "Running")
+    assert condition is not None
+    assert "--detector-image" in condition.message
+    without = detector(mode=None).model_copy(update={"status": said})
+    assert find(detector_status(without, [], NOW).conditions, "Running") is None
+    unknown_yet = detector().model_copy(update={"status": said})
+    assert find(detector_status(unknown_yet, [], NOW).conditions, "Running") == condition
+
+
+def test_the_guide_shows_a_detector_that_keeps_its_files_and_what_resources_are_the_default() -> None:
+    text = guide("detectors")
+    shown = yaml.safe_load(yaml_blocks(text)[0])
+    shown["metadata"] |= {"namespace": "site", "uid": "u-1"}
+    one = Detector.model_validate(shown)
+    assert mounted(one) == {
+        "/tmp": {"emptyDir": {"sizeLimit": "256Mi"}},
+        "/data": {"persistentVolumeClaim": {"claimName": "town-data"}},
+        "/etc/wayside/secrets/pager": {"secret": {"secretName": "pager", "optional": True}},
+        "/etc/wayside/secrets/zenoh-client": {"secret": {"secretName": "zenoh-client", "optional": True}},
+    }
+    (container,) = pod(detector())["containers"]
+    assert container["resources"] == {"requests": {"cpu": "100m", "memory": "256Mi"}, "limits": {"memory": "1Gi"}}
+    assert "requests of 100m and 256Mi, a limit of 1Gi" in text

@@ -1,0 +1,231 @@
+"""What the API server asks before it stores an object, and what it is answered: only a new spec is ever refused."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from kubernetes.aio.client import Configuration
+
+from application_manager.admission.admission import Admission
+from application_manager.cluster.client import ApiError, Client, Resource
+from application_manager.core.findings.findings import Findings
+from application_manager.core.findings.reviews import LONGEST, MOST_TOLD, ReviewError, answer, read
+from application_manager.core.findings.webhooks import Place, webhook_configuration
+from application_manager.core.objects.policy import Policy
+from application_manager.knowledge.world import DETECTOR, EVENT_RULE, TEMPLATE, World
+from application_manager.measures import Measures
+from tests.unit.manager_objects import template
+from tests.unit.templates.test_findings import counting, deploying, detector, rule
+from wayside.api import API_VERSION, Kind
+
+WRONG = Findings(("spec.when: is wrong",), ("it is early",))
+
+
+def question(
+    operation: str = "CREATE", new: Any = None, old: Any = None, kind: str = "EventRule", **more: Any
+) -> dict[str, Any]:
+    asked = {
+        "uid": "u1",
+        "kind": {"group": "wayside.dev", "version": "v1alpha1", "kind": kind},
+        "namespace": "site",
+        "name": "fast",
+        "operation": operation,
+        "object": new,
+        "oldObject": old,
+        **more,
+    }
+    return {"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview", "request": asked}
+
+
+def answered(review: dict[str, Any], findings: Findings = WRONG) -> dict[str, Any]:
+    response = answer(read(review), findings)["response"]
+    assert isinstance(response, dict)
+    assert response["uid"] == "u1"
+    return response
+
+
+OBJECT: dict[str, Any] = {"metadata": {"name": "fast", "labels": {"a": "b"}}, "spec": {"when": "x"}}
+
+
+def test_a_new_object_that_is_wrong_is_refused_with_its_fields() -> None:
+    response = answered(question(new=OBJECT))
+    assert (response["allowed"], response["warnings"]) == (False, ["it is early"])
+    assert (response["status"]["code"], response["status"]["message"]) == (422, "spec.when: is wrong")
+    (cause,) = response["status"]["details"]["causes"]
+    assert (cause["field"], cause["message"]) == ("spec.when", "is wrong")
+
+
+def test_a_doubt_alone_is_a_warning() -> None:
+    response = answered(question(new=OBJECT), Findings((), ("it is early",)))
+    assert (response["allowed"], response["warnings"]) == (True, ["it is early"])
+
+
+METADATA = st.fixed_dictionaries(
+    {"name": st.just("fast")},
+    optional={
+        "labels": st.dictionaries(st.sampled_from("ab"), st.sampled_from("xy"), max_size=2),
+        "annotations": st.dictionaries(st.sampled_from("ab"), st.sampled_from("xy"), max_size=2),
+        "finalizers": st.lists(st.sampled_from("ab"), max_size=2),
+    },
+)
+
+
+@given(METADATA, METADATA, st.sampled_from(["", "status", "scale"]))
+def test_what_leaves_the_spec_as_it_is_is_never_refused(new: Any, old: Any, subresource: str) -> None:
+    spec = {"when": "wrong as it was"}
+    changed, stored = {"metadata": new, "spec": spec, "status": {"n": 1}}, {"metadata": old, "spec": spec}
+    response = answered(question("UPDATE", changed, stored, subResource=subresource))
+    assert response["allowed"]
+    relabelled = new.get("labels") != old.get("labels") and not subresource
+    assert ("warnings" in response) is relabelled
+
+
+@pytest.mark.parametrize(
+    "review",
+    [
+        question("DELETE", None, OBJECT),
+        question("CONNECT", OBJECT),
+        question(new=OBJECT, kind="ApplicationTask"),
+        question(new=OBJECT, kind="ApplicationInstance"),
+        question("UPDATE", {**OBJECT, "metadata": {"name": "f", "deletionTimestamp": "2026-01-01T00:00:00Z"}}, {}),
+        question("UPDATE", {**OBJECT, "spec": {}}, OBJECT, subResource="status"),
+    ],
+    ids=["deleted", "connected", "task", "instance", "going", "status"],
+)
+def test_what_is_not_looked_at_passes_without_a_word(review: dict[str, Any]) -> None:
+    assert answered(review) == {"uid": "u1", "allowed": True}
+
+
+@given(st.lists(st.text(max_size=40).map(lambda text: text * 60), max_size=40))
+def test_warnings_are_few_short_lines_whatever_is_in_them(texts: list[str]) -> None:
+    warnings = answered(question(new=OBJECT), Findings((), tuple(texts))).get("warnings", [])
+    assert len(warnings) <= MOST_TOLD + 1
+    assert all(len(each) <= LONGEST and each.isprintable() for each in warnings)
+
+
+@pytest.mark.parametrize("asked", [None, [], {}, {"apiVersion": "admission.k8s.io/v1"}, question() | {"request": {}}])
+def test_what_is_no_review_is_said_to_be_none(asked: Any) -> None:
+    with pytest.raises(ReviewError, match="only the API server has business here"):
+        read(asked)
+
+
+def test_of_a_kind_that_is_not_looked_at_nothing_is_kept() -> None:
+    assert read(question(new=OBJECT, kind="Anything\n")).kind == ""
+    named = {"metadata": {"name": "a\nb"}, "spec": {}}
+    assert answered(question(new=named))["status"]["details"]["name"] == "a b"
+
+
+def test_the_configuration_asks_about_three_kinds_and_stands_in_nobodys_way() -> None:
+    made = webhook_configuration(Place.of_service("wayside/manager:8443"), b"PEM", ["b", "a"])
+    (webhook,) = made["webhooks"]
+    service = {"namespace": "wayside", "name": "manager", "port": 8443, "path": "/admission"}
+    assert webhook["clientConfig"] == {"service": service, "caBundle": "UEVN"}
+    assert (webhook["failurePolicy"], webhook["sideEffects"], webhook["timeoutSeconds"]) == ("Ignore", "None", 5)
+    (asked,) = webhook["rules"]
+    assert asked["resources"] == ["applicationtemplates", "detectors", "eventrules"]
+    assert asked["operations"] == ["CREATE", "UPDATE"]
+    assert webhook["namespaceSelector"]["matchExpressions"][0]["values"] == ["a", "b"]
+
+
+@pytest.mark.parametrize("url", ["http://a", "https://", "a:1", "https://a/b", "https://u@a", "https://a:123456"])
+def test_a_place_that_is_none_is_refused(url: str) -> None:
+    with pytest.raises(ValueError, match="write https://HOST:PORT"):
+        Place.of_url(url)
+    with pytest.raises(ValueError, match="write NAMESPACE/NAME"):
+        Place.of_service(url)
+
+
+# --- Rules and detectors are judged with each other
+
+
+class Cluster(Client):
+    """An API server with these objects; it is away where there are none."""
+
+    def __init__(self, *objects: Kind) -> None:
+        super().__init__(Configuration())
+        self.objects = objects
+
+    async def list(
+        self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", limit: int = 0
+    ) -> tuple[list[dict[str, Any]], str]:
+        if not self.objects:
+            raise ApiError(503, "away")
+        return [raw(each) for each in self.objects if each.kind == resource.kind], "9"
+
+
+def raw(model: Kind, version: int = 9) -> dict[str, Any]:
+    made = model.to_json()
+    made["metadata"] |= {"uid": f"uid-{model.name}", "resourceVersion": str(version)}
+    return made
+
+
+def reviewed(
+    new: Kind, *known: Kind, live: tuple[Kind, ...] = (), old: Kind | None = None, namespaces: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """What is answered where the manager knows some objects, and the API server has others."""
+
+    async def ask() -> dict[str, Any]:
+        world = World(Policy())
+        for each in known:
+            world.store.put(raw(each, 1))
+        resources = {
+            kind: Resource(API_VERSION, kind[1], f"{kind[1].lower()}s") for kind in (DETECTOR, EVENT_RULE, TEMPLATE)
+        }
+        client = Cluster(*live)
+        admission = Admission(world, client, resources, world.store.put, Measures(), namespaces)
+        asked = question("CREATE" if old is None else "UPDATE", new.to_json(), old and old.to_json(), new.kind)
+        try:
+            return await admission.review(asked)
+        finally:
+            await client.close()
+
+    response = asyncio.run(ask())["response"]
+    assert isinstance(response, dict)
+    return response
+
+
+def test_what_a_rule_has_with_its_detector_is_looked_up_before_it_is_said() -> None:
+    old, new = detector(stream="odometry"), detector()
+    assert reviewed(rule(), old, live=(new,)) == {"uid": "u1", "allowed": True}
+    assert reviewed(rule(), live=(new,)) == {"uid": "u1", "allowed": True}
+    assert not reviewed(rule(), old, live=(old,))["allowed"]
+    assert reviewed(counting("many", "fast"), new, live=(new, rule())) == {"uid": "u1", "allowed": True}
+
+
+def test_where_it_cannot_be_looked_up_it_is_a_warning() -> None:
+    response = reviewed(rule(), detector(stream="odometry"))
+    assert response["allowed"]
+    assert "no stream pose" in response["warnings"][0]
+
+
+def test_what_the_rule_alone_has_is_refused_without_looking_up() -> None:
+    response = reviewed(rule(when="sped > 3"))
+    assert response["status"]["message"].startswith("spec.when: line 1, column 1: `sped`")
+
+
+def test_a_detector_that_leaves_rules_without_their_stream_is_warned_of_them() -> None:
+    before, after = detector(), detector(stream="odometry")
+    response = reviewed(after, before, rule(), old=before)
+    assert response["allowed"]
+    assert response["warnings"][0].startswith("EventRule fast, spec.signals[0].stream")
+    assert "warnings" not in reviewed(detector(clientTimeout="9s", stream="odometry"), after, rule(), old=after)
+
+
+def test_a_template_that_a_rule_names_is_looked_up_before_it_is_missed() -> None:
+    missed = reviewed(deploying(), detector(), live=(detector(),))
+    assert missed["allowed"]
+    assert "there is no ApplicationTemplate app" in missed["warnings"][0]
+    assert reviewed(deploying(), detector(), live=(detector(), template())) == {"uid": "u1", "allowed": True}
+
+
+def test_namespaces_that_are_not_looked_after_are_not_judged() -> None:
+    assert reviewed(rule(when="sped > 3"), namespaces=("other",)) == {"uid": "u1", "allowed": True}
+
+
+def test_an_object_that_is_none_is_refused() -> None:
+    broken = rule().model_copy(update={"kind": "Detector"})
+    assert "spec.streams: is missing" in reviewed(broken)["status"]["message"]

@@ -1,0 +1,362 @@
+"""What a pod gets that asks for a detector: once, without harm to the pod, and never against its Detector's word."""
+
+from __future__ import annotations
+
+import base64
+import copy
+import json
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from application_manager.cli import app
+from application_manager.core.findings.injections import answer_pod, injection, read_pod
+from application_manager.core.findings.reviews import ReviewError
+from application_manager.core.objects.detectors import detector_objects, sidecar_roles
+from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.sidecars import CONTAINER, added, addition, patch, sidecar_pods
+from application_manager.core.statuses.running import carried
+from tests.cluster.manifests import DETECTOR
+from tests.guides import guide, yaml_blocks
+from wayside.api import Detector
+
+IMAGE = "wayside:1"
+DEFAULTS = PodDefaults(IMAGE)
+LABELS = {"wayside.dev/detector": "town"}
+MIRROR = {"kubernetes.io/config.mirror": "x"}
+TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"
+
+Json = dict[str, Any]
+
+
+def detector(**spec: Any) -> Detector:
+    raw = copy.deepcopy(DETECTOR)
+    raw["metadata"] |= {"name": "town", "namespace": "site", "uid": "u-1", "generation": 1}
+    raw["spec"] |= {"mode": "Sidecar", "serviceAccountNames": ["vehicle"]} | spec
+    return Detector.model_validate(raw)
+
+
+def pod(**spec: Any) -> Json:
+    main = {"name": "main", "image": "app:1"}
+    return {
+        "apiVersion": "v1",
+        "kind": "Pod",
+        "metadata": {"name": "car", "labels": LABELS},
+        "spec": {"serviceAccountName": "vehicle", "containers": [main]} | spec,
+    }
+
+
+def injected(one: Json, of: Detector) -> Json:
+    found = addition(one["spec"], of, DEFAULTS)
+    return one if found is None else one | {"spec": added(one["spec"], found)}
+
+
+def sidecar(one: Json) -> Json:
+    (found,) = (each for each in one["spec"]["initContainers"] if each["name"] == CONTAINER)
+    return dict(found)
+
+
+def why_not(one: Json, of: Detector | None, defaults: PodDefaults | None = DEFAULTS) -> str:
+    found = injection(one["metadata"], one["spec"], "site", of, defaults)
+    assert found.addition is None
+    return found.why_not or ""
+
+
+names = st.sampled_from(["main", "wayside-detector", "log", "wayside-scratch", "wayside-token", "data"])
+ports = st.lists(st.fixed_dictionaries({"containerPort": st.integers(9463, 9466)}), max_size=3)
+containers = st.lists(
+    st.fixed_dictionaries({"name": names, "image": st.just("a:1")}, optional={"ports": ports}),
+    max_size=4,
+    unique_by=lambda each: str(each["name"]),
+)
+volumes = st.lists(
+    st.fixed_dictionaries({"name": names, "emptyDir": st.just({})}),
+    max_size=3,
+    unique_by=lambda each: str(each["name"]),
+)
+specs = st.fixed_dictionaries(
+    {"containers": containers},
+    optional={
+        "initContainers": st.one_of(st.none(), containers),
+        "volumes": st.one_of(st.none(), volumes),
+        "hostNetwork": st.booleans(),
+        "serviceAccountName": st.just("vehicle"),
+    },
+)
+detectors = st.sampled_from(
+    [
+        detector(),
+        detector(zenoh={"connect": ["tls/zenoh:7447"], "tlsSecret": "zenoh"}),
+        detector(state={"path": "/state"}, pod={"volumes": [{"path": "/data", "claim": "town"}], "secrets": ["pager"]}),
+    ]
+)
+
+
+def applied(document: Json, operations: list[Json]) -> Json:
+    """A JSON patch of additions, as RFC 6902 has it."""
+    document = copy.deepcopy(document)
+    for each in operations:
+        assert each["op"] == "add"
+        *path, last = each["path"].split("/")[1:]
+        target: Any = document
+        for step in path:
+            target = target[step]
+        if last == "-":
+            target.append(each["value"])
+        else:
+            target[last] = each["value"]
+    return document
+
+
+@given(specs, detectors)
+def test_it_comes_in_once_by_its_patch_and_takes_nothing_from_the_pod(spec: Json, of: Detector) -> None:
+    before = copy.deepcopy(spec)
+    metadata = {"name": "car", "labels": LABELS}
+    found = injection(metadata, spec, "site", of, DEFAULTS)
+    assert spec == before
+    if found.addition is None:
+        return
+    after = added(spec, found.addition)
+    assert applied({"spec": spec}, patch(spec, found.addition)) == {"spec": after}
+    again = injection(metadata, after, "site", of, DEFAULTS)
+    assert (again.addition, again.why_not) == (None, None)
+    for field in ("initContainers", "volumes"):
+        there = spec.get(field) or []
+        assert after[field][: len(there)] == there
+        every = [each["name"] for each in after[field]]
+        assert [name for name in every if every.count(name) > 1] == []
+    assert {key: after[key] for key in spec if key not in ("initContainers", "volumes")} == {
+        key: spec[key] for key in spec if key not in ("initContainers", "volumes")
+    }
+    mine = sidecar({"spec": after})
+    paths = [each["mountPath"] for each in mine["volumeMounts"]]
+    assert len(set(paths)) == len(paths)
+    assert {each["name"] for each in mine["volumeMounts"]} <= {each["name"] for each in after["volumes"]}
+    taken = {port["containerPort"] for each in spec["containers"] for port in each.get("ports", [])}
+    assert not taken & {port["containerPort"] for port in mine.get("ports", [])}
+
+
+def test_nothing_of_the_pod_waits_for_it() -> None:
+    made = sidecar(injected(pod(), detector()))
+    assert made["restartPolicy"] == "Always"
+    assert "startupProbe" not in made
+    assert "readinessProbe" not in made
+    assert made["livenessProbe"]["httpGet"]["port"] == made["ports"][0]["name"]
+    assert made["livenessProbe"]["initialDelaySeconds"] == 120
+    first = {"name": "prepare", "image": "a:1"}
+    assert [each["name"] for each in injected(pod(initContainers=[first]), detector())["spec"]["initContainers"]] == [
+        "prepare",
+        CONTAINER,
+    ]
+
+
+def test_it_holds_for_its_pod_with_a_token_of_its_own_under_the_restricted_standard() -> None:
+    made = injected(pod(automountServiceAccountToken=False), detector())
+    mine = sidecar(made)
+    assert mine["command"] == [
+        "detector", "run", "--name=town", "--metrics-port=9464", "--as-pod", "--namespace=$(POD_NAMESPACE)",
+    ]  # fmt: skip
+    told = {each["name"]: each["valueFrom"]["fieldRef"]["fieldPath"] for each in mine["env"]}
+    assert told == {"POD_NAME": "metadata.name", "POD_UID": "metadata.uid", "POD_NAMESPACE": "metadata.namespace"}
+    (token,) = (each["name"] for each in mine["volumeMounts"] if each["mountPath"] == TOKEN)
+    (volume,) = (each for each in made["spec"]["volumes"] if each["name"] == token)
+    assert volume["projected"]["sources"][0]["serviceAccountToken"]["path"] == "token"
+    assert mine["securityContext"] == {
+        "allowPrivilegeEscalation": False,
+        "capabilities": {"drop": ["ALL"]},
+        "readOnlyRootFilesystem": True,
+        "runAsNonRoot": True,
+        "runAsUser": 65532,
+        "runAsGroup": 65532,
+        "seccompProfile": {"type": "RuntimeDefault"},
+    }
+
+
+def test_its_folders_secrets_and_resources_are_as_of_a_standalone_detectors_pod() -> None:
+    pod_says = {"image": "own:2", "secrets": ["pager"], "resources": {"limits": {"memory": "2Gi"}}}
+    given_one = {"state": {"path": "/state"}, "pod": pod_says, "zenoh": {"connect": ["tls/z:7447"], "tlsSecret": "z"}}
+    mine = sidecar(injected(pod(), detector(**given_one)))
+    *_, deployment = detector_objects(detector(**given_one, mode="Standalone", serviceAccountNames=None), DEFAULTS)
+    (own,) = deployment["spec"]["template"]["spec"]["containers"]
+    assert (mine["image"], mine["resources"]) == (own["image"], own["resources"])
+    paths = {each["mountPath"] for each in mine["volumeMounts"]}
+    assert paths == {each["mountPath"] for each in own["volumeMounts"]} | {TOKEN}
+
+
+def test_the_guides_pod_gets_the_guides_detector() -> None:
+    section = guide("detectors").partition("## As a sidecar")[2]
+    of, asked = yaml.safe_load_all(yaml_blocks(section)[0])
+    found = injection(asked["metadata"], asked["spec"], "default", Detector.model_validate(of), DEFAULTS)
+    assert found.why_not is None
+    assert found.addition is not None
+
+
+def test_what_is_needed_to_pull_its_image_or_would_keep_the_pod_from_starting_is_seen_to() -> None:
+    variables = [{"name": "TOKEN", "fromSecret": {"name": "pager", "key": "token"}}]
+    defaults = PodDefaults(IMAGE, pull_secrets=("registry", "mirror"))
+    given_one = pod(imagePullSecrets=[{"name": "registry"}, {"name": "own"}])["spec"]
+    found = addition(given_one, detector(pod={"env": variables}), defaults)
+    assert found is not None
+    after = added(given_one, found)
+    assert [each["name"] for each in after["imagePullSecrets"]] == ["registry", "own", "mirror"]
+    (token,) = (each for each in sidecar({"spec": after})["env"] if each["name"] == "TOKEN")
+    assert token["valueFrom"]["secretKeyRef"] == {"name": "pager", "key": "token", "optional": True}
+
+
+def test_in_the_nodes_network_it_takes_no_port() -> None:
+    mine = sidecar(injected(pod(hostNetwork=True), detector()))
+    assert "ports" not in mine
+    assert "livenessProbe" not in mine
+    assert not [each for each in mine["command"] if "metrics" in each]
+
+
+@pytest.mark.parametrize(
+    ("asked", "of", "said"),
+    [
+        (pod(), None, "namespace site has no Detector 'town'"),
+        (pod(), detector(mode="Standalone", serviceAccountNames=None), "is of mode Standalone: give it mode Sidecar"),
+        (pod(), detector(mode=None, serviceAccountNames=None), "is without a mode: give it mode Sidecar"),
+        (pod(serviceAccountName="other"), detector(), "has only vehicle, not other"),
+        (pod(serviceAccountName=None), detector(), "has only vehicle, not default"),
+        (pod(), detector(serviceAccountNames=[]), "has none, not vehicle"),
+        (pod(volumes=[{"name": "wayside-scratch", "hostPath": {}}]), detector(), "the name wayside-scratch is taken"),
+        (pod(), detector(state={"path": TOKEN}), f"has two volumes at {TOKEN}"),
+        (pod() | {"metadata": {"labels": LABELS, "annotations": MIRROR}}, detector(), "static"),
+    ],
+)  # fmt: skip
+def test_why_a_pod_goes_without_is_said_with_the_remedy(asked: Json, of: Detector | None, said: str) -> None:
+    assert said in why_not(asked, of)
+
+
+def test_a_detector_that_is_not_accepted_comes_into_no_pod() -> None:
+    wrong = [{"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "stamp": "msg.t +"}]
+    assert "is not accepted" in why_not(pod(), detector(streams=wrong))
+
+
+def test_a_manager_that_runs_no_detectors_says_so() -> None:
+    assert "--detector-image" in why_not(pod(), detector(), None)
+
+
+def test_a_pod_that_asks_for_none_or_has_a_container_of_the_name_is_left_alone() -> None:
+    unlabelled = pod() | {"metadata": {"name": "car"}}
+    assert why_not(unlabelled, None) == ""
+    theirs = pod(containers=[{"name": CONTAINER, "image": "mine:1"}])
+    assert why_not(theirs, detector()) == ""
+
+
+def review(one: Json, **more: Any) -> Json:
+    request = {
+        "uid": "q",
+        "kind": {"group": "", "kind": "Pod"},
+        "operation": "CREATE",
+        "namespace": "site",
+        "object": one,
+    }
+    return {"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview", "request": request | more}
+
+
+def test_the_answer_always_allows_with_a_patch_or_a_warning() -> None:
+    asked = read_pod(review(pod()))
+    response = answer_pod(asked, injection(asked.pod["metadata"], asked.pod["spec"], "site", detector(), DEFAULTS))[
+        "response"
+    ]
+    assert (response["uid"], response["allowed"], response["patchType"]) == ("q", True, "JSONPatch")
+    assert applied(pod(), json.loads(base64.b64decode(response["patch"]))) == injected(pod(), detector())
+    response = answer_pod(asked, injection(asked.pod["metadata"], asked.pod["spec"], "site", None, DEFAULTS))[
+        "response"
+    ]
+    assert (response["allowed"], "patch" in response) == (True, False)
+    assert "it is made without a detector: label wayside.dev/detector" in response["warnings"][0]
+
+
+def test_only_a_new_pod_is_looked_at() -> None:
+    for more in (
+        {"operation": "UPDATE"},
+        {"subResource": "ephemeralcontainers"},
+        {"kind": {"group": "apps", "kind": "Pod"}},
+    ):
+        assert read_pod(review(pod(), **more)).pod == {}
+    for none in (None, {}, {"apiVersion": "admission.k8s.io/v1"}, {"apiVersion": "admission.k8s.io/v1", "request": {}}):
+        with pytest.raises(ReviewError):
+            read_pod(none)
+
+
+def test_the_accounts_and_no_others_are_bound_to_what_the_detector_needs() -> None:
+    role, binding = detector_objects(detector(serviceAccountNames=["vehicle", "bus"]), DEFAULTS)
+    assert [each["name"] for each in binding["subjects"]] == ["bus", "vehicle"]
+    rules = {
+        (resource, verb, *rule.get("resourceNames", []))
+        for rule in role["rules"]
+        for resource in rule["resources"]
+        for verb in rule["verbs"]
+    }
+    assert ("detectors", "hold-as-pod", "town") in rules
+    assert {each for each in rules if each[1] == "hold"} == set()
+    assert detector_objects(detector(serviceAccountNames=[]), DEFAULTS)[1]["subjects"] == []
+
+
+def test_who_puts_it_into_pods_by_hand_is_told_the_same_rights() -> None:
+    options = ["detector-rbac", "town", "-n", "site", "--pod-account", "vehicle"]
+    done = CliRunner().invoke(app, options)
+    assert list(yaml.safe_load_all(done.stdout)) == sidecar_roles("site", "town", ["vehicle"])
+    refused = CliRunner().invoke(app, [*options[:-1], "Vehicle"])
+    assert "'Vehicle' is no account's name" in refused.stderr
+
+
+def state(one: Json, **how: Any) -> Json:
+    name = "wayside-detector"
+    return one | {"status": {"phase": "Running", "initContainerStatuses": [{"name": name, "image": IMAGE, **how}]}}
+
+
+def test_the_condition_says_in_how_many_pods_it_runs_and_what_keeps_it_from_running() -> None:
+    of = detector()
+    runs = state(injected(pod(), of), state={"running": {}}, ready=True)
+    said = carried(of, [runs, pod()])
+    assert (said.holds, said.message) == (
+        True,
+        "it runs in 1 of 2 pods that ask for it; 1 were made without it: their Events say why",
+    )
+    waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
+    said = carried(of, [runs, state(injected(pod(), of), state=waiting)])
+    assert (said.holds, said.reason) == (False, "ImagePullFailed")
+    assert said.message == "it runs in 1 of 2 pods that ask for it: image wayside:1 cannot be pulled: not found"
+    broken = runs | {"status": runs["status"] | {"containerStatuses": [{"name": "main", "state": waiting}]}}
+    assert carried(of, [broken]).holds
+    assert [each["spec"]["initContainers"][0]["name"] for each in sidecar_pods([broken, pod()])] == [CONTAINER]
+    assert carried(detector(serviceAccountNames=[]), []).reason == "NoAccounts"
+
+
+def test_pods_that_are_over_are_no_trouble() -> None:
+    of, killed = detector(), {"terminated": {"exitCode": 137}}
+    one = state(injected(pod(restartPolicy="OnFailure"), of), state=killed)
+    over = one | {"status": one["status"] | {"containerStatuses": [{"name": "main", "state": killed}]}}
+    said = carried(of, [over, one | {"metadata": one["metadata"] | {"deletionTimestamp": "2026-01-01T00:00:00Z"}}])
+    assert (said.holds, said.message) == (True, "it runs in 0 of 0 pods that ask for it")
+    assert carried(of, [one]).reason == "CrashLoop"
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ({"mode": "Standalone"}, "serviceAccountNames says nothing without mode Sidecar"),
+        ({"mode": None}, "serviceAccountNames says nothing without mode Sidecar"),
+        ({"pod": {"nodeSelector": {"a": "b"}}}, "pod.nodeSelector and pod.tolerations: with mode Sidecar"),
+        ({"serviceAccountNames": ["a", "a"]}, "serviceAccountNames: a is given twice"),
+        ({"state": {"path": "state"}}, "state.path: 'state' is no folder for a volume"),
+        (
+            {"pod": {"resources": {"requests": {"memory": "2Gi"}}}},
+            "requests.memory: 2Gi is more than limits.memory, 1Gi",
+        ),
+        ({"pod": {"resources": {"requests": {"x": "1"}}}}, "requests: 'x' is no resource"),
+        ({"pod": {"resources": {"requests": {"a.b/gpu": "1"}}}}, "requests.a.b/gpu: 1 must be the same as limits"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_its_field(spec: Json, said: str) -> None:
+    with pytest.raises(ValidationError) as refused:
+        detector(**spec)
+    assert said in str(refused.value)

@@ -1,0 +1,49 @@
+"""What the image is made of: pinned, with hashes, and all that the programs ask for."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+from tests.guides import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DOCKERFILE = (ROOT / "Dockerfile").read_text()
+EXTRAS = ("etsi", "mqtt", "otel")
+PINS = {
+    canonicalize_name(name): (Version(version), block)
+    for block in re.split(r"\n(?=\S)", (ROOT / "docker" / "requirements.txt").read_text())
+    for name, version in re.findall(r"^([\w.-]+)==([^\s;\\]+)", block)
+}
+ASKED = [*PROJECT["dependencies"], *(each for extra in EXTRAS for each in PROJECT["optional-dependencies"][extra])]
+
+
+@pytest.mark.parametrize("asked", ASKED)
+def test_the_image_has_what_the_programs_ask_for(asked: str) -> None:
+    requirement = Requirement(asked)
+    assert (name := canonicalize_name(requirement.name)) in PINS, "run `make requirements`"
+    assert requirement.specifier.contains(PINS[name][0]), "run `make requirements`"
+
+
+def test_every_package_is_pinned_by_hashes() -> None:
+    assert [name for name, (_, block) in PINS.items() if "--hash=sha256:" not in block] == []
+
+
+def test_the_base_is_pinned_by_its_digest_and_the_user_is_not_root() -> None:
+    assert re.search(r"^ARG BASE=\S+@sha256:[0-9a-f]{64}$", DOCKERFILE, re.MULTILINE)
+    assert re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE) == ["${BASE}", "${BASE}"]
+    assert re.search(r"^USER 65532:65532$", DOCKERFILE, re.MULTILINE)
+
+
+def test_what_the_dockerfile_copies_exists_and_is_let_through() -> None:
+    let_through = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    copied = {
+        name for line in re.findall(r"^COPY (?!--from)(.*) \S+$", DOCKERFILE, re.MULTILINE) for name in line.split()
+    }
+    assert copied == let_through
+    assert all((ROOT / name).exists() for name in copied)

@@ -1,0 +1,110 @@
+"""The roles follow from the allowed kinds, and are as small as these."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from application_manager.cli import app
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.cluster.entitlement import judge
+from application_manager.core.objects.policy import DEFAULT_PLURALS, KindKey
+from application_manager.core.objects.rights import merged, rights, roles
+from tests.guides import guide
+
+DEPLOYMENT: KindKey = ("apps/v1", "Deployment")
+ACCOUNT = ("system", "manager")
+LEASE = ("system", "application-manager")
+
+
+def verbs(plurals: dict[KindKey, str]) -> dict[tuple[str, str], set[str]]:
+    return {
+        (group, resource): set(rule["verbs"])
+        for rule in merged(rights(plurals))
+        for group in rule["apiGroups"]
+        for resource in rule["resources"]
+    }
+
+
+def test_a_kind_that_is_not_allowed_is_in_no_role() -> None:
+    found = verbs({DEPLOYMENT: "deployments"})
+    assert found["apps", "deployments"] == {"get", "list", "watch", "create", "patch", "delete"}
+    assert found["apps", "deployments/scale"] == {"patch"}
+    assert found["", "pods"] == {"list", "watch", "patch"}
+    assert {group for group, _ in found} == {"", "apps", "coordination.k8s.io", "events.k8s.io", "wayside.dev"}
+    assert ("", "secrets") not in found
+    assert ("", "secrets") in verbs(dict(DEFAULT_PLURALS))
+
+
+def test_nothing_is_granted_by_a_wildcard_and_no_rights_can_be_given_on() -> None:
+    for rule in merged(rights(dict(DEFAULT_PLURALS))):
+        assert "*" not in str(rule)
+        assert not {"escalate", "bind", "impersonate"} & set(rule["verbs"])
+
+
+def test_namespaces_have_a_role_each_and_all_of_them_a_cluster_role() -> None:
+    where = [(each["kind"], each["metadata"].get("namespace")) for each in roles({}, ["a", "b"], LEASE, ACCOUNT)]
+    own = [("Role", "system"), ("RoleBinding", "system")]
+    assert where == [(kind, each) for each in ("a", "b") for kind in ("Role", "RoleBinding")] + own
+    everywhere = roles({}, [], LEASE, ACCOUNT)
+    assert [each["kind"] for each in everywhere] == ["ClusterRole", "ClusterRoleBinding", "Role", "RoleBinding"]
+    assert everywhere[2]["rules"][0]["resourceNames"] == ["application-manager"]
+    assert all(each["subjects"][0]["name"] == "manager" for each in everywhere if "subjects" in each)
+
+
+def test_the_command_prints_what_the_table_says() -> None:
+    done = CliRunner().invoke(app, ["rbac", "--allowed-kinds", "apps/v1/Deployment", "--account", "system/manager"])
+    assert done.exit_code == 0
+    assert list(yaml.safe_load_all(done.stdout)) == roles({DEPLOYMENT: "deployments"}, [], LEASE, ACCOUNT)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--account", "manager"], "write NAMESPACE/NAME"),
+        (["--allowed-kinds", "rbac.authorization.k8s.io/v1/Role"], "can never be allowed"),
+        (["--lease", "wayside-town"], "write NAME or NAMESPACE/NAME"),
+    ],
+)
+def test_what_cannot_be_is_refused(arguments: list[str], said: str) -> None:
+    done = CliRunner().invoke(app, ["rbac", *arguments])
+    assert done.exit_code == 2
+    assert said in " ".join(done.output.replace("│", " ").split())
+
+
+def test_a_kind_that_nobody_knows_is_looked_up_in_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KUBECONFIG", "/nonexistent")
+    done = CliRunner().invoke(app, ["rbac", "--allowed-kinds", "example.com/v1/Widget"])
+    assert isinstance(done.exception, ConfigurationError)
+    assert "what roles call example.com/v1/Widget only a cluster knows" in str(done.exception)
+
+
+def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
+    needed = {(each.resource, each.vital): each for each in rights({DEPLOYMENT: "deployments"})}
+    judge([(needed["deployments", False], "patch", "a")])
+    (said,) = caplog.messages
+    assert said == (
+        "its account may not patch deployments of apps in namespace a: no Deployment of a template is made, changed or "
+        "removed: grant what `application-manager rbac` prints"
+    )
+    with pytest.raises(ConfigurationError, match="may not list pods in all namespaces: why workloads do not run"):
+        judge([(needed["pods", True], "list", None)])
+
+
+def test_the_guides_command_gives_what_the_guides_manager_needs() -> None:
+    text = guide("manager").replace("\\\n", " ")
+    command, run = (
+        shlex.split(line.partition("|")[0])[2:]
+        for line in text.splitlines()
+        if re.match(r"\$ application-manager r[bu]", line)
+    )
+    assert (command[0], run[0]) == ("rbac", "run")
+    assert [each for each in run[1:] if each not in command] == [], "both mean the same kinds and namespaces"
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0
+    kinds = {each["kind"] for each in yaml.safe_load_all(done.stdout)}
+    assert kinds == {"Role", "RoleBinding"}

@@ -1,0 +1,308 @@
+"""When rules are evaluated: with samples, on demand, not while paused, less often under load; and how often at most."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from detector.assembly import inlets, make_engine
+from detector.engine.engine import NoAnswerError
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.events import Event
+from detector.engine.samples.intake import Intake
+from detector.engine.samples.sample import Arrival
+from detector.engine.timing.load import highest_level, thinning
+from detector.evaluator import Evaluator
+from detector.overload import CALM, LONG, Overload
+from detector.replay.intake_file import Control
+from detector.replay.replaying import replay_intake
+from detector.restoring import Restored
+from detector.rules.selection import RuleSet
+from tests.driving import (
+    POSITION,
+    SECOND,
+    SPEED,
+    START,
+    Drive,
+    a_detector,
+    a_rule,
+    a_stream,
+    arrival,
+    at,
+    compiled,
+    lines,
+    place,
+    speed,
+)
+
+
+def fast(name: str = "r", **spec: Any) -> Any:
+    return a_rule(name, **{"signals": [SPEED], "when": "speed > 10", "evaluation": {"onSample": "speed"}, **spec})
+
+
+def test_with_on_sample_a_rule_is_evaluated_at_the_time_of_each_sample() -> None:
+    drive = Drive(a_detector(), fast())
+    told = drive.take(speed(0.25, 5), place(0.26, "car", 1), speed(0.3, 20), speed(0.7, 5), until=2)
+    assert told == ["r car started 0.3", "r car Until 0.7"]
+    assert drive.engine.counters.rule("r").evaluations == 3
+
+
+def test_with_on_sample_others_are_not_looked_at() -> None:
+    drive = Drive(
+        a_detector(), fast(signals=[{"name": "age", "stream": "speed", "aggregate": "Age"}], when="age > 0.1")
+    )
+    assert drive.take(speed(0.1, 0, "a"), speed(0.3, 0, "b"), until=0.9) == []
+    assert drive.engine.counters.rule("r").evaluations == 2
+
+
+def test_a_for_that_is_over_wakes_a_rule_with_on_sample() -> None:
+    drive = Drive(a_detector(), fast(**{"for": "2s"}))
+    assert drive.take(speed(0.3, 20), until=5) == ["r car started 2.3"]
+
+
+def test_a_cooldown_that_is_over_wakes_a_rule_with_on_sample() -> None:
+    drive = Drive(a_detector(), fast(cooldown="3s", until="speed > 30"))
+    told = drive.take(speed(0.3, 20), speed(0.5, 40), speed(0.6, 20), until=6)
+    assert told == ["r car started 0.3", "r car Until 0.5", "r car started 3.5"]
+
+
+def test_an_unknown_timeout_that_is_over_wakes_a_rule_with_on_sample() -> None:
+    drive = Drive(a_detector(), fast(unknownTimeout="2s"))
+    told = drive.take(speed(0.3, 20), speed(0.5, 20), arrival(1.2, "car", {}), until=6)
+    assert told == ["r car started 0.3", "r car Unknown 3.2"]
+
+
+def test_a_lost_client_ends_the_episodes_of_a_rule_with_on_sample() -> None:
+    drive = Drive(a_detector(clientTimeout="5s"), fast())
+    assert drive.take(speed(0.3, 20), until=9) == ["r car started 0.3", "r car ClientLost 6"]
+
+
+def test_who_is_lost_and_who_wakes_at_one_tick_are_told_in_order_of_the_subjects() -> None:
+    drive = Drive(a_detector(clientTimeout="4s"), fast(unknownTimeout="2s"))
+    told = drive.take(speed(0.1, 20, "b"), speed(0.2, 20, "a"), arrival(3, "a", {}), until=5)
+    assert told[2:] == ["r a Unknown 5", "r b ClientLost 5"]
+
+
+def test_a_subject_that_was_lost_when_its_time_was_over_is_not_looked_at_with_the_samples_of_others() -> None:
+    drive = Drive(a_detector(clientTimeout="2s"), fast(cooldown="20s", until="speed < 10"))
+    drive.take(speed(0.3, 20, "a"), speed(0.5, 5, "a"), until=20.9)
+    counters = drive.engine.counters.rule("r")
+    before = counters.evaluations
+    drive.take(place(21.0, "a", 0), speed(21.5, 5, "b"), until=22)
+    assert counters.evaluations == before + 1
+
+
+def test_with_on_sample_all_pairs_of_the_samples_client_are_evaluated_and_no_others() -> None:
+    scope = {"pairs": {"position": POSITION, "within": 100}}
+    rule = a_rule("near", scope=scope, when="distance < 50", evaluation={"onSample": "pose"})
+    drive = Drive(a_detector(), rule)
+    places = [place(0.1, "a", 0), place(0.2, "b", 10), place(0.3, "c", 20)]
+    told = drive.take(*places, until=0.9)
+    assert told == ["near a+b started 0.2", "near a+c started 0.3", "near b+c started 0.3"]
+
+
+def test_with_clock_data_a_sample_is_evaluated_at_its_stamp_once_lateness_has_passed() -> None:
+    detector = a_detector(a_stream("speed", stamp="msg.t"), clock="Data", lateness="500ms")
+    drive = Drive(detector, fast())
+
+    def stamped(seconds: float, value: float) -> Arrival:
+        return arrival(seconds, "car", {"v": value, "t": at(seconds) / SECOND})
+
+    first = [stamped(0.1, 5), stamped(0.4, 20), stamped(0.3, 5), stamped(0.9, 20)]
+    assert drive.note(drive.engine.advance(first, 0)) == ["r car started 0.4"]
+    assert drive.note(drive.engine.advance([stamped(0.5, 5), stamped(1.2, 5)], 0)) == ["r car Until 0.5"]
+    assert drive.note(drive.engine.advance([stamped(2.0, 5)], 0)) == ["r car started 0.9", "r car Until 1.2"]
+
+
+def test_how_arrivals_are_parcelled_changes_nothing() -> None:
+    arrivals = [speed(0.3 * n, 20 if n % 7 > 2 else 5, "ab"[n % 2]) for n in range(1, 60)]
+    rules = [fast(**{"for": "500ms"}), fast("p", evaluation={"every": "1s"})]
+    whole = Drive(a_detector(), *rules)
+    whole.take(*arrivals, until=20)
+    parts = Drive(a_detector(), *rules)
+    for each in arrivals:
+        parts.take(until=(each.received - START) / SECOND - 0.1)
+        parts.take(each, until=0)
+    parts.take(until=20)
+    assert lines(whole.events) == lines(parts.events) != []
+
+
+def test_on_demand_a_rule_is_evaluated_when_asked_and_tells_what_it_says_of_each_subject() -> None:
+    drive = Drive(a_detector(), fast(evaluation={"onDemand": True}))
+    assert drive.take(speed(0.3, 20, "a"), speed(0.4, 5, "b"), arrival(0.5, "c", {}), until=3) == []
+    events, answers = drive.engine.ask("r")
+    assert drive.note(events) == ["r a started 3"]
+    assert [(each.subject, each.when, each.values, each.episode is not None) for each in answers] == [
+        ("a", True, {"speed": 20}, True),
+        ("b", False, {"speed": 5}, False),
+        ("c", None, {}, False),
+    ]
+    assert drive.take(speed(3.5, 5, "a"), until=4) == []
+    assert drive.note(drive.engine.ask("r")[0]) == ["r a Until 4"]
+
+
+def test_only_rules_with_on_demand_can_be_asked() -> None:
+    drive = Drive(a_detector(), fast(), fast("q", evaluation={"onDemand": True}))
+    with pytest.raises(NoAnswerError, match="there is no rule x; there is q, r"):
+        drive.engine.ask("x")
+    with pytest.raises(NoAnswerError, match="rule r is not evaluated on demand"):
+        drive.engine.ask("r")
+    drive.engine.set_paused({"q"})
+    with pytest.raises(NoAnswerError, match="rule q is paused"):
+        drive.engine.ask("q")
+
+
+def test_a_paused_rule_keeps_its_open_episodes_and_forgets_what_was_pending() -> None:
+    drive = Drive(a_detector(), fast(**{"for": "2s"}, evaluation={"every": "1s"}))
+    assert drive.take(speed(0.1, 20, "a"), speed(1.1, 20, "b"), until=3) == ["r a started 3"]
+    drive.engine.set_paused({"r"})
+    assert drive.take(speed(3.1, 5, "a"), until=6) == []
+    drive.engine.set_paused(set())
+    assert drive.take(until=10) == ["r a Until 7", "r b started 9"]
+
+
+def test_more_episodes_than_a_client_may_start_within_an_hour_are_left_out_and_counted() -> None:
+    drive = Drive(a_detector(clientTimeout="2h"), fast(evaluation={"every": "1s"}, maxEpisodesPerHour=2))
+    blinks = [
+        speed(n + 0.5, 20 if n % 2 else 5, client) for n in range(8) for client in ("a", "b") if client == "a" or n < 3
+    ]
+    told = drive.take(*blinks, speed(3600.5, 5, "a"), speed(3601.5, 20, "a"), until=3602)
+    assert [each for each in told if "started" in each] == [
+        "r a started 2",
+        "r b started 2",
+        "r a started 4",
+        "r a started 3602",  # an hour after the first one
+    ]
+    assert drive.engine.counters.rule("r").suppressed == 2
+
+
+def test_an_episode_of_a_dry_run_says_so() -> None:
+    drive = Drive(a_detector(), fast(dryRun=True), fast("real"))
+    drive.take(speed(0.5, 20), until=1)
+    dry, real = (event.cloud_event()["data"] for event in drive.events)
+    assert dry["dryRun"] is True
+    assert "dryRun" not in real
+
+
+def test_under_load_rules_of_lowest_priority_are_left_out_first_and_visibly() -> None:
+    rules = [
+        fast("low", evaluation={"every": "1s", "priority": -1}),
+        fast("high", evaluation={"every": "1s"}),
+        fast("sampled", evaluation={"onSample": "speed", "priority": -1}),
+    ]
+    drive = Drive(a_detector(), *rules)
+    drive.engine.set_level(2)
+    drive.take(*(speed(n + 0.5, 5) for n in range(16)), until=16)
+    counts = {name: drive.engine.counters.rule(name) for name in ("low", "high", "sampled")}
+    assert {name: (each.evaluations, each.skipped) for name, each in counts.items()} == {
+        "low": (4, 12),
+        "high": (16, 0),
+        "sampled": (4, 12),
+    }
+    drive.engine.set_level(0)
+    drive.take(speed(16.5, 5), until=17)
+    assert counts["low"].evaluations == 5
+
+
+def test_levels_thin_out_class_by_class() -> None:
+    assert [dict(thinning(level, [5, 0, 5])) for level in (0, 1, 3, 4, 6)] == [
+        {0: 1, 5: 1},
+        {0: 2, 5: 1},
+        {0: 8, 5: 1},
+        {0: 8, 5: 2},
+        {0: 8, 5: 8},
+    ]
+    assert highest_level([5, 0, 5]) == 6
+
+
+def test_the_level_rises_with_each_long_look_and_falls_in_calm() -> None:
+    overload = Overload()
+    assert [overload.observe(n, LONG + 1, 2) for n in (0, 1, 2)] == [True, True, False]
+    assert overload.level == 2
+    assert [overload.observe(2 + n * CALM // 2, 0, 2) for n in (1, 2, 3, 4, 5)] == [False, True, False, True, False]
+    assert overload.level == 0
+
+
+class Recording:
+    """Keeps what the engine consumes and says: recorder and outlet in one."""
+
+    def __init__(self) -> None:
+        self.records: list[Arrival | Control] = []
+        self.said: list[Event] = []
+
+    def arrivals(self, arrivals: Sequence[Arrival]) -> None:
+        self.records += arrivals
+
+    def follow(self, streams_or_rules: Any, types_or_surroundings: Any) -> None:
+        pass
+
+    def consequences(self, consequences: Any) -> None:
+        pass
+
+    def control(self, time: int, document: Mapping[str, Any]) -> None:
+        self.records.append(Control(time, dict(document)))
+
+    def events(self, events: Sequence[Event]) -> None:
+        self.said += events
+
+    def open_episodes(self, episodes: Any) -> None:
+        pass
+
+    def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
+        pass
+
+
+def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_events() -> None:
+    detector, clock = a_detector(), [START]
+    rules = [fast(), fast("q", evaluation={"onDemand": True}), fast("p", evaluation={"every": "1s"})]
+    failures: list[BaseException] = []
+    engine = make_engine(detector, inlets(detector), holder="h", start=START)
+    intake, recording = Intake(lambda: clock[0]), Recording()
+    evaluator = Evaluator(
+        engine, intake, recording, now=lambda: clock[0], recorder=recording, on_failure=failures.append
+    )
+    put = intake.putter("speed")
+    evaluator.start(RuleSet(detector, tuple(rules)), Restored())
+    slow = itertools.count(0, SECOND)
+    for n in range(80):
+        engine.stopwatch = partial(next, slow) if 10 < n < 20 else lambda: 0
+        clock[0] += SECOND // 4
+        payload = b'{"v": %d}' % (20 if (n // 3) % 2 else 5)
+        put([(f"vehicles/{client}/speed", payload) for client in ("a", "b")])
+        if n in (10, 20):
+            evaluator.pause_rule("p", n == 10).result(10)
+        assert [each.subject for each in evaluator.ask("q").result(10)] == ["a", "b"]
+    evaluator.stop()
+    assert failures == []
+    assert {event.rule for event in recording.said} == {"r", "q", "p"}
+    levels = [
+        each.document["level"] for each in recording.records if isinstance(each, Control) and each.kind == "level"
+    ]
+    assert levels == [1, 2, 3, 2]  # three at once while it was slow; one taken back after ten seconds of calm
+    assert engine.counters.rule("r").skipped > 0
+    assert lines(replay_intake(recording.records, None, None).events) == lines(recording.said)
+
+
+@pytest.mark.parametrize(
+    ("evaluation", "message"),
+    [
+        ({"every": "1s", "onSample": "speed"}, "at most one of every, onSample and onDemand"),
+        ({"onDemand": False}, "onDemand: write true"),
+        ({"every": "1ms"}, "every: 1ms is too short"),
+    ],
+)
+def test_what_an_evaluation_cannot_be(evaluation: Any, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        fast(evaluation=evaluation)
+
+
+def test_on_sample_names_a_stream_of_the_detector() -> None:
+    with pytest.raises(
+        Exception, match=r"spec\.evaluation\.onSample: Detector d has no stream sped; did you mean speed"
+    ):
+        compiled(a_detector(), fast(evaluation={"onSample": "sped"}))

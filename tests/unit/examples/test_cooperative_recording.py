@@ -1,0 +1,429 @@
+"""The case cooperative recording: a drive that can be trusted, and files that say what the README says."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import queue
+import re
+import signal
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer
+from tests.guides import ROOT
+from tests.networks import PATIENCE
+from tests.ports import free_endpoint
+from tests.unit.manager_objects import instance
+from wayside.api import ApplicationTemplate, Detector, EventRule, Kind
+from wayside.api.documents import load_documents
+from wayside.rules import compile_rule
+
+EXAMPLE = ROOT / "examples" / "cooperative-recording"
+sys.path.insert(0, str(EXAMPLE))  # its folder's name has a dash, so it is no package of ours
+
+from cooperative_recording.expected import (  # noqa: E402
+    APART,
+    CLOSE,
+    LINGER,
+    Episode,
+    Fusion,
+    Span,
+    episodes,
+    fusions,
+    place_at,
+    recorders,
+)
+from cooperative_recording.messages import POINTS_TYPE, POSE_TYPE, TYPESTORE, keys, messages  # noqa: E402
+from cooperative_recording.network import choices, connection, lanes  # noqa: E402
+from cooperative_recording.publish import UnreachableError, publish  # noqa: E402
+from cooperative_recording.record import START_NS, record  # noqa: E402
+from cooperative_recording.seeds import (  # noqa: E402
+    CLEAR_DURATIONS_S,
+    CLEAR_SEEDS,
+    DEMO_DURATION_S,
+    DEMO_SEED,
+    PLACE_LOOK,
+    clear_seed,
+    doubtful_pauses,
+    unclear,
+)
+from cooperative_recording.vehicles import (  # noqa: E402
+    ACCELERATION,
+    FASTEST,
+    LIDAR_VEHICLES,
+    VEHICLES,
+    Drive,
+    Track,
+    simulate,
+)
+
+NUMBER = r"-?\d+(?:\.\d+)?"
+
+
+def listening(endpoint: str) -> zenoh.Session:
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+def documents() -> list[Kind]:
+    return [each.object for each in load_documents([EXAMPLE / f"{n}.yaml" for n in ("detector", "rules", "templates")])]
+
+
+def only(kind: type[Kind], name: str) -> Any:
+    (found,) = [each for each in documents() if isinstance(each, kind) and each.name == name]
+    return found
+
+
+# The drive
+
+
+def test_fifteen_vehicles_with_names_that_ros_accepts_and_enough_lidars_for_several_pairs() -> None:
+    assert len({vehicle.name for vehicle in VEHICLES}) == 15
+    assert all(vehicle.name.replace("_", "").isalnum() for vehicle in VEHICLES)
+    assert len(LIDAR_VEHICLES) >= 4
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**32), horizon=st.floats(5, 60))
+def test_a_seed_decides_the_whole_drive_and_a_longer_horizon_only_adds_to_it(seed: int, horizon: float) -> None:
+    times = np.linspace(0, 5, 51)
+    one, other, longer = simulate(seed, horizon), simulate(seed, horizon), simulate(seed, 90)
+    for vehicle in VEHICLES:
+        assert np.array_equal(one.poses(vehicle.name, times), other.poses(vehicle.name, times))
+        assert one.poses(vehicle.name, times) == pytest.approx(longer.poses(vehicle.name, times), abs=1e-6)
+
+
+def test_another_seed_gives_another_drive() -> None:
+    assert simulate(1).pose("taxi_1", 3) != simulate(2).pose("taxi_1", 3)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32))
+def test_vehicles_move_as_vehicles_can(seed: int) -> None:
+    step = 0.05
+    drive = simulate(seed, 60)
+    for vehicle in VEHICLES:
+        x, y, yaw = drive.poses(vehicle.name, np.arange(0, 60, step)).T
+        moved = np.hypot(np.diff(x), np.diff(y))
+        speeds = moved / step
+        assert speeds.min() > 4
+        assert speeds.max() <= FASTEST + 1e-6
+        assert np.abs(np.diff(speeds)).max() / step < ACCELERATION + 0.5
+        turned = np.abs(np.remainder(np.diff(yaw) + np.pi, 2 * np.pi) - np.pi)
+        assert (turned / step * speeds).max() < 6  # m/s² sideways
+        ahead = np.abs(np.remainder(np.arctan2(np.diff(y), np.diff(x)) - yaw[:-1] + np.pi, 2 * np.pi) - np.pi)
+        assert ahead.max() < 0.1  # it goes where it looks
+
+
+def test_every_way_through_the_network_is_without_a_gap_or_a_kink() -> None:
+    for lane, here in lanes().items():
+        assert choices(lane), f"{lane} is a dead end"
+        for follower, _ in choices(lane):
+            chain = [here, connection(lane, follower), lanes()[follower]]
+            for before, after in itertools.pairwise(chain):
+                assert before.points[-1] == pytest.approx(after.points[0], abs=1e-9)
+                first, second = np.diff(before.points[-2:], axis=0)[0], np.diff(after.points[:2], axis=0)[0]
+                cosine = first @ second / np.hypot(*first) / np.hypot(*second)
+                assert np.degrees(np.arccos(min(1, cosine))) < 3
+
+
+def test_the_shuttles_circle_in_opposite_directions() -> None:
+    drive = simulate(DEMO_SEED)
+    for name, sense in (("shuttle_1", -1), ("shuttle_2", 1)):
+        x, y, _ = drive.poses(name, np.arange(0, 60, 0.5)).T
+        angles = np.unwrap(np.arctan2(y, x + 330))
+        assert np.all(sense * np.diff(angles) > 0)
+
+
+def test_a_time_beyond_the_horizon_is_refused_with_the_remedy() -> None:
+    with pytest.raises(ValueError, match=r"t: 31\.\.31 s is not within the drive's 0\.\.30 s: simulate with a longer"):
+        simulate(1, 30).pose("taxi_1", 31)
+
+
+# What is expected
+
+
+def test_the_judge_shares_no_code_with_what_it_judges() -> None:
+    for file in (EXAMPLE / "cooperative_recording").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            assert not {name.split(".")[0] for name in names} & {"detector", "application_manager", "wayside"}, file
+
+
+@pytest.mark.parametrize("seed", CLEAR_SEEDS)
+def test_episodes_are_what_looking_at_every_hundredth_of_a_second_finds(seed: int) -> None:
+    drive = simulate(seed, 25)
+    times = np.arange(0, 25, 0.01)
+    where = {vehicle.name: drive.poses(vehicle.name, times)[:, :2] for vehicle in LIDAR_VEHICLES}
+    found = []
+    for a in sorted(where):
+        for b in sorted(where):
+            if a < b:
+                near, start = False, 0.0
+                for t, (dx, dy) in zip(times, where[a] - where[b], strict=True):
+                    squared = dx * dx + dy * dy
+                    if not near and squared < 150**2:
+                        near, start = True, t
+                    elif near and squared > 200**2:
+                        near = False
+                        found.append((a, b, start, t))
+                if near:
+                    found.append((a, b, start, 99.0))
+    expected = [(*e.pair, e.start_s, 99.0 if e.end_s is None else e.end_s) for e in episodes(drive, 25)]
+    assert [each[:2] for each in sorted(found)] == [each[:2] for each in sorted(expected)]
+    for ours, theirs in zip(sorted(expected), sorted(found), strict=True):
+        assert ours[2:] == pytest.approx(theirs[2:], abs=0.011)
+
+
+def test_the_demo_shows_what_the_readme_promises() -> None:
+    found = episodes(simulate(DEMO_SEED, DEMO_DURATION_S), DEMO_DURATION_S)
+    assert [("+".join(e.pair), round(e.start_s, 1), round(e.end_s or -1, 1), e.place) for e in found] == [
+        ("shuttle_1+shuttle_2", 0.0, 5.0, "west"),
+        ("shuttle_1+taxi_1", 6.9, 19.2, "west"),
+        ("shuttle_2+taxi_1", 8.3, 19.6, "west"),
+        ("taxi_3+taxi_4", 8.8, 14.7, "east"),
+        ("shuttle_1+shuttle_2", 11.6, 21.6, "west"),
+    ]
+    assert [(round(f.start_s, 1), f.sources) for f in fusions(found)["west"]] == [
+        (0.0, ("shuttle_1", "shuttle_2")),
+        (6.9, ("shuttle_1", "taxi_1")),
+        (8.3, ("shuttle_1", "shuttle_2", "taxi_1")),
+        (19.6, ("shuttle_1", "shuttle_2")),
+    ]
+
+
+@pytest.mark.parametrize("seed", CLEAR_SEEDS)
+@pytest.mark.parametrize("duration", CLEAR_DURATIONS_S)
+def test_the_listed_seeds_are_clear_and_eventful(seed: int, duration: float) -> None:
+    assert unclear(simulate(seed, duration + PLACE_LOOK), duration) == []
+    assert len(episodes(simulate(seed, duration), duration)) >= 4
+
+
+def test_not_every_seed_is_clear() -> None:
+    assert 0 < sum(clear_seed(seed) for seed in range(12)) < 12
+
+
+def approaching(nearest: float, speed: float = 20.0) -> Drive:
+    """shuttle_1 passes shuttle_2 after 10 s, `nearest` metres away; the other lidar vehicles stand far apart."""
+    times, ones = np.array([0.0, 30.0]), np.ones(2)
+    tracks = {
+        vehicle.name: Track(times, ones, np.column_stack([1e6 * number * ones, 0 * ones, 0 * ones]))
+        for number, vehicle in enumerate(LIDAR_VEHICLES, start=1)
+    }
+    tracks["shuttle_1"] = Track(times, speed * ones, np.column_stack([speed * (times - 10) - 500, 0 * ones, 0 * ones]))
+    tracks["shuttle_2"] = Track(times, ones, np.column_stack([-500 * ones, nearest * ones, 0 * ones]))
+    return Drive(0, 30.0, tracks)
+
+
+@pytest.mark.parametrize(
+    ("drive", "doubt"),
+    [
+        (approaching(148.0), "148.0 m grazes 150 m"),
+        (approaching(152.0), "152.0 m grazes 150 m"),
+        (approaching(197.0), "197.0 m grazes 200 m"),
+        (approaching(20.0, speed=20.2), "at 0.0 s: 203.0 m grazes 200 m"),  # at the outset
+        (approaching(144.0, speed=60.0), "beyond 150 m for only 1.4 s"),
+        (approaching(140.0, speed=6.0), "crosses 150 m at only 2.2 m/s"),
+    ],
+)
+def test_a_drive_that_grazes_a_threshold_is_not_clear(drive: Drive, doubt: str) -> None:
+    assert doubt in " ".join(unclear(drive, 20.0))
+
+
+@pytest.mark.parametrize("nearest", [0.0, 100.0, 140.0, 160.0, 190.0, 210.0])
+def test_a_drive_that_keeps_away_from_the_thresholds_is_clear(nearest: float) -> None:
+    assert unclear(approaching(nearest, speed=30.0), 20.0) == []
+
+
+@pytest.mark.parametrize(("linger", "doubtful"), [(5.0, 0), (3.0, 2), (1.0, 0)])
+def test_a_pause_about_as_long_as_the_linger_is_doubtful(linger: float, doubtful: int) -> None:
+    found = [Episode(("a", "b"), start, end, "west") for start, end in ((1, 4), (7.2, 9), (40, None))]
+    doubts = doubtful_pauses(found, linger)
+    assert len(doubts) == doubtful, "one for the recorder, one for the fusion"
+    assert all("at 4.0 s: a pause of 3.2 s is about the linger" in doubt for doubt in doubts)
+
+
+def test_a_recorder_lingers_and_one_that_is_wanted_again_meanwhile_stays() -> None:
+    pair, other = ("a", "b"), ("a", "c")
+    found = [Episode(pair, 1, 4, "west"), Episode(pair, 5, 8, "west"), Episode(other, 2, None, "west")]
+    assert recorders(found, linger_s=0) == {pair: [Span(1, 4), Span(5, 8)], other: [Span(2, None)]}
+    assert recorders(found, linger_s=2) == {pair: [Span(1, 10)], other: [Span(2, None)]}
+
+
+def test_a_fusion_has_the_vehicles_of_all_open_episodes_and_keeps_its_last_sources_while_it_lingers() -> None:
+    found = [
+        Episode(("a", "b"), 1, 4, "west"),
+        Episode(("a", "c"), 2, 6, "west"),
+        Episode(("a", "b"), 7, 9, "west"),
+        Episode(("c", "d"), 3, None, "east"),
+    ]
+    assert fusions(found, linger_s=0) == {
+        "west": [
+            Fusion("west", 1, 2, ("a", "b")),
+            Fusion("west", 2, 4, ("a", "b", "c")),
+            Fusion("west", 4, 6, ("a", "c")),
+            Fusion("west", 7, 9, ("a", "b")),
+        ],
+        "east": [Fusion("east", 3, None, ("c", "d"))],
+    }
+    west = fusions(found, linger_s=2)["west"]
+    assert [(f.start_s, f.end_s) for f in west] == [(1, 2), (2, 4), (4, 7), (7, 11)]
+
+
+# What is sent
+
+
+def test_messages_decode_to_the_simulated_drive() -> None:
+    drive = simulate(DEMO_SEED, 2)
+    sent = list(messages(drive, START_NS, 2.0))
+    assert [message.after_ns for message in sent] == sorted(message.after_ns for message in sent)
+    assert Counter(message.type for message in sent) == {POSE_TYPE: 15 * 20, POINTS_TYPE: 6 * 4}
+    assert {message.key for message in sent} == set(keys())
+    for message in sent:
+        decoded: Any = TYPESTORE.deserialize_cdr(message.payload, message.type)
+        stamp = decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
+        assert stamp == START_NS + message.after_ns
+        name = message.key.split("/")[1]
+        if message.type == POSE_TYPE:
+            pose = drive.pose(name, message.after_ns / 1e9)
+            position, turn = decoded.pose.position, decoded.pose.orientation
+            assert decoded.header.frame_id == "map"
+            assert (position.x, position.y, position.z) == pytest.approx((pose.x, pose.y, pose.z))
+            assert 2 * np.arctan2(turn.z, turn.w) == pytest.approx(pose.yaw)
+        else:
+            assert decoded.header.frame_id == f"{name}/lidar"
+            assert len(decoded.data) == decoded.row_step * decoded.height == decoded.width * decoded.point_step
+            assert np.isfinite(decoded.data.view("<f4")).all()
+
+
+def test_what_arrives_over_zenoh_is_the_drive_byte_for_byte() -> None:
+    endpoint, drive = free_endpoint(), simulate(DEMO_SEED, 1)
+    arrived: list[tuple[str, bytes]] = []
+    expected = [(message.key, message.payload) for message in messages(drive, START_NS, 1.0)]
+    done: queue.SimpleQueue[None] = queue.SimpleQueue()
+
+    def take(sample: zenoh.Sample) -> None:
+        arrived.append((str(sample.key_expr), sample.payload.to_bytes()))
+        if len(arrived) == len(expected):
+            done.put(None)
+
+    with listening(endpoint) as session:
+        subscriber = session.declare_subscriber("vehicles/**", take)
+        published = publish(drive, 1.0, connect=[endpoint], start_ns=START_NS, speed=4.0)
+        done.get(timeout=PATIENCE)
+        subscriber.undeclare()
+    assert published.complete
+    assert published.listened
+    assert published.start_ns == START_NS
+    assert (published.messages, published.bytes) == (len(expected), sum(len(payload) for _, payload in expected))
+    assert arrived == expected
+
+
+def test_nobody_to_connect_to_is_told_with_the_endpoint() -> None:
+    with pytest.raises(UnreachableError, match=r"--connect tcp/127\.0\.0\.1:\d+: no Zenoh session within 0.2 s"):
+        publish(simulate(1, 1), 1.0, connect=[free_endpoint()], wait_s=0.2)
+    with pytest.raises(UnreachableError, match="--listen here: no Zenoh session"):
+        publish(simulate(1, 1), 1.0, listen=["here"])
+
+
+def test_sigterm_ends_the_drive_in_good_order() -> None:
+    endpoint = free_endpoint()
+    first: queue.SimpleQueue[None] = queue.SimpleQueue()
+    with listening(endpoint) as session:
+        subscriber = session.declare_subscriber("vehicles/*/pose", lambda _: first.put(None))
+        command = [sys.executable, str(EXAMPLE / "drive.py"), "--connect", endpoint, "--duration", "60"]
+        drive = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        first.get(timeout=PATIENCE)
+        drive.send_signal(signal.SIGTERM)
+        out, errors = drive.communicate(timeout=PATIENCE)
+        subscriber.undeclare()
+    assert (drive.returncode, errors) == (0, "")
+    assert out.count("\n") == 1
+    assert "stopped early" in out
+
+
+def test_a_recording_is_the_same_drive_and_opens_as_a_rosbag(tmp_path: Path) -> None:
+    drive, file = simulate(DEMO_SEED, 2), tmp_path / "drive.mcap"
+    expected = list(messages(drive, START_NS, 2.0))
+    assert record(drive, file, 2.0) == len(expected)
+    with AnyReader([file]) as reader:
+        assert {(c.topic, c.msgtype) for c in reader.connections} == {("/" + m.key, m.type) for m in expected}
+        found = [(c.topic, stamp, bytes(raw)) for c, stamp, raw in reader.messages()]
+        for connection_, _, raw in reader.messages():
+            reader.deserialize(raw, connection_.msgtype)  # the file's own definitions suffice
+    assert sorted(found) == sorted(("/" + m.key, START_NS + m.after_ns, m.payload) for m in expected)
+
+
+# The files
+
+
+def test_the_rule_compiles_against_the_detector_and_the_detector_selects_it() -> None:
+    detector, rule = only(Detector, "town"), only(EventRule, "lidar-vehicles-close")
+    assert detector.spec.rules.matches(rule.metadata.labels)
+    compiled = compile_rule(rule, detector)
+    assert [deploy.template for deploy in compiled.deploys] == ["scene-recorder", "scene-fusion"]
+
+
+def test_the_expectation_has_the_numbers_of_the_files() -> None:
+    rule = only(EventRule, "lidar-vehicles-close").spec
+    assert (rule.when, rule.until) == (f"distance < {CLOSE:g}", f"distance > {APART:g}")
+    for name in ("scene-recorder", "scene-fusion"):
+        assert only(ApplicationTemplate, name).spec.lifecycle.linger.seconds == LINGER
+
+
+@pytest.mark.parametrize("x", [-300.0, -1.0, 1.0, 300.0])
+def test_the_rules_place_and_the_expected_one_are_the_same(x: float) -> None:
+    compiled = compile_rule(only(EventRule, "lidar-vehicles-close"), only(Detector, "town"))
+    ends = [
+        {"client": name, "position": {"x": x + shift, "y": 0.0, "z": 0.0}} for name, shift in (("p", -60), ("q", 60))
+    ]
+    (fuse,) = [deploy for deploy in compiled.deploys if deploy.action == "fuse"]
+    parameters = fuse.parameters.render({"a": ends[0], "b": ends[1], "distance": 120.0})
+    assert parameters == {"place": place_at(x), "sources": ["p", "q"]}
+
+
+def test_new_sources_change_the_configuration_but_not_the_deployment() -> None:
+    renderer = Renderer(only(ApplicationTemplate, "scene-fusion"), Policy())
+    two, three = (
+        renderer.render(instance("scene-fusion", key="west", parameters={"place": "west", "sources": sources}))
+        for sources in (["p", "q"], ["p", "q", "r"])
+    )
+    assert two.manifests[0] != three.manifests[0]
+    assert two.manifests[1] == three.manifests[1]
+    assert three.manifests[0]["data"] == {"sources.yaml": 'place: west\nsources: ["p","q","r"]\n'}
+
+
+def test_the_recorder_is_told_its_two_vehicles() -> None:
+    renderer = Renderer(only(ApplicationTemplate, "scene-recorder"), Policy())
+    rendered = renderer.render(instance("scene-recorder", key='["p","q"]', parameters={"vehicles": ["p", "q"]}))
+    (container,) = rendered.manifests[0]["spec"]["template"]["spec"]["containers"]
+    assert container["args"] == ["--key=vehicles/p/**", "--key=vehicles/q/**", "--output=/recording"]
+
+
+def test_the_picture_is_that_of_the_demo() -> None:
+    from picture import svg
+
+    committed = (EXAMPLE / "drive.svg").read_text(encoding="utf-8")
+    drawn = svg(simulate(DEMO_SEED), DEMO_DURATION_S)
+    assert re.sub(NUMBER, "#", committed) == re.sub(NUMBER, "#", drawn), "run examples/cooperative-recording/picture.py"
+    numbers = [[float(number) for number in re.findall(NUMBER, text)] for text in (committed, drawn)]
+    assert numbers[0] == pytest.approx(numbers[1], abs=0.2)  # the last digit may differ between processors
+    assert len(committed) < 60_000
+    ET.fromstring(committed)

@@ -1,0 +1,109 @@
+"""The objects of an instance: nothing that is not its own is touched, and its status knows of all of them first."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from application_manager.cluster.apply import Applied, Applier, Known, references
+from application_manager.cluster.client import Object
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Renderer, owned
+from application_manager.knowledge.world import World
+from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_world, raw, work_on
+from tests.unit.manager_objects import instance, task, template
+
+NAME = ("site", "app")
+APP = instance()
+OTHER = instance("other")
+
+
+def config(name: str, **data: str) -> Object:
+    return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": name}, "data": data}
+
+
+def there(name: str, owner: Any = None, uid: str = "") -> Object:
+    """A ConfigMap in the cluster, controlled by an instance or by nobody."""
+    made = config(name)
+    made["metadata"] |= {"namespace": "site", **({"uid": uid} if uid else {})}
+    return made if owner is None else owned(made, owner)
+
+
+def key(name: str) -> tuple[str, str, str]:
+    return "v1", "ConfigMap", name
+
+
+def applied(server: MemoryServer, *names: str, known: Known | None = None, meanwhile: Object | None = None) -> Applied:
+    """Apply ConfigMaps of these names; `meanwhile`: what is put into the cluster between the look and the apply."""
+
+    async def run() -> Applied:
+        rendering = Renderer(template(manifests=[config(name, new="yes") for name in names]), Policy()).render(APP)
+        applier = Applier(server, World(Policy()).store, {key("")[:2]: CONFIG_MAPS})  # type: ignore[arg-type]
+        looked = await applier.look("site", rendering.manifests)
+        if meanwhile is not None:
+            server.put(meanwhile)
+        return await applier.apply(APP, rendering, rendering.manifests, known or Known(), looked)
+
+    return asyncio.run(run())
+
+
+@pytest.mark.parametrize("owner", [None, OTHER])
+def test_an_object_that_is_not_the_instances_own_is_left_alone_and_nothing_is_pruned(owner: Any) -> None:
+    server = MemoryServer(there("taken", owner), there("old", APP, "uid-old"))
+    found = applied(server, "taken", "free", known=Known("before", {key("old"): "uid-old"}))
+    assert (found.aspect.holds, found.aspect.reason, found.complete) == (False, "ObjectExists", False)
+    assert server.written == [("apply", "ConfigMap", "free")]
+    assert {each.name for each in found.objects} == {"taken", "free", "old"}
+
+
+def test_an_object_that_was_replaced_since_it_was_looked_at_is_no_victim() -> None:
+    server = MemoryServer(there("a", APP, "uid-old"))
+    found = applied(server, "a", meanwhile=there("a", OTHER, "uid-new"))
+    assert found.aspect.reason == "Waiting"
+    assert server.written == []
+
+
+def test_what_the_rendering_has_no_more_is_pruned_where_it_is_still_the_instances_own() -> None:
+    server = MemoryServer(there("old", APP, "uid-old"), there("taken-over", OTHER, "uid-taken"))
+    known = Known("before", {key("old"): "uid-old", key("taken-over"): "uid-taken", key("gone"): "uid-gone"})
+    found = applied(server, "new", known=known)
+    assert found.complete
+    assert server.written == [("apply", "ConfigMap", "new"), ("delete", "ConfigMap", "old")]
+    assert {each.name for each in found.objects} == {"new"}
+
+
+def reconciled(*manifests: Object) -> tuple[MemoryServer, World]:
+    """An instance that has ConfigMap a, reconciled once with these manifests in its template."""
+    objects = [each.to_json() for each in references({key("a"): "uid-a"})]
+    made = raw(APP, 1)
+    made["status"] = {"objects": objects, "specHash": "before", "conditions": []}
+    server = MemoryServer()
+    known = [server.put(raw(template(manifests=list(manifests)), 1)), server.put(made)]
+    server.put(there("a", APP, "uid-a"))
+    world = a_world(*known, task=task("t"))
+    asyncio.run(work_on(world, server, []).reconcile(NAME))
+    return server, world
+
+
+def test_the_status_names_what_will_belong_to_the_instance_before_it_is_applied() -> None:
+    server, world = reconciled(config("a"), config("b"))
+    assert server.written[-3:] == [
+        ("status", "ApplicationInstance", "app"),
+        ("apply", "ConfigMap", "a"),
+        ("apply", "ConfigMap", "b"),
+    ]
+    announced = {
+        each["name"]: each.get("uid") for each in server.objects[("ApplicationInstance", "app")]["status"]["objects"]
+    }
+    assert announced == {"a": "uid-a", "b": None}
+    assert world.records[NAME].applied.complete
+
+
+def test_while_a_template_cannot_be_rendered_what_runs_stays_as_it_is_and_is_not_forgotten() -> None:
+    server, world = reconciled(config("a", x="${parameters.nothing}"))
+    assert [each for each in server.written if each[1] == "ConfigMap"] == []
+    record = world.records[NAME]
+    assert (record.applied.aspect.reason, record.digest) == ("RenderFailed", "before")
+    assert [(each.name, each.uid) for each in record.applied.objects] == [("a", "uid-a")]

@@ -1,0 +1,112 @@
+"""Two rules over the same recording: a learning-based and a rule-based one, matched episode by episode."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detector import cli
+from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.events import Event
+from detector.replay.comparing import compare
+from tests import onnx_models
+from tests.driving import START, a_detector, a_rule, at
+from wayside.commandline import run
+
+
+def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car") -> list[Event]:
+    """Events of episodes from and to seconds after the start; None: still open."""
+    events = []
+    for first, last in spans:
+        for end in (None, last):
+            if end is None or last is not None:
+                fields = {
+                    "holder": "h",
+                    "rule": rule,
+                    "subject": subject,
+                    "subjects": (subject,),
+                    "episode": f"{rule}{subject}{first}",
+                    "onset_time": at(first),
+                    "start_time": at(first),
+                    "end_time": None if end is None else at(end),
+                    "reason": None if end is None else Reason.UNTIL,
+                    "values": {},
+                    "classification": None,
+                }
+                events.append(Event(**fields))  # type: ignore[arg-type]
+    return events
+
+
+def test_episodes_that_overlap_are_the_same_and_their_times_are_compared() -> None:
+    events = [*episodes("a", (0, 10), (20, 30), (50, 60)), *episodes("b", (1, 12), (40, 45), (49, 60))]
+    comparison = compare(events, "a", "b", at(100))
+    assert comparison.start_differences == [1.0, -1.0]
+    assert comparison.end_differences == [2.0, 0.0]
+    assert [span.start for span in comparison.only_first] == [at(20)]
+    assert [span.start for span in comparison.only_second] == [at(40)]
+    assert comparison.agreement == (9 + 10) / (12 + 10 + 5 + 11)
+    assert next(comparison.lines()) == "a and b: 2 episodes in both, 1 only in a, 1 only in b"
+
+
+def test_one_that_is_open_ends_with_the_recording_and_has_no_end_to_compare() -> None:
+    comparison = compare([*episodes("a", (0, None)), *episodes("b", (5, 10))], "a", "b", at(20))
+    assert comparison.start_differences == [5.0]
+    assert comparison.end_differences == []
+    assert comparison.agreement == 5 / 20
+
+
+def test_other_subjects_are_other_episodes_and_of_several_the_longest_shared_is_taken() -> None:
+    events = [*episodes("a", (0, 10)), *episodes("b", (0, 10), subject="bus"), *episodes("b", (0, 1), (2, 10))]
+    comparison = compare(events, "a", "b", at(10))
+    assert [(first.start, second.start) for first, second in comparison.both] == [(at(0), at(2))]
+    assert [span.subject for span in comparison.only_second] == ["car", "bus"]
+
+
+spans = st.lists(st.tuples(st.integers(0, 50), st.integers(0, 10)), max_size=8).map(
+    lambda pairs: [(float(first), float(first + length)) for first, length in pairs]
+)
+
+
+@given(spans, spans)
+def test_each_episode_is_counted_once_and_only_what_overlaps_is_the_same(
+    first: list[tuple[float, float]], second: list[tuple[float, float]]
+) -> None:
+    first, second = [*dict.fromkeys(first)], [*dict.fromkeys(second)]
+    events = [*episodes("a", *dict(first).items()), *episodes("b", *dict(second).items())]
+    comparison = compare(events, "a", "b", at(100))
+    assert len(comparison.both) + len(comparison.only_first) == len(dict(first))
+    assert len(comparison.both) + len(comparison.only_second) == len(dict(second))
+    assert all(one.shared(other) >= 0 for one, other in comparison.both)
+
+
+def test_a_learning_based_and_a_rule_based_rule_over_one_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = onnx_models.weighted(tmp_path / "m.onnx", [0.25] * 4)  # the mean of the last four speeds
+    speed = {"name": "v", "stream": "speed", "value": "msg.v"}
+    risk = {
+        "name": "mean",
+        "model": {"file": str(model), "inputs": [{"name": "x", "window": {"signals": ["v"], "last": 4}}]},
+    }
+    learned = a_rule("learned", signals=[speed, risk], when="mean > 10")
+    threshold = a_rule("threshold", signals=[speed], when="v > 10")
+    (tmp_path / "detector.yaml").write_text(json.dumps(a_detector().to_json()))
+    (tmp_path / "rules.yaml").write_text("\n---\n".join(json.dumps(rule.to_json()) for rule in (learned, threshold)))
+    speeds = [0] * 5 + [20] * 10 + [0] * 10 + [20] + [0] * 10  # the last is too short for the mean
+    lines = [
+        json.dumps({"t": START + round((n + 0.5) * 1e9), "key": "vehicles/car/speed", "value": {"v": value}})
+        for n, value in enumerate(speeds)
+    ]
+    (tmp_path / "drive.jsonl").write_text("\n".join(lines))
+    files = ["--detector", str(tmp_path / "detector.yaml"), "--rules", str(tmp_path / "rules.yaml")]
+    command = ["replay", str(tmp_path / "drive.jsonl"), *files, "--output", str(tmp_path / "out")]
+    assert run(cli.app, "detector", (), [*command, "--compare", "threshold", "learned"]) == 0
+    assert "1 episodes in both, 1 only in threshold, 0 only in learned" in capsys.readouterr().err
+    comparison = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert [each["startDifference"] for each in comparison["both"]] == [2.0]
+    assert run(cli.app, "detector", (), [*command, "--compare", "threshold", "lerned"]) == 2
+    assert "--compare lerned: there is no such rule; there are learned, threshold" in capsys.readouterr().err

@@ -1,0 +1,99 @@
+"""`detector replay` reads back what the record action wrote; `detector check` wants to know where recordings go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from detector.checking import check_documents
+from detector.replay.errors import RecordingError
+from detector.replay.recordings import open_recordings, types_of
+from detector.testing import run
+from tests.driving import at
+from tests.recording_bench import STREAMS, Bench, an_episode, mcap_files, pose, speed, tf_static
+from wayside.api.documents import load_documents
+
+DETECTOR = """
+apiVersion: wayside.dev/v1alpha1
+kind: Detector
+metadata: {name: d}
+spec:
+  streams:
+    - {name: speed, key: 'vehicles/${client:*}/speed', encoding: json}
+    - {name: pose, key: 'vehicles/${client:*}/pose', encoding: cdr, type: geometry_msgs/msg/PoseStamped}
+"""
+RULE = """
+apiVersion: wayside.dev/v1alpha1
+kind: EventRule
+metadata: {name: fast}
+spec:
+  evaluation: {every: 100ms}
+  signals: [{name: speed, stream: speed, value: msg.v}]
+  when: speed > 10
+  actions:
+    - name: bag
+      record: {before: 5s}
+"""
+
+
+def test_a_replay_finds_the_messages_at_their_times_and_what_is_latched_once(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, split={"duration": "1s"})
+    given = [tf_static(1.0), *(each for k in range(30) for each in (pose(1 + k / 10, k), speed(1.05 + k / 10, k)))]
+    folder = bench.record(an_episode(), given)
+    assert len(mcap_files(folder)) == 3
+    found = list(open_recordings([folder]))
+    assert [(each.time, f"vehicles/{each.key.split('/', 1)[1]}", each.payload) for each in found] == [
+        (each.time, each.key, each.payload) for each in given
+    ]
+    assert {(each.encoding, each.type) for each in found} == {
+        ("cdr", "tf2_msgs/msg/TFMessage"),
+        ("cdr", "geometry_msgs/msg/PoseStamped"),
+        ("json", None),
+    }
+    assert {each.name for each in types_of(folder)} == {"tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"}
+
+
+def test_a_replay_of_a_recording_gives_the_event_again(tmp_path: Path) -> None:
+    (tmp_path / "d.yaml").write_text(DETECTOR)
+    (tmp_path / "r.yaml").write_text(RULE.partition("  actions:")[0])
+    bench = Bench(tmp_path / "recordings", *STREAMS[:3])
+    folder = bench.record(an_episode(), [speed(1 + k / 10, 20 if 10 <= k < 20 else 5) for k in range(40)])
+    events = run(tmp_path / "r.yaml", tmp_path / "d.yaml", folder)
+    assert [(event.subject, event.started) for event in events] == [("car1", True), ("car1", False)]
+    assert events[0].start_time == at(2.0)
+
+
+def test_a_file_that_is_gone_is_said(tmp_path: Path) -> None:
+    folder = Bench(tmp_path).record(an_episode(), [pose(1.1)])
+    (file,) = mcap_files(folder)
+    file.unlink()
+    with pytest.raises(RecordingError, match=f"{file.name} is missing"):
+        list(open_recordings([folder]))
+
+
+def problems(tmp_path: Path, detector: str, rule: str) -> list[str]:
+    path = tmp_path / "both.yaml"
+    path.write_text(f"{detector}---{rule}")
+    return [str(each).removeprefix(f"{path}:") for each in check_documents(load_documents([path]))]
+
+
+def test_a_rule_that_records_needs_to_know_where(tmp_path: Path) -> None:
+    (found,) = problems(tmp_path, DETECTOR, RULE)
+    assert "spec.actions[0].record: Detector d does not say where recordings go: give its spec.recordings" in found
+    assert found.startswith("19:15: ")
+    assert problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", RULE) == []
+
+
+def test_what_is_wrong_with_metadata_is_found_at_its_place(tmp_path: Path) -> None:
+    rule = RULE.replace("{before: 5s}", "{metadata: {fine: '${speed}', wrong: '${sped}'}}")
+    (found,) = problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", rule)
+    assert found.startswith("20:52: spec.actions[0].record.metadata.wrong: ")
+    assert "sped" in found
+
+
+def test_a_window_that_reaches_further_back_than_the_buffer_is_refused(tmp_path: Path) -> None:
+    rule = RULE.replace("5s", "50s")
+    found = problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", rule)
+    assert "record.before: 50s reach back further than the 10 s that Detector d keeps of stream speed" in found[0]
+    assert found[0].startswith("20:24: ")

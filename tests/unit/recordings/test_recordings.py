@@ -1,0 +1,235 @@
+"""Recordings of every kind read as the same messages, in order of time; what is wrong is said with its place."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+
+from detector.engine.samples.sample import Arrival
+from detector.replay.errors import RecordingError
+from detector.replay.intake_writer import IntakeWriter
+from detector.replay.message import Message
+from detector.replay.recordings import open_recordings
+from detector.replay.routing import Router
+from detector.streams.codecs.ros import standard
+from tests.ros_messages import cdr, odometry, pose_stamped
+from wayside.api.stream import Encoding, Stream
+
+POSE_TYPE = "geometry_msgs/msg/PoseStamped"
+ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+POSES = [cdr(pose_stamped(x=float(n))) for n in range(10)]
+MESSAGES = [Message(100 * n, "car1/pose", raw, "cdr", POSE_TYPE) for n, raw in enumerate(POSES)] + [
+    Message(2000, "odom", cdr(odometry()), "cdr", ODOMETRY_TYPE)
+]
+
+
+def write_mcap(path: Path, messages: list[Message], **options: Any) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start()
+        channels: dict[tuple[str, str | None], int] = {}
+        for message in messages:
+            place = (message.key, message.type)
+            if place not in channels:
+                schema = 0
+                if message.type is not None:
+                    schema = writer.register_schema(
+                        message.type, "ros2msg", standard().definition(message.type).encode()
+                    )
+                channels[place] = writer.register_channel(f"/{message.key}", message.encoding, schema)
+            writer.add_message(channels[place], message.time, message.payload, message.time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def write_bag(path: Path, messages: list[Message], storage: StoragePlugin = StoragePlugin.MCAP) -> Path:
+    with BagWriter(path, version=9, storage_plugin=storage) as writer:
+        connections = {
+            message.key: writer.add_connection(f"/{message.key}", message.type or "", typestore=standard().store)
+            for message in {message.key: message for message in messages}.values()
+        }
+        for message in messages:
+            writer.write(connections[message.key], message.time, message.payload)
+    return path
+
+
+def write_lines(path: Path, *lines: object) -> Path:
+    path.write_text("".join((line if isinstance(line, str) else json.dumps(line)) + "\n" for line in lines))
+    return path
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"compression": CompressionType.LZ4, "chunk_size": 500},
+        {"compression": CompressionType.NONE},
+        {"use_chunking": False},
+    ],
+    ids=["zstd", "lz4", "uncompressed", "unchunked"],
+)
+def test_mcap_files_are_read(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = write_mcap(tmp_path / "drive.mcap", MESSAGES, **options)
+    assert list(open_recordings([path])) == MESSAGES
+
+
+def test_mcap_files_are_read_in_the_order_of_their_times(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "drive.mcap", MESSAGES[::-1], chunk_size=500)
+    assert list(open_recordings([path])) == MESSAGES
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+def test_rosbag2_folders_are_read(tmp_path: Path, storage: StoragePlugin) -> None:
+    path = write_bag(tmp_path / "bag", MESSAGES, storage)
+    assert list(open_recordings([path])) == MESSAGES
+    (file,) = [entry for entry in path.iterdir() if entry.name != "metadata.yaml"]
+    assert list(open_recordings([file])) == MESSAGES
+
+
+def test_json_lines_are_read_with_their_values_as_they_stand(tmp_path: Path) -> None:
+    path = write_lines(
+        tmp_path / "drive.jsonl",
+        '{"t": 5, "key": "vehicles/car7/pose", "value": {"x": 1.50}}',
+        "",
+        '{"key": "/b", "value": [1], "t": 5}',
+    )
+    assert list(open_recordings([path])) == [
+        Message(5, "vehicles/car7/pose", b'{"x": 1.50}', "json", None),
+        Message(5, "b", b"[1]", "json", None),
+    ]
+
+
+def test_an_intake_file_is_read_like_any_mcap_file(tmp_path: Path) -> None:
+    stream = Stream(name="pose", key="${client:*}/pose", encoding=Encoding.CDR, type=POSE_TYPE)
+    writer = IntakeWriter(tmp_path / "intake.mcap", [stream])
+    writer.control(1, {"kind": "start"})
+    writer.arrivals([Arrival(message.time, "pose", message.key, message.payload) for message in MESSAGES[:3]])
+    writer.close()
+    assert list(open_recordings([tmp_path / "intake.mcap"], Router([stream]).wanted)) == MESSAGES[:3]
+
+
+def test_several_recordings_are_merged_by_time(tmp_path: Path) -> None:
+    paths = [
+        write_mcap(tmp_path / "a.mcap", MESSAGES[::2]),
+        write_bag(tmp_path / "bag", MESSAGES[1::2]),
+        write_lines(tmp_path / "c.jsonl", {"t": 200, "key": "c", "value": 1}),
+    ]
+    merged = list(open_recordings(paths))
+    assert [message for message in merged if message.encoding == "cdr"] == MESSAGES
+    assert [message.key for message in merged if message.time == 200] == ["car1/pose", "c"]
+
+
+def test_only_wanted_keys_are_read(tmp_path: Path) -> None:
+    paths = [
+        write_mcap(tmp_path / "a.mcap", MESSAGES),
+        write_bag(tmp_path / "bag", MESSAGES),
+        write_lines(tmp_path / "c.jsonl", {"t": 1, "key": "odom", "value": 1}, {"t": 2, "key": "x", "value": 1}),
+    ]
+    assert [message.key for message in open_recordings(paths, lambda key: key == "odom")] == ["odom"] * 3
+    assert list(open_recordings(paths, lambda key: False)) == []
+
+
+GOOD = '{"t": 5, "key": "a", "value": {}}'
+
+
+@pytest.mark.parametrize(
+    ("lines", "where", "words"),
+    [
+        ([GOOD, "{"], 2, "truncated"),
+        ([GOOD, "nonsense"], 2, "malformed"),
+        ([GOOD, '{"t": 6, "key": "a"}'], 2, "value"),
+        ([GOOD, '{"t": "6", "key": "a", "value": 1}'], 2, "int"),
+        ([GOOD, '{"t": 6, "key": "a", "value": NaN}'], 2, "malformed"),
+        ([GOOD, '{"t": 6, "key": "a", "value": 1, "stamp": 2}'], 2, "stamp"),
+        ([GOOD, '{"t": 6, "key": "", "value": 1}'], 2, "key is empty"),
+        ([GOOD, "", '{"t": 4, "key": "a", "value": 1}'], 3, "goes back from 5 to 4"),
+        (['{"t": -1, "key": "a", "value": 1}'], 1, "negative"),
+    ],
+)
+def test_a_broken_line_is_said_with_file_and_line(tmp_path: Path, lines: list[str], where: int, words: str) -> None:
+    path = write_lines(tmp_path / "drive.jsonl", *lines)
+    with pytest.raises(RecordingError) as caught:
+        list(open_recordings([path]))
+    assert str(caught.value).startswith(f"{path}:{where}: ")
+    assert words in str(caught.value)
+
+
+def test_what_is_no_recording_is_refused_at_once(tmp_path: Path) -> None:
+    def refused(path: Path) -> str:
+        with pytest.raises(RecordingError) as caught:
+            open_recordings([path])
+        assert str(path) in str(caught.value)
+        return str(caught.value)
+
+    (tmp_path / "empty.mcap").touch()
+    (tmp_path / "text.txt").write_text("hello")
+    (tmp_path / "data.sqlite").write_bytes(b"SQLite format 3\0rest")
+    assert "no such file" in refused(tmp_path / "missing.mcap")
+    assert "metadata.yaml" in refused(tmp_path)
+    assert "empty" in refused(tmp_path / "empty.mcap")
+    assert "no kind of recording" in refused(tmp_path / "text.txt")
+    assert ".db3" in refused(tmp_path / "data.sqlite")
+
+
+def damage(path: Path, share: float) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+
+
+def write_sqlite(path: Path, messages: list[Message]) -> Path:
+    return write_bag(path, messages, StoragePlugin.SQLITE3)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.3, 0.5, 0.8, 0.99])
+@pytest.mark.parametrize("write", [write_mcap, write_bag, write_sqlite])
+def test_a_cut_recording_is_an_error_that_names_it(
+    tmp_path: Path, write: Callable[[Path, list[Message]], Path], share: float
+) -> None:
+    path = write(tmp_path / "drive", MESSAGES * 20)
+    for file in [path] if path.is_file() else path.glob("*.[md][cb]*"):
+        damage(file, share)
+    with pytest.raises(RecordingError, match=str(tmp_path)):
+        list(open_recordings([path]))
+
+
+def stream(name: str, key: str, type_name: str | None = POSE_TYPE) -> Stream:
+    encoding = Encoding.JSON if type_name is None else Encoding.CDR
+    return Stream(name=name, key=key, encoding=encoding, type=type_name, client=None if "${" in key else "ego")
+
+
+def test_messages_go_to_every_stream_of_their_key_and_later_than_the_last() -> None:
+    router = Router([stream("pose", "${client:*}/pose"), stream("all", "**/${client:*}/pose")])
+    assert router.route("car1/pose") == ("pose", "all")
+    assert router.route("odom") == ()
+    assert router.unrouted == ["odom"]
+    arrivals = list(router.arrivals([MESSAGES[1], MESSAGES[1], MESSAGES[-1], MESSAGES[2]]))
+    assert [(arrival.received, arrival.stream) for arrival in arrivals] == [
+        (100, "pose"),
+        (101, "all"),
+        (102, "pose"),
+        (103, "all"),
+        (200, "pose"),
+        (201, "all"),
+    ]
+    assert arrivals[0].payload == POSES[1]
+
+
+@pytest.mark.parametrize(
+    ("declared", "words"),
+    [
+        (stream("odometry", "odom", POSE_TYPE), ["odom", ODOMETRY_TYPE, POSE_TYPE, "streams[odometry].type"]),
+        (stream("odometry", "odom", None), ["odom", "cdr", "json", "streams[odometry].encoding"]),
+    ],
+)
+def test_a_message_of_another_type_than_its_streams_is_an_error_that_names_both(
+    declared: Stream, words: list[str]
+) -> None:
+    with pytest.raises(RecordingError) as caught:
+        list(Router([declared]).arrivals(MESSAGES))
+    for word in words:
+        assert word in str(caught.value)

@@ -1,0 +1,214 @@
+"""Signals over rules: sequence, count, escalation, absence of a follow-up; their order and what can be wrong."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from detector.assembly import RuleBook
+from tests.driving import POSITION, SPEED, Drive, a_detector, a_rule, arrival, at, compiled
+from wayside.rules import dependency_problems, in_order
+
+
+def over(rule: str, name: str = "it", **fields: Any) -> dict[str, Any]:
+    return {"name": name, "rule": rule, **fields}
+
+
+def count(rule: str, window: str, name: str = "it", **fields: Any) -> dict[str, Any]:
+    return over(rule, name, over=window, aggregate="Count", **fields)
+
+
+def braking(name: str = "braking", **spec: Any) -> Any:
+    return a_rule(name, **{"signals": [SPEED], "when": "speed < 1", **spec})
+
+
+def speeds(values: str, client: str = "car", start: float = 0.5) -> list[Any]:
+    """One sample a second; a digit is its speed."""
+    return [arrival(start + n, client, {"v": float(value)}) for n, value in enumerate(values)]
+
+
+def test_a_count_of_starts_within_a_time_starts_a_rule_at_the_very_tick() -> None:
+    often = a_rule("a-often", signals=[count("braking", "5s")], when="it >= 2")
+    drive = Drive(a_detector(), often, braking())
+    told = drive.take(*speeds("50505555555"), until=11)
+    assert told == [
+        "braking car started 2",
+        "braking car Until 3",
+        "braking car started 4",
+        "a-often car started 4",  # after the rule that it depends on, although its name is smaller
+        "braking car Until 5",
+        "a-often car Until 7",  # the first start, at 2, is no longer in (2, 7]
+    ]
+
+
+def test_a_sequence_needs_the_second_to_follow_the_first() -> None:
+    fast = a_rule("fast", signals=[SPEED], when="speed > 8")
+    sequence = a_rule(
+        "sequence",
+        signals=[
+            over("fast", "since", aggregate="Age"),
+            count("fast", "3s"),
+            over("braking", "now", aggregate="Active"),
+        ],
+        when="now && it > 0 && since > 0",
+    )
+    drive = Drive(a_detector(), sequence, fast, braking())
+    assert [each for each in drive.take(*speeds("0950555509505"), until=13) if each.startswith("sequence")] == [
+        "sequence car started 4",
+        "sequence car Until 5",
+        "sequence car started 12",
+        "sequence car Until 13",
+    ]
+
+
+def test_the_absence_of_a_follow_up_within_a_time() -> None:
+    moved = a_rule("moved", signals=[SPEED], when="speed > 8")
+    absence = a_rule(
+        "stuck",
+        signals=[
+            count("braking", "60s", "stops"),
+            over("braking", "stopped", aggregate="Age"),
+            over("moved", "moved", aggregate="Age"),
+        ],
+        when="stops > 0 && stopped >= 3 && moved >= stopped",
+    )
+    drive = Drive(a_detector(), absence, moved, braking())
+    told = drive.take(*speeds("055905555559"), until=12)
+    assert [each for each in told if each.startswith("stuck")] == ["stuck car started 8", "stuck car Until 12"]
+
+
+def test_escalation_while_an_episode_is_open_and_how_it_began() -> None:
+    worse = a_rule(
+        "worse",
+        signals=[over("slow", aggregate="Active"), over("slow", "before", value="msg.values.speed"), SPEED],
+        when="it && speed < before",
+    )
+    drive = Drive(a_detector(), worse, braking("slow", when="speed < 5"))
+    told = drive.take(*speeds("943229"), until=6)
+    assert told == ["slow car started 2", "worse car started 3", "slow car Until 6", "worse car Until 6"]
+    assert drive.events[1].values == {"it": True, "before": 4, "speed": 3}
+
+
+def test_where_picks_starts_by_what_they_were() -> None:
+    hard = a_rule("hard", signals=[count("slow", "10s", where="msg.values.speed < 2")], when="it > 0")
+    drive = Drive(a_detector(), hard, braking("slow", when="speed < 5"))
+    told = drive.take(*speeds("939919"), until=6)
+    assert [each for each in told if each.startswith("hard")] == ["hard car started 5"]
+
+
+def test_an_episode_of_a_pair_is_one_of_both_its_clients() -> None:
+    near = a_rule("near", scope={"pairs": {"position": POSITION, "within": 50}}, when="distance < 10")
+    party = a_rule("party", signals=[over("near", aggregate="Active")], when="it")
+    drive = Drive(a_detector(), near, party)
+    places = [arrival(0.5, client, {"x": x, "y": 0}, "pose") for client, x in (("a", 0), ("b", 5), ("c", 500))]
+    assert drive.take(*places, until=1) == ["near a+b started 1", "party a started 1", "party b started 1"]
+
+
+def test_a_dependency_that_is_disabled_is_unknown_and_one_that_comes_later_brings_what_is_open() -> None:
+    detector = a_detector()
+    top = a_rule("top", signals=[over("braking", aggregate="Active")], when="it", until="!it")
+    drive = Drive(detector, top, braking(enabled=False))
+    assert drive.take(*speeds("0"), until=1) == []
+    assert drive.engine.counters.rule("top").absences["signal it: rule braking is disabled, refused or gone"] == 1
+    drive.note(drive.engine.set_rules(compiled(detector, braking())))
+    assert drive.take(until=2) == ["braking car started 2"]
+    drive.note(drive.engine.set_rules(compiled(detector, braking(), top)))
+    assert drive.take(until=3) == ["top car started 3"]
+    assert drive.events[-1].onset_time == at(3)
+
+
+def test_a_dependency_that_changes_its_meaning_begins_with_no_starts() -> None:
+    detector = a_detector()
+    top = a_rule("top", signals=[count("braking", "10s")], when="it > 0")
+    drive = Drive(detector, top, braking())
+    assert drive.take(*speeds("0"), until=1) == ["braking car started 1", "top car started 1"]
+    told = drive.note(drive.engine.set_rules(compiled(detector, top, braking(when="speed < 0.5"))))
+    assert told == ["braking car RuleChanged 1"]
+    assert drive.take(*speeds("9", start=1.5), until=2) == ["top car Until 2"]
+
+
+def test_starts_keep_nobody_alive_and_are_forgotten_with_the_client() -> None:
+    top = a_rule("top", signals=[count("braking", "1h")], when="it > 0")
+    drive = Drive(a_detector(clientTimeout="5s"), top, braking())
+    told = drive.take(*speeds("0"), *speeds("9", start=20.5), until=21)
+    assert told == [
+        "braking car started 1",
+        "top car started 1",
+        "braking car ClientLost 6",
+        "top car ClientLost 6",
+    ]
+
+
+def test_a_restored_episode_is_active_and_a_past_start() -> None:
+    detector = a_detector()
+    rule = braking(actions=[{"name": "go", "deploy": {"template": "app"}}])
+    first = Drive(detector, rule)
+    first.take(*speeds("0"), until=1)
+    top = a_rule("top", signals=[over("braking", "since", aggregate="Age")], when="since == 9.0", until="false")
+    second = Drive(detector, rule, top, start=5)
+    second.note(second.engine.restore(list(first.engine.demands().values()), at(5)))
+    assert second.take(*speeds("00000", start=5.5), until=10) == ["top car started 10"]
+
+
+def test_rules_are_evaluated_by_depth_then_name() -> None:
+    rules = [
+        a_rule("a", signals=[count("c", "1s")], when="it > 0"),
+        a_rule("b", signals=[count("a", "1s")], when="it > 0"),
+        a_rule("c", when="true"),
+        a_rule("d", when="true"),
+    ]
+    assert [rule.name for rule in in_order(compiled(a_detector(), *rules))] == ["c", "d", "a", "b"]
+    circle = compiled(a_detector(), *rules[:2], a_rule("c", signals=[count("b", "1s")], when="it > 0"))
+    assert sorted(rule.name for rule in in_order(circle)) == ["a", "b", "c"]
+
+
+def test_a_circle_is_told_with_its_way_and_an_unknown_rule_with_the_nearest() -> None:
+    rules = [
+        a_rule("a", signals=[count("b", "1s")], when="it > 0"),
+        a_rule("b", signals=[SPEED, count("c", "1s")], when="it > 0"),
+        a_rule("c", signals=[count("a", "1s")], when="it > 0"),
+        a_rule("d", signals=[count("a", "1s")], when="it > 0"),
+        a_rule("e", signals=[count("e", "1s")], when="it > 0"),
+        a_rule("f", signals=[count("brakin", "1s")], when="it > 0"),
+        a_rule("braking", when="true"),
+    ]
+    told = {name: [str(problem) for problem in problems] for name, problems in dependency_problems(rules).items()}
+    circle = "rules cannot depend on each other in a circle: {}; remove one of these signals"
+    assert told == {
+        "a": ["spec.signals[0].rule: " + circle.format("a → b → c → a")],
+        "b": ["spec.signals[1].rule: " + circle.format("b → c → a → b")],
+        "c": ["spec.signals[0].rule: " + circle.format("c → a → b → c")],
+        "e": ["spec.signals[0].rule: " + circle.format("e → e")],
+        "f": ["spec.signals[0].rule: there is no rule brakin that the same Detector selects; did you mean braking?"],
+    }
+
+
+def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None:
+    book, top = RuleBook(), a_rule("top", signals=[count("braking", "1s")], when="it > 0")
+    good, refused = book.compile([top], a_detector(), {})
+    assert (good, len(refused)) == ([], 1)
+    good, refused = book.compile([top, braking()], a_detector(), {})
+    assert ([rule.name for rule in good], refused) == (["top", "braking"], [])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"name": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream, rule, model and plugin"),
+        ({"name": "s", "rule": "r", "stream": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream"),
+        ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active is for a signal over a rule"),
+        ({"name": "s", "rule": "r", "aggregate": "Active", "over": "1s"}, "takes neither over nor where"),
+        ({"name": "s", "rule": "r", "aggregate": "Active", "value": "msg.episode"}, "looks at no value"),
+    ],
+)
+def test_what_a_signal_over_a_rule_cannot_be(fields: Any, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        a_rule("r", signals=[fields], when="true")
+
+
+def test_a_start_has_no_other_fields() -> None:
+    top = a_rule("top", signals=[over("braking", value="msg.vales.speed")], when="it > 0.0")
+    (refusal,) = RuleBook().compile([top, braking()], a_detector(), {})[1]
+    assert "spec.signals[0].value: msg has no field vales; did you mean values?" in str(refusal)

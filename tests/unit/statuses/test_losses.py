@@ -1,0 +1,65 @@
+"""What is lost is said at once, then no more than once a minute, and in all at the end."""
+
+from __future__ import annotations
+
+from itertools import count
+
+import pytest
+
+from detector.engine.samples.intake import Intake
+from detector.losses import Losses
+from tests.driving import POSITION, Drive, a_detector, a_rule, arrival
+
+PAIRS = a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="distance < 10")
+
+
+def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    now = [0.0]
+    drive = Drive(a_detector(), PAIRS)
+    losses = Losses(drive.engine, Intake(lambda: 0), monotonic=lambda: now[0])
+    losses.say()
+    assert caplog.messages == []
+    for second in (0, 20, 40, 60):
+        now[0] = second
+        drive.take(arrival(second / 20 + 0.5, "car", b"{", "pose"), until=second / 20 + 1)
+        losses.say()
+    said = [message for message in caplog.messages if "could not be read" in message]
+    assert len(said) == 2
+    assert said[0].startswith("1 times a sample of stream pose could not be read; the last: vehicles/car/pose: no JSON")
+    assert said[1].startswith("3 times a sample of stream pose could not be read")
+    caplog.clear()
+    losses.sum_up()
+    assert any(
+        message.startswith("in all, 4 times a sample of stream pose could not be read") for message in caplog.messages
+    )
+
+
+@pytest.mark.parametrize(
+    ("payload", "said"),
+    [
+        (b'{"x": 1e13, "y": 0}', "x of car is 1e+13 m, where nobody is"),
+        (b'{"x": 0, "y": "far"}', "y of car is absent, NaN, no number, or cannot be read"),
+        (b'{"y": 0}', "x of car is absent, NaN, no number, or cannot be read"),
+    ],
+)
+def test_a_sample_without_a_position_is_told_with_client_and_axis(
+    caplog: pytest.LogCaptureFixture, payload: bytes, said: str
+) -> None:
+    drive = Drive(a_detector(), PAIRS)
+    drive.take(arrival(0.5, "car", payload, "pose"), until=1)
+    Losses(drive.engine, Intake(lambda: 0)).say()
+    assert f"1 times a sample had no position for EventRule near; the last: {said}" in caplog.messages
+
+
+def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCaptureFixture) -> None:
+    stream = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "stamp": "msg.t"}
+    drive = Drive(a_detector(stream, clock="Data"))
+    stamps = count(1_767_225_600)
+    for client in ("a", "b", "a", "b"):
+        drive.take(arrival(0.5, client, {"t": next(stamps)}, "pose"), until=1)
+    drive.take(arrival(1.5, "c", {"t": next(stamps) + 3600}, "pose"), until=2)
+    Losses(drive.engine, Intake(lambda: 0)).say()
+    (message,) = [each for each in caplog.messages if "stamps being ahead" in each]
+    assert "the last: c is 3601 s ahead of the rest" in message
