@@ -56,7 +56,9 @@ class Program:
             folder: its working directory; by default that of the test run.
         """
         self.arguments = [str(each) for each in arguments]
-        files = (str(output.absolute()), str((errors or output).absolute()))
+        files = (output.absolute(), (errors or output).absolute())
+        for file in files:
+            file.touch()  # who reads it at once finds it
         everything = dict(os.environ if environment is None else environment)
         where = str(folder or Path.cwd())
         # A daemon of `multiprocessing` is one that is terminated at the end of the test run, not waited for.
@@ -133,7 +135,7 @@ def run(
     return done
 
 
-def _become(arguments: list[str], files: tuple[str, str], environment: dict[str, str], folder: str) -> None:
+def _become(arguments: list[str], files: tuple[Path, Path], environment: dict[str, str], folder: str) -> None:
     """Be the program, in a process that was just forked."""
     from importlib import import_module
 
