@@ -28,7 +28,7 @@ def end_on_sigterm() -> None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Within, no garbage is looked for; afterwards not in what was made within."""
+    """Around imports: within, no garbage is looked for; afterwards not in what was made within."""
     gc.disable()
     try:
         yield
