@@ -1,40 +1,31 @@
 """The command line: `application-manager run`, `render`, `check`, `explain`, `inject`, and those that print manifests.
 
+Declared here; what a command runs is imported when it runs, so that `--help` need not.
 That the API server refuses us at the start is bad input as well: the account and its rights are given to us.
 """
 
 from __future__ import annotations
 
-import asyncio
 import json
 import logging
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
-from application_manager.charts.chartcache import default_folder
-from application_manager.charts.helm import Helm
-from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.leadership import LeaseKey, lease_key
-from application_manager.commands.checking import check_files
-from application_manager.commands.injecting import inject
-from application_manager.commands.inquiry import InquiryError, inquire
-from application_manager.commands.offline import charts_at_once, render_files
-from application_manager.commands.rbac import detector_rbac, rbac
-from application_manager.commands.telling import text
-from application_manager.commands.webhooks import webhooks
-from application_manager.core.objects.poddefaults import PodDefaults, PullPolicy, parse_environment
-from application_manager.core.objects.policy import Policy
-from application_manager.options import Options
-from application_manager.service import serve
-from application_manager.work.publishing import settings
+from application_manager.commands.printing import detector_rbac, inject, rbac, webhooks
+from application_manager.core.objects.pullpolicy import PullPolicy
 from wayside import commandline
-from wayside.api.base import Duration
-from wayside.api.documents import DocumentError
+from wayside.beginning import importing
+from wayside.inputerror import InputError
+
+if TYPE_CHECKING:
+    from application_manager.admission.reviewing import Serving
+    from application_manager.cluster.leadership import LeaseKey
+    from application_manager.core.objects.poddefaults import PodDefaults
+    from application_manager.core.objects.policy import Policy
 
 app = typer.Typer(
     add_completion=False,
@@ -43,12 +34,8 @@ app = typer.Typer(
     help="Makes a cluster run what the live ApplicationTasks demand.",
 )
 
-EXPECTED = (DocumentError, ConfigurationError, InquiryError)
+EXPECTED = (InputError,)
 """Errors of the input: said in one line, without a trace."""
-
-RESYNC = Duration("60s")
-TTL_AFTER_FINISHED = Duration("1h")
-STALLED = Duration("5m")
 
 AllowedKinds = Annotated[
     list[str] | None,
@@ -90,14 +77,18 @@ def _main(
             handler.addFilter(lambda record: not record.getMessage().startswith("Request attempt"))
 
 
-def _duration(text: str) -> Duration:
+def _seconds(option: str, written: str) -> float:
+    from wayside.api.base import Duration
+
     try:
-        return Duration.parse(text)
+        return Duration.parse(written).seconds
     except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
+        raise typer.BadParameter(str(error), param_hint=option) from None
 
 
 def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
+    from application_manager.core.objects.policy import Policy
+
     try:
         return Policy.parse(kinds, accounts)
     except ValueError as error:
@@ -107,12 +98,16 @@ def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
 def _serving(port: int | None, certificates: Path | None) -> Serving | None:
     if port is None and certificates is None:
         return None
+    from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
+
     if port is None or certificates is None:
         commandline.refuse(f"{PORT_OPTION} and {FOLDER_OPTION} go together: give both, or none")
     return Serving(port, certificates)
 
 
 def _lease(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
+    from application_manager.cluster.leadership import lease_key
+
     try:
         return lease_key(given, namespaces)
     except ValueError as error:
@@ -122,6 +117,8 @@ def _lease(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
 def _detectors(
     image: str | None, policy: PullPolicy | None, secrets: list[str] | None, variables: list[str] | None
 ) -> PodDefaults | None:
+    from application_manager.core.objects.poddefaults import PodDefaults, parse_environment
+
     try:
         environment = parse_environment(variables or ())
     except ValueError as error:
@@ -141,18 +138,14 @@ def run(
         list[str] | None, typer.Option(help="A namespace to look after; repeatable. Default: all.")
     ] = None,
     max_instances: MaxInstances = None,
-    resync: Annotated[
-        Duration, typer.Option(parser=_duration, metavar="DURATION", help="How often everything is listed anew.")
-    ] = RESYNC,
+    resync: Annotated[str, typer.Option(metavar="DURATION", help="How often everything is listed anew.")] = "60s",
     ttl_after_finished: Annotated[
-        Duration, typer.Option(parser=_duration, metavar="DURATION", help="How long finished tasks are kept.")
-    ] = TTL_AFTER_FINISHED,
+        str, typer.Option(metavar="DURATION", help="How long finished tasks are kept.")
+    ] = "1h",
     stalled_after: Annotated[
-        Duration,
-        typer.Option(
-            parser=_duration, metavar="DURATION", help="After how long without progress the watchdog ends this manager."
-        ),
-    ] = STALLED,
+        str,
+        typer.Option(metavar="DURATION", help="After how long without progress the watchdog ends this manager."),
+    ] = "5m",
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
     ] = None,
@@ -209,13 +202,22 @@ def run(
     ] = None,
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
+    with importing():
+        import asyncio
+
+        from application_manager.charts.chartcache import default_folder
+        from application_manager.charts.helm import Helm
+        from application_manager.options import Options
+        from application_manager.service import serve
+        from application_manager.work.publishing import settings
+
     options = Options(
         policy=_policy(allowed_kinds, service_accounts),
         namespaces=tuple(namespace or ()),
         max_instances=max_instances,
-        resync=resync.seconds,
-        ttl_after_finished=ttl_after_finished.seconds,
-        stalled_after=stalled_after.seconds,
+        resync=_seconds("--resync", resync),
+        ttl_after_finished=_seconds("--ttl-after-finished", ttl_after_finished),
+        stalled_after=_seconds("--stalled-after", stalled_after),
         metrics_port=metrics_port,
         zenoh=settings(zenoh) if zenoh else None,
         helm=Helm(helm),
@@ -246,6 +248,10 @@ def render(
 
     What waits, is held at a bound or is refused is said on stderr; where something is refused, the exit code is 1.
     """
+    with importing():
+        from application_manager.charts.helm import Helm
+        from application_manager.commands.offline import charts_at_once, render_files
+
     policy = _policy(allowed_kinds, service_accounts)
     result = render_files(
         [*templates, *tasks], policy, max_instances, charts_at_once(Helm(helm), chart_cache, chart_folder)
@@ -267,6 +273,10 @@ def check(
 
     Exits with 1 where it would refuse something; what it would warn of is said alone.
     """
+    with importing():
+        from application_manager.commands.checking import check_files
+        from wayside.api.documents import DocumentError
+
     try:
         checked = check_files(files, _policy(allowed_kinds, service_accounts))
     except DocumentError as error:
@@ -295,6 +305,12 @@ def explain(
     output: Annotated[Output, typer.Option("--output", "-o", help="For people or for programs.")] = Output.TEXT,
 ) -> None:
     """Say why a task is served or not, and why an instance runs as it does: from the event to the pods."""
+    with importing():
+        import asyncio
+
+        from application_manager.commands.inquiry import inquire
+        from application_manager.commands.telling import text
+
     explanation = asyncio.run(inquire(subject, namespace))
     if output is Output.JSON:
         sys.stdout.write(f"{json.dumps(explanation.to_json(), indent=2, ensure_ascii=False)}\n")

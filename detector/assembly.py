@@ -21,6 +21,7 @@ from detector.streams.codecs.fields import message_fields
 from detector.streams.codecs.ros import RosTypes, standard, types_with
 from wayside.api import Detector, EventRule
 from wayside.api.stream import MessageDefinition
+from wayside.inputerror import InputError
 from wayside.keys import KeyPattern
 from wayside.rules import (
     CompiledRule,
@@ -34,7 +35,7 @@ from wayside.rules import (
 )
 
 
-class DetectorError(ValueError):
+class DetectorError(InputError, ValueError):
     """A Detector that cannot run; `problems` says why."""
 
     def __init__(self, problems: Iterable[RuleProblem]) -> None:

@@ -1,50 +1,24 @@
-"""The command `detector`: run, replay, check, and the commands that ask one that runs."""
+"""The command `detector`: run, replay, check, and the commands that ask one that runs.
+
+Declared here, and in the modules of commands that are added below; what a command runs is imported when it runs.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import sys
-from collections.abc import Iterable
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import TypeAdapter, ValidationError
-from rich.console import Console
 
 from detector import inquiry, recordings
-from detector.actions.deploy.file_store import write_tasks_yaml
-from detector.assembly import DetectorError
 from detector.catalog.command import command as catalog_command
-from detector.checking import findings, summary
-from detector.cluster.errors import NoClusterError
-from detector.comparison import write_comparison
-from detector.engine.episodes.demands import from_task
-from detector.engine.episodes.events import Event
-from detector.engine.scoping.plugins import PluginHost
-from detector.plugins.outages import Outages
-from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
-from detector.replay.errors import RecordingError
-from detector.replay.intake_file import is_intake_file, read_intake, recorded_outages
-from detector.replay.latched import recorded_arrivals
-from detector.replay.progress import Progress
-from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
-from detector.replay.routing import Router
-from detector.rules.files import load_rules
-from detector.service import Files, Named, Options
-from detector.service import run as run_service
-from detector.streams.asking import NoAnswerError
-from detector.streams.zenoh import NetworkError
-from detector.tracing import episode_traces
 from wayside import commandline
-from wayside.api import ApplicationTask
-from wayside.api.applicationtask import Holder
-from wayside.api.documents import DocumentError, load_documents
+from wayside.beginning import importing
 from wayside.commandline import leave, refuse
+from wayside.inputerror import InputError
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -53,15 +27,7 @@ app = typer.Typer(
     add_completion=False,
 )
 
-_EXPECTED = (
-    DocumentError,
-    DetectorError,
-    RecordingError,
-    NetworkError,
-    NoAnswerError,
-    NoClusterError,
-    OSError,
-)
+_EXPECTED = (InputError, OSError)
 """Errors of the input: said in one line, without a trace."""
 
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
@@ -116,23 +82,33 @@ def run(
     """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
     if (name is None) == (detector is None):
         refuse("give either --detector FILE and --rules FILE, or --name NAME")
+    if name is not None and rules:
+        refuse("--rules goes with --detector; with --name the rules are read from the API server")
+    if detector is not None and namespace is not None:
+        refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
+    if detector is not None and as_pod:
+        refuse("--as-pod goes with --name; a Detector in a file is held by its name")
+    with importing():
+        import asyncio
+
+        from detector.service import Files, Named, Options
+        from detector.service import run as run_service
+
     if name is not None:
-        if rules:
-            refuse("--rules goes with --detector; with --name the rules are read from the API server")
         holder = _holder_in_pod(name) if as_pod else name
-        options = Options(Named(name, namespace, output, holder), record_intake, metrics_port)
+        source: Files | Named = Named(name, namespace, output, holder)
     else:
         assert detector is not None  # noqa: S101  one of both is given
-        if namespace is not None:
-            refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
-        if as_pod:
-            refuse("--as-pod goes with --name; a Detector in a file is held by its name")
-        options = Options(Files(detector, tuple(rules or ()), output or Path("out")), record_intake, metrics_port)
-    asyncio.run(run_service(options))
+        source = Files(detector, tuple(rules or ()), output or Path("out"))
+    asyncio.run(run_service(Options(source, record_intake, metrics_port)))
     leave()
 
 
 def _holder_in_pod(name: str) -> str:
+    from pydantic import TypeAdapter, ValidationError
+
+    from wayside.api.applicationtask import Holder
+
     pod = os.environ.get("POD_NAME", "")
     try:
         return TypeAdapter(Holder).validate_python(f"{name}.{pod}" if pod else "")
@@ -157,38 +133,10 @@ def replay(
     ] = None,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
-    plugins = ProcessHost(
-        Outages(lambda: recorded_outages(recordings[0]) if detector is None else ()),
-        wait=True,
-        patience=REPLAY_PATIENCE,
-    )
-    with Progress(Console(stderr=True)) as progress, closing(plugins):
-        outcome = _replayed(recordings, detector, rules, progress, plugins)
-    output.mkdir(parents=True, exist_ok=True)
-    events, tasks = _traced(outcome)
-    with (output / "events.jsonl").open("w", encoding="utf-8") as file:
-        file.writelines(event.to_json() + "\n" for event in events)
-    write_tasks_yaml(output / "tasks.yaml", tasks)
-    if compared is not None:
-        write_comparison(outcome, compared, output)
-    for refusal in outcome.refusals:
-        typer.echo(str(refusal), err=True)
-    for note in outcome.notes:
-        typer.echo(note, err=True)
-    if outcome.cut:
-        typer.echo("the intake file ends in the middle: its detector was killed", err=True)
-    if outcome.lost:
-        typer.echo(
-            f"the intake file lacks {outcome.lost} samples, the disk being too slow: events may differ", err=True
-        )
-    started = sum(event.started for event in outcome.events)
-    typer.echo(
-        f"{outcome.samples} samples, {started} episodes started, {len(outcome.events) - started} ended, "
-        f"{len(outcome.tasks)} tasks: {output}",
-        err=True,
-    )
-    if outcome.refusals:
-        raise typer.Exit(1)
+    with importing():
+        from detector.commands.replay import replay_files
+
+    replay_files(recordings, output, detector, rules or (), compared)
 
 
 @app.command()
@@ -200,6 +148,10 @@ def check(
 
     A classification that contradicts its rule is a warning.
     """
+    with importing():
+        from detector.checking import findings, summary
+        from wayside.api.documents import DocumentError, load_documents
+
     try:
         documents = load_documents(files)
     except DocumentError as error:
@@ -221,46 +173,6 @@ app.command("catalog")(catalog_command)
 
 for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume):
     app.command()(command)
-
-
-def _replayed(
-    recordings: list[Path], detector: Path | None, rules: list[Path] | None, progress: Progress, plugins: PluginHost
-) -> Outcome:
-    if recordings[0].exists() and is_intake_file(recordings[0]):
-        if len(recordings) > 1:
-            refuse("an intake file is replayed alone: give one recording")
-        if detector is None and rules:
-            refuse("give --detector as well: rules are compiled against their Detector")
-        given = None if detector is None else load_rules(detector, rules or ()).rule_set
-        return replay_intake(
-            progress.watch(read_intake(recordings[0])),
-            None if given is None else given.detector,
-            given.rules if given is not None and rules else None,
-            plugins,
-        )
-    if detector is None:
-        refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
-    loaded = load_rules(detector, rules or ())
-    for warning in loaded.warnings:
-        typer.echo(warning, err=True)
-    completed = with_recorded_types(loaded.rule_set.detector, recordings)
-    router = Router(completed.spec.streams)
-    arrivals = recorded_arrivals(recordings, router, completed)
-    outcome = replay_arrivals(progress.watch(arrivals), completed, loaded.rule_set.rules, plugins)
-    if not outcome.samples:
-        keys = ", ".join(router.unrouted) or "none"
-        typer.echo(f"no message belongs to a stream of the Detector; keys in the recording: {keys}", err=True)
-    return outcome
-
-
-def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
-    """The events and tasks; with where they stand in traces, as live, where the environment asks for traces."""
-    with episode_traces(export=False) as traces:
-        if traces is None:
-            return outcome.events, outcome.tasks.values()
-        demands = ((task, from_task(task)) for task in outcome.tasks.values())
-        tasks = [task if demand is None else traces.task(demand, task) for task, demand in demands]
-        return [traces.event(event) for event in outcome.events], tasks
 
 
 def main() -> None:

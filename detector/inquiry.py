@@ -1,21 +1,22 @@
-"""The commands that ask a running detector: `detector status`, `evaluate`, `pause` and `resume`."""
+"""The commands that ask a running detector: `detector status`, `evaluate`, `pause` and `resume`.
+
+A command imports what it runs when it runs, so that `--help` need not.
+"""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
-from detector.rules.files import load_rules
-from detector.status.model import read_status
-from detector.status.table import status_view
-from detector.streams.asking import Asked, ask
-from wayside.api.pod import DetectorMode
-from wayside.api.zenoh import Zenoh, ZenohMode
+from wayside.beginning import importing
 from wayside.commandline import refuse
+
+if TYPE_CHECKING:
+    from detector.streams.asking import Asked
+    from wayside.api.zenoh import Zenoh
 
 DetectorFile = Annotated[
     Path | None, typer.Option("--detector", help="The running detector's YAML file: says its name and network.")
@@ -47,16 +48,24 @@ def status(
     if subject is not None and rule is None:
         refuse("--subject goes with --rule: of which rule?")
     given = {"rule": rule, "subject": subject, "wait": f"{min(timeout * 0.6, 99):.3f}"} if rule is not None else {}
+    answers = inquire(
+        "status", {name: value for name, value in given.items() if value is not None}, detector, name, connect, timeout
+    )
+    if as_json:
+        for answer in answers:
+            typer.echo(json.dumps(json.loads(answer.payload)))
+        return
+    with importing():
+        from rich.console import Console
+
+        from detector.status.model import read_status
+        from detector.status.table import status_view
+
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
-    for answer in inquire(
-        "status", {name: value for name, value in given.items() if value is not None}, detector, name, connect, timeout
-    ):
-        if as_json:
-            typer.echo(json.dumps(json.loads(answer.payload)))
-        else:
-            console.print(status_view(read_status(answer.payload)), highlight=False, markup=False)
+    for answer in answers:
+        console.print(status_view(read_status(answer.payload)), highlight=False, markup=False)
 
 
 def evaluate(
@@ -97,6 +106,12 @@ def inquire(
     payload: bytes | None = None,
 ) -> list[Asked]:
     """Ask the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
+    with importing():
+        from detector.rules.files import load_rules
+        from detector.streams.asking import ask
+        from wayside.api.pod import DetectorMode
+        from wayside.api.zenoh import Zenoh, ZenohMode
+
     config, holder = Zenoh(mode=ZenohMode.PEER), "*"
     if detector is not None:
         given_detector = load_rules(detector, ()).rule_set.detector
@@ -112,7 +127,9 @@ def inquire(
 
 def _reaching(zenoh: Zenoh) -> Zenoh:
     """The detector's own way into the network; one that others connect to is reached where it listens."""
-    if zenoh.listen:
-        here = [endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for endpoint in zenoh.listen]
-        return zenoh.model_copy(update={"connect": here, "listen": [], "mode": ZenohMode.CLIENT})
-    return zenoh
+    if not zenoh.listen:
+        return zenoh
+    from wayside.api.zenoh import ZenohMode
+
+    here = [endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for endpoint in zenoh.listen]
+    return zenoh.model_copy(update={"connect": here, "listen": [], "mode": ZenohMode.CLIENT})

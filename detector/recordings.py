@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import json
 import uuid
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
-from pydantic import ValidationError
-from rich.console import Console
-from rich.table import Table
 
-from detector.actions.trigger.orders import Progress
-from detector.actions.trigger.requests import (
-    RECORDINGS,
-    RecordingReport,
-    RecordingRequest,
-    read_reports,
-    write_request,
-)
 from detector.inquiry import Connect, DetectorFile, Name, Timeout, inquire
-from wayside.api.wording import messages
+from wayside.beginning import importing
 from wayside.commandline import refuse
+
+if TYPE_CHECKING:
+    from detector.actions.trigger.requests import RecordingReport, RecordingRequest
 
 app = typer.Typer(help="Have running detectors record, where they allow it (spec.recordings.onRequest).")
 
@@ -90,6 +81,12 @@ def status(
 
 
 def _request(**given: object) -> RecordingRequest:
+    with importing():
+        from pydantic import ValidationError
+
+        from detector.actions.trigger.requests import RecordingRequest
+        from wayside.api.wording import messages
+
     try:
         return RecordingRequest.model_validate(given)
     except ValidationError as error:
@@ -105,17 +102,26 @@ def _asked(
     timeout: float,
 ) -> list[tuple[str, RecordingReport]]:
     """The reports, each with the name of the detector that gave it."""
+    from detector.actions.trigger.requests import RECORDINGS, read_reports, write_request
+
     answers = inquire(RECORDINGS, {}, detector, name, connect, timeout, write_request(request))
     return [(answer.key.split("/")[2], report) for answer in answers for report in read_reports(answer.payload)]
 
 
 def _print(told: list[tuple[str, RecordingReport]], as_json: bool) -> None:
     """Exits with 1 where a recording was refused or has failed."""
+    from detector.actions.trigger.orders import Progress
+
     if as_json:
+        import msgspec
+
         for holder, report in told:
             answer = {"detector": holder, **{key: value for key, value in msgspec.to_builtins(report).items() if value}}
             typer.echo(json.dumps(answer))
     else:
+        from rich.console import Console
+        from rich.table import Table
+
         console = Console()
         if not console.is_terminal:
             console = Console(width=_WIDTH)

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequenc
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.outcomes import Outcomes
@@ -22,7 +23,6 @@ from detector.event_log import EventLog
 from detector.losses import Loss
 from detector.outlet import LiveOutlet
 from detector.plugins.processes import ProcessHost
-from detector.replay.intake_writer import IntakeWriter
 from detector.requested import Requested
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
@@ -38,6 +38,9 @@ from detector.tracing import EpisodeTraces
 from wayside.api import Detector
 from wayside.api.source import ZENOH
 from wayside.api.stream import Stream
+
+if TYPE_CHECKING:
+    from detector.replay.intake_writer import IntakeWriter
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +71,7 @@ class Running:
         self._intake = Intake(time.time_ns)
         self._plugins = ProcessHost()
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
-        self._writer = None if record is None else IntakeWriter(_unused(record), detector.spec.streams, entries.types)
+        self._writer = None if record is None else _writer(record, detector, entries)
         self._log = None if output is None else EventLog(output / "events.jsonl")
         self._outlet = LiveOutlet(self._network(detector), holder, self._log, reconciler, state, traces)
         self._state = state
@@ -187,6 +190,13 @@ class Running:
         self._evaluator.losses.sum_up()
         if self._outlet.network.dropped_events:
             _log.warning("in all, %d events not published", self._outlet.network.dropped_events)
+
+
+def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:
+    # Not at the top: only a detector that records its intake needs the MCAP library.
+    from detector.replay.intake_writer import IntakeWriter  # noqa: PLC0415
+
+    return IntakeWriter(_unused(path), detector.spec.streams, entries.types)
 
 
 def _server(port: int, answers: Answers) -> StatusServer:

@@ -1,4 +1,4 @@
-"""What our programs do before they import anything else: become able to end, and put off looking for garbage.
+"""What our programs do before and while they import: become able to end, and put off looking for garbage.
 
 The first process of a container is spared every signal that it has no handler for. Without one, a container that is to
 end while its program still imports (a second and more) would go on for the whole grace period, and with it its pod: a
@@ -28,7 +28,7 @@ def end_on_sigterm() -> None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Within, no garbage is looked for; afterwards not in what was made within."""
+    """Around imports: within, no garbage is looked for; afterwards not in what was made within."""
     gc.disable()
     try:
         yield

@@ -11,6 +11,7 @@ from kubernetes.aio.config import ConfigException, load_kube_config
 from yaml import YAMLError
 
 from application_manager.cluster.podaccount import AccountError, use_pod_account
+from wayside.inputerror import InputError
 
 _CONNECTIONS = 32
 _DEFAULT_FILE = "~/.kube/config"
@@ -23,7 +24,7 @@ _load_kube_config: Any = load_kube_config
 _ApiClient: Any = ApiClient
 
 
-class ConfigurationError(Exception):
+class ConfigurationError(InputError):
     """There is no usable kubeconfig, or the cluster lacks what the manager needs."""
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 import yaml
@@ -38,23 +38,16 @@ _NO_IMAGE = "Detector {} names no image: give --detector-image, or its spec.pod.
 Manifest = dict[str, Any]
 
 
-def inject(
-    files: Annotated[
-        list[str],
-        typer.Option("--file", "-f", metavar="FILE|-", help="A YAML file, or - for stdin; repeatable. Detectors too."),
-    ],
-    namespace: Annotated[
-        str, typer.Option("--namespace", "-n", help="Of manifests that name none, for Detectors of the cluster.")
-    ] = "default",
-    detector_image: Annotated[
-        str | None, typer.Option(help="As of `run`: the image of detectors that name none.")
-    ] = None,
-) -> None:
-    """Print the manifests with the detectors in them that their pods ask for by the label wayside.dev/detector.
+def print_injected(files: Sequence[str], namespace: str, detector_image: str | None) -> None:
+    """Print the manifests with their detectors as YAML; exits with 1 where a pod cannot have its detector.
 
-    Pods, and what makes pods, e.g. a Deployment. The Detectors come from the files, else from the cluster of the
-    current kubeconfig. What asks for none, or has it already, is printed as it is. Where a pod cannot have its detector
-    that is said, it is printed as it is, and the exit code is 1.
+    Args:
+        files: of manifests and Detectors; `-` is stdin.
+        namespace: of manifests that name none.
+        detector_image: of Detectors that name none.
+
+    Raises:
+        ConfigurationError: a file cannot be read, or a Detector not be looked up.
     """
     documents = [each for file in files for each in _read(file)]
     known = _Known({each.name: each for each in map(_detector, documents) if each is not None}, namespace)

@@ -17,6 +17,7 @@ from application_manager.core.statuses.explaining import Found, explain, serving
 from application_manager.core.statuses.explanation import Explanation
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.documents import parse_object
+from wayside.inputerror import InputError
 from wayside.leases import lease_name
 
 Model = TypeVar("Model", bound=Kind)
@@ -32,7 +33,7 @@ _TASK_WORDS = frozenset({"task", "apptask", "applicationtask", "applicationtasks
 _INSTANCE_WORDS = frozenset({"instance", "appinst", "applicationinstance", "applicationinstances"})
 
 
-class InquiryError(Exception):
+class InquiryError(InputError):
     """What was asked about cannot be explained; the message is one line, with the remedy."""
 
 

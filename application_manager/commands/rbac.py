@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from typing import Annotated
+from collections.abc import Sequence
 
 import typer
 from pydantic import TypeAdapter, ValidationError
@@ -19,33 +19,27 @@ from wayside.api.base import ObjectName
 from wayside.manifests import to_yaml
 
 
-def rbac(
-    allowed_kinds: Annotated[
-        list[str] | None,
-        typer.Option(help="As of `run`: a kind that templates may create; repeatable. Replaces the default."),
-    ] = None,
-    namespace: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="As of `run`: a namespace to look after, which gets a Role; repeatable. Default: a ClusterRole."
-        ),
-    ] = None,
-    account: Annotated[
-        str, typer.Option(metavar="NAMESPACE/NAME", help="The service account that the manager runs with.")
-    ] = "wayside/application-manager",
-    lease: Annotated[
-        str | None, typer.Option(metavar="[NAMESPACE/]NAME", help="As of `run`. Default: in the account's namespace.")
-    ] = None,
-    detectors: Annotated[
-        bool, typer.Option("--detectors", help="For a manager with --detector-image, which runs detectors too.")
-    ] = False,
-    name: Annotated[
-        str, typer.Option(help="Of the roles and bindings; managers of different namespaces need different ones.")
-    ] = "wayside-application-manager",
+def print_rbac(
+    allowed_kinds: list[str] | None,
+    namespaces: Sequence[str],
+    account: str,
+    lease: str | None,
+    name: str,
+    *,
+    detectors: bool,
 ) -> None:
-    """Print the roles that the manager's account needs for the kinds that templates may create, and no more.
+    """Print the roles and bindings as YAML.
 
-    Only a kind that is not one of the default ones is looked up in the cluster of the current kubeconfig.
+    Args:
+        allowed_kinds: that templates may create; None: the default ones.
+        namespaces: that get a Role each; empty: one ClusterRole.
+        account: as NAMESPACE/NAME.
+        lease: of the managers, as [NAMESPACE/]NAME; None: the default one, in the account's namespace.
+        name: of the roles and bindings.
+        detectors: whether the manager runs detectors too.
+
+    Raises:
+        ConfigurationError: a kind has to be looked up and cannot be.
     """
     where, _, who = account.partition("/")
     if not where or not who:
@@ -60,22 +54,15 @@ def rbac(
         raise typer.BadParameter(str(error), param_hint="--lease") from None
     found = plurals(policy)
     lease_place = (key.namespace, key.name)
-    sys.stdout.write(to_yaml(roles(found, namespace or (), lease_place, (where, who), name, detectors=detectors)))
+    sys.stdout.write(to_yaml(roles(found, namespaces, lease_place, (where, who), name, detectors=detectors)))
 
 
-def detector_rbac(
-    name: Annotated[str, typer.Argument(help="The Detector.")],
-    namespace: Annotated[str, typer.Option("--namespace", "-n", help="Its namespace.")],
-    pod_account: Annotated[
-        list[str] | None,
-        typer.Option(help="An account of pods that have the detector as a sidecar; repeatable. No other is made."),
-    ] = None,
-) -> None:
-    """Print the account of a detector that you run yourself, with the rights that it needs, and no more."""
+def print_detector_rbac(name: str, namespace: str, pod_accounts: Sequence[str]) -> None:
+    """Print the account of a Detector and its rights as YAML; those of the accounts of pods, where there are any."""
     _named(name, "Detector", "NAME")
-    for account in pod_account or ():
+    for account in pod_accounts:
         _named(account, "account", "--pod-account")
-    made = sidecar_roles(namespace, name, pod_account) if pod_account else detector_roles(namespace, name)
+    made = sidecar_roles(namespace, name, pod_accounts) if pod_accounts else detector_roles(namespace, name)
     sys.stdout.write(to_yaml(made))
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -14,55 +14,41 @@ from wayside import commandline
 from wayside.manifests import to_yaml
 
 
-def webhooks(
-    service: Annotated[
-        str | None,
-        typer.Option(metavar="NAMESPACE/NAME[:PORT]", help="The manager's Service. The port's default: 443."),
-    ] = None,
-    url: Annotated[
-        str | None,
-        typer.Option(metavar="https://HOST:PORT", help="In place of --service: a manager that is elsewhere."),
-    ] = None,
-    ca_bundle: Annotated[
-        Path | None,
-        typer.Option(
-            help="The certificate (PEM) of the authority that signed the manager's. Without it somebody else "
-            "must write it in, as cert-manager does."
-        ),
-    ] = None,
-    make_certificates: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="In place of --ca-bundle, for trials: make an authority and a certificate "
-            "that is valid for a year, as ca.crt, tls.crt and tls.key in this folder.",
-        ),
-    ] = None,
-    namespace: Annotated[
-        list[str] | None, typer.Option(help="As of `run`: the namespaces that the manager looks after; repeatable.")
-    ] = None,
-    detectors: Annotated[
-        bool,
-        typer.Option(
-            "--detectors", help="For a manager with --detector-image: also what puts detectors into pods (Sidecar)."
-        ),
-    ] = False,
-    name: Annotated[str, typer.Option(help="Of the objects; managers of different namespaces need different ones.")] = (
-        "wayside"
-    ),
+def print_webhooks(
+    service: str | None,
+    url: str | None,
+    ca_bundle: Path | None,
+    folder: Path | None,
+    namespaces: Sequence[str],
+    name: str,
+    *,
+    detectors: bool,
 ) -> None:
-    """Print what makes the API server ask a manager with --admission-port about templates, rules and detectors."""
+    """Print the configurations as YAML.
+
+    Args:
+        service: the manager's Service as NAMESPACE/NAME[:PORT]; or else `url`.
+        url: of a manager elsewhere.
+        ca_bundle: the certificate of the authority, a PEM file.
+        folder: where an authority and a certificate are made in place of `ca_bundle`.
+        namespaces: that the manager looks after; empty: all.
+        name: of the objects.
+        detectors: whether detectors are put into pods.
+
+    Raises:
+        ConfigurationError: the certificate cannot be read.
+    """
     if (service is None) == (url is None):
         commandline.refuse("give either --service NAMESPACE/NAME or --url https://HOST:PORT")
-    if ca_bundle is not None and make_certificates is not None:
+    if ca_bundle is not None and folder is not None:
         commandline.refuse("--ca-bundle and --make-certificates exclude each other: give one")
     try:
         place = Place.of_service(service) if service is not None else Place.of_url(url or "")
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--url" if service is None else "--service") from None
-    bundle = _authority(ca_bundle, make_certificates, place)
+    bundle = _authority(ca_bundle, folder, place)
     made = [webhook_configuration, *([injection_configuration] if detectors else [])]
-    sys.stdout.write(to_yaml([each(place, bundle, namespace or (), name) for each in made]))
+    sys.stdout.write(to_yaml([each(place, bundle, namespaces, name) for each in made]))
 
 
 def _authority(given: Path | None, folder: Path | None, place: Place) -> bytes | None:

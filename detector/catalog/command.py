@@ -1,23 +1,18 @@
-"""The command `detector catalog`."""
+"""The command `detector catalog`. It imports what it runs when it runs, so that `--help` need not."""
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
-from detector.catalog.catalog import Catalog, ChoiceError, Read, catalog, choose
-from detector.catalog.document import json_view
-from detector.catalog.files import read_files
-from detector.catalog.markdown import markdown_view
-from detector.catalog.page import page
-from detector.catalog.terminal import terminal_view
+from wayside.beginning import importing
 from wayside.commandline import refuse
+
+if TYPE_CHECKING:
+    from detector.catalog.catalog import Catalog, Read
 
 _WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""
@@ -30,14 +25,6 @@ class Format(StrEnum):
     MARKDOWN = "markdown"
     JSON = "json"
     HTML = "html"
-
-
-_VIEWS: Mapping[Format, Callable[[Catalog], str]] = {
-    Format.MARKDOWN: markdown_view,
-    Format.JSON: json_view,
-    Format.HTML: page,
-}
-"""How it becomes text; a table depends on where it goes."""
 
 
 def command(
@@ -64,6 +51,10 @@ def command(
         refuse("give files or folders with EventRules, or --cluster")
     if namespace is not None and not cluster:
         refuse("--namespace goes with --cluster; rules in files say their namespaces themselves")
+    with importing():
+        from detector.catalog.catalog import ChoiceError, catalog, choose
+        from detector.catalog.files import read_files
+
     try:
         chosen = choose(only or ())
     except ChoiceError as error:
@@ -72,7 +63,7 @@ def command(
     for text in read.unreadable:
         typer.echo(f"left out, since it cannot be read: {text}", err=True)
     found = catalog(read.entries, chosen)
-    text = _VIEWS[form](found) if form in _VIEWS else _table(found, into_file=output is not None)
+    text = _text(found, form, into_file=output is not None)
     if output is None:
         typer.echo(text, nl=False)
     else:
@@ -81,12 +72,37 @@ def command(
 
 
 def _read_cluster(namespace: str | None) -> Read:
-    from detector.catalog.cluster import read_cluster  # noqa: PLC0415  the client library takes half a second to load
+    import asyncio
+
+    from detector.catalog.cluster import read_cluster
 
     return asyncio.run(read_cluster(namespace))
 
 
+def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
+    """The catalog as it is shown; a table depends on where it goes."""
+    match form:
+        case Format.MARKDOWN:
+            from detector.catalog.markdown import markdown_view
+
+            return markdown_view(found)
+        case Format.JSON:
+            from detector.catalog.document import json_view
+
+            return json_view(found)
+        case Format.HTML:
+            from detector.catalog.page import page
+
+            return page(found)
+        case Format.TABLE:
+            return _table(found, into_file=into_file)
+
+
 def _table(found: Catalog, *, into_file: bool) -> str:
+    from rich.console import Console
+
+    from detector.catalog.terminal import terminal_view
+
     console = Console()
     if into_file or not console.is_terminal:
         console = Console(width=_WIDTH, no_color=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+from wayside.inputerror import InputError
+
 
 class ApiError(Exception):
     """A request to the API server failed. The text is what the server said, or why it said nothing."""
@@ -73,5 +75,5 @@ def error_of(code: int, body: bytes, retry_after: str | None = None) -> ApiError
     return kind(code, reason, message)
 
 
-class NoClusterError(Exception):
+class NoClusterError(InputError):
     """There is no way to an API server; the text says what to give."""

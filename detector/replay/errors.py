@@ -2,8 +2,10 @@
 
 import struct
 
+from wayside.inputerror import InputError
 
-class RecordingError(ValueError):
+
+class RecordingError(InputError, ValueError):
     """A recording that cannot be read or does not fit the Detector; the text names the place and the remedy."""
 
 

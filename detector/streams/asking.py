@@ -11,12 +11,13 @@ import zenoh
 from detector.streams.answering import status_key
 from detector.streams.session import NetworkError, open_session
 from wayside.api.zenoh import Zenoh
+from wayside.inputerror import InputError
 
 _PATIENCE = 0.2
 """Seconds between two attempts to find somebody who answers."""
 
 
-class NoAnswerError(ValueError):
+class NoAnswerError(InputError, ValueError):
     """Nobody answered, or the answer is a refusal; the text says which."""
 
 

@@ -13,6 +13,7 @@ import zenoh
 from detector.access import AccessError
 from detector.credentials import Material, read_material
 from wayside.api.zenoh import Zenoh, ZenohMode
+from wayside.inputerror import InputError
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +23,7 @@ _RETRY_SECONDS = (0.2, 0.5, 1.0, 2.0)
 _FIELD = "spec.zenoh"
 
 
-class NetworkError(ValueError):
+class NetworkError(InputError, ValueError):
     """The Zenoh session cannot be had as configured; the text names the field and the reason."""
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from detector.actions import ActionError, Completion, Episode, Outcome, OutcomeState, Setting, Surroundings
-from detector.actions.trigger import Trigger
+from detector.actions.trigger.action import Trigger
 from detector.assembly import inlets
 from tests.driving import a_detector, a_rule
 from tests.http_servers import answers, endpoint, hangs, sends

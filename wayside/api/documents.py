@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from wayside.api import API_VERSION, KINDS
 from wayside.api.base import Kind
 from wayside.api.wording import FieldPath, field_text, messages
+from wayside.inputerror import InputError
 
 __all__ = ["Document", "DocumentError", "FieldPath", "Problem", "field_text", "load_documents", "parse_object"]
 
@@ -50,7 +51,7 @@ class Problem:
         return where + how + (f"{self.field}: " if self.field else "") + self.message
 
 
-class DocumentError(Exception):
+class DocumentError(InputError):
     """Files that cannot be used; `problems` has all that is wrong with them."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:

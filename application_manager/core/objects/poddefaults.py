@@ -5,19 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 
+from application_manager.core.objects.pullpolicy import PullPolicy
 from wayside.api.pod import RESERVED_VARIABLES
 
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-
-
-class PullPolicy(StrEnum):
-    """When a node asks the registry for an image, as Kubernetes names it."""
-
-    ALWAYS = "Always"
-    IF_NOT_PRESENT = "IfNotPresent"
-    NEVER = "Never"
 
 
 @dataclass(frozen=True, slots=True)

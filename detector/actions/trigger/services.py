@@ -74,7 +74,7 @@ class Service:
     def response(self, payload: bytes) -> dict[str, Any]:
         """A response as a map. Raises ServiceError where the bytes are none."""
         try:
-            decoded: dict[str, Any] = CdrDecoder(f"{self.name}_Response", RosTypes(self.store)).decode(payload)
+            decoded: dict[str, Any] = CdrDecoder(f"{self.name}_Response", RosTypes(lambda: self.store)).decode(payload)
         except DecodeError as error:
             raise ServiceError(f"the answer is no response of {self.name}: {error}") from None
         return decoded

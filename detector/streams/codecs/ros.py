@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import difflib
 import threading
-from collections.abc import Sequence
-from functools import cache, lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache, cached_property, lru_cache
 
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys import Stores, get_typestore
@@ -35,9 +35,14 @@ class UnknownTypeError(ValueError):
 class RosTypes:
     """Message types by their names, e.g. geometry_msgs/msg/PoseStamped."""
 
-    def __init__(self, store: Typestore) -> None:
-        self.store = store
+    def __init__(self, load: Callable[[], Typestore]) -> None:
+        """`load` gives the types when they are first asked for: the classes of a release take 0.1 s to make."""
+        self._load = load
+
+    @cached_property
+    def store(self) -> Typestore:
         """As rosbags keeps them."""
+        return self._load()
 
     def known(self, name: str) -> bool:
         """Whether the type is known."""
@@ -74,7 +79,7 @@ class RosTypes:
 @cache
 def standard() -> RosTypes:
     """All message types of the newest long-term ROS 2 release."""
-    return RosTypes(get_typestore(Stores.ROS2_JAZZY))
+    return RosTypes(lambda: get_typestore(Stores.ROS2_JAZZY))
 
 
 @lru_cache(maxsize=16)
@@ -96,4 +101,4 @@ def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
             store.register(new)
     except (TypesysError, SyntaxError, ValueError) as error:
         raise DefinitionsError([(definitions[0].name, f"the definitions cannot be used: {error}")]) from error
-    return RosTypes(store)
+    return RosTypes(lambda: store)

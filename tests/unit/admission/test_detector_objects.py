@@ -14,7 +14,8 @@ from application_manager.cli import app
 from application_manager.core.conditions import find
 from application_manager.core.health.pods import Trouble, TroubleReason
 from application_manager.core.objects.detectors import detector_objects, detector_roles, secrets_of
-from application_manager.core.objects.poddefaults import PodDefaults, PullPolicy
+from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.pullpolicy import PullPolicy
 from application_manager.core.objects.rights import detector_rights, merged, rights
 from application_manager.core.statuses.rulestatus import detector_status
 from application_manager.core.statuses.running import NOT_RUN, running
