@@ -250,6 +250,7 @@ def test_a_recorder_that_is_killed_goes_on_when_it_is_back(rsu: Peer, town: Peer
     """What it had is kept as cut; the requester says the start again within seconds."""
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
+    wait_for(lambda: rsu.under_way() > 0, PATIENCE)  # the file's header, which alone would not be kept
     before = rsu.under_way()
     town.send("car1", {"n": 1}, "pose")
     wait_for(lambda: rsu.under_way() > before, PATIENCE)  # what the kernel does not have yet, a kill costs
