@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.samples.sample import Arrival, DecodeError
-from detector.streams.codecs import CdrDecoder, JsonDecoder, UnknownTypeError, codec_for
+from detector.streams.codecs import CborDecoder, CdrDecoder, JsonDecoder, RawDecoder, UnknownTypeError, codec_for
 from detector.streams.codecs.doubles import EXACT
 from detector.streams.codecs.json_ import MAX_DEPTH
 from tests.driving import Drive, a_detector, a_rule, at
@@ -159,10 +159,11 @@ def test_nesting_is_bounded() -> None:
         JsonDecoder().decode(b"[" * (MAX_DEPTH + 1) + b"]" * (MAX_DEPTH + 1))
 
 
-def test_the_codec_follows_the_stream() -> None:
-    assert isinstance(codec_for(Stream(name="s", key="${client:*}", encoding=Encoding.JSON)), JsonDecoder)
-    odometry_stream = Stream(name="s", key="${client:*}", encoding=Encoding.CDR, type="nav_msgs/msg/Odometry")
-    assert isinstance(codec_for(odometry_stream), CdrDecoder)
+@pytest.mark.parametrize("encoding", [Encoding.JSON, Encoding.CDR, Encoding.CBOR, Encoding.RAW])
+def test_the_codec_follows_the_stream(encoding: Encoding) -> None:
+    kind = {"type": "nav_msgs/msg/Odometry"} if encoding is Encoding.CDR else {}
+    codecs = {"json": JsonDecoder, "cdr": CdrDecoder, "cbor": CborDecoder, "raw": RawDecoder}
+    assert type(codec_for(Stream(name="s", key="${client:*}", encoding=encoding, **kind))) is codecs[encoding]
 
 
 def test_an_unknown_type_names_the_stream_the_type_and_what_is_close() -> None:
