@@ -14,12 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.engine.samples.sample import DecodeError
-from detector.streams.codecs import CborDecoder, JsonDecoder, RawDecoder, codec_for
+from detector.streams.codecs import CborDecoder, RawDecoder
 from detector.streams.codecs.cbor import MAX_DEPTH
 from detector.streams.codecs.doubles import EXACT
 from tests.driving import Drive, a_detector, a_rule, arrival
 from tests.unit.encodings import hostile
-from wayside.api.stream import Encoding, Stream
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats(allow_nan=False) | st.text() | st.binary(),
@@ -113,11 +112,6 @@ def test_ten_thousand_hostile_payloads_give_a_value_or_a_decode_error() -> None:
 def test_raw_is_handed_through() -> None:
     assert RawDecoder().decode(b"\x00\xff") == b"\x00\xff"
     assert RawDecoder().stamp(b"\x00\xff") is None
-
-
-def test_the_codec_follows_the_stream() -> None:
-    for encoding, codec in ((Encoding.CBOR, CborDecoder), (Encoding.RAW, RawDecoder), (Encoding.JSON, JsonDecoder)):
-        assert type(codec_for(Stream(name="s", key="${client:*}", encoding=encoding))) is codec
 
 
 def test_rules_see_cbor_values_and_the_size_of_raw_samples() -> None:

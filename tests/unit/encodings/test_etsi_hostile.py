@@ -42,12 +42,6 @@ def test_only_decode_errors_come_of_ten_thousand_hostile_messages(name: str) -> 
     assert min(outcomes.values()) > COUNT // 20, outcomes
 
 
-@given(st.binary(max_size=200))
-def test_only_decode_errors_come_of_noise(raw: bytes) -> None:
-    with suppress(DecodeError):
-        assert_plain(EtsiDecoder().decode(raw))
-
-
 @given(st.binary(max_size=60), st.sampled_from([b"\x11\x00\x1a\x01", b"\x12\x00\x1a\x01\x03\x81\x00\x40", b"\x03\x81"]))
 def test_only_decode_errors_come_of_noise_behind_headers(raw: bytes, headers: bytes) -> None:
     with suppress(DecodeError):

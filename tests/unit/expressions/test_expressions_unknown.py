@@ -108,11 +108,6 @@ def test_any_formula_over_comparisons_is_kleene(formula: object, truths: dict[st
     assert (None if result is UNKNOWN else result) is meaning(formula, truths)
 
 
-def test_the_alternative_decides_without_the_unknown() -> None:
-    assert evaluate("p > 3 || d < 5", d=3.0) is True
-    assert evaluate("p > 3 || d < 5", d=6.0) is UNKNOWN
-
-
 def test_nan_deep_inside_a_message_is_unknown_not_false() -> None:
     message = {"pose": {"x": float("nan"), "y": 1.0}}
     assert evaluate("msg.pose.x > 3", msg=message) is UNKNOWN

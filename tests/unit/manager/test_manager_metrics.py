@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -23,10 +22,11 @@ from application_manager.observability.pages import STALLED_AFTER, pages, stalle
 from application_manager.observability.tracing import LostSpans
 from application_manager.work.recorder import Reason
 from application_manager.work.workqueue import WorkQueue
+from tests.guides import guide
 from tests.unit.manager_objects import instance, task, template
 from wayside.tracing import Tracing
 
-GUIDE = Path("docs/manager.md").read_text()
+GUIDE = guide("manager")
 
 
 def raw(model: Any, version: int = 1, **status: Any) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 from application_manager.commands.telling import text
 from application_manager.core.statuses.explaining import Found, explain, serving
 from application_manager.core.statuses.explanation import Explanation
+from tests.guides import guide
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.times import format_seconds
@@ -196,8 +196,7 @@ def test_what_is_over_does_not_push_what_counts_out_of_sight() -> None:
 def test_the_guide_shows_what_is_printed() -> None:
     lease = {"spec": {"renewTime": format_seconds(NOW - 2.5)}}
     found = explained(objects={("apps/v1", "Deployment", NAME): DEPLOYMENT}, pods=[POD], leases={"town": lease})
-    guide = Path("docs/manager.md").read_text()
-    shown = re.search(r"```console\n\$ application-manager explain scene-a\n(.*?)```", guide, re.DOTALL)
+    shown = re.search(r"```console\n\$ application-manager explain scene-a\n(.*?)```", guide("manager"), re.DOTALL)
     assert shown is not None
     assert shown[1] == text(found)
 

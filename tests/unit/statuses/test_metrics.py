@@ -17,6 +17,7 @@ from detector.status.model import Status
 from detector.status.server import StatusServer
 from detector.streams.tally import Cause
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
+from tests.guides import guide
 from tests.unit.statuses.test_status import FAST, Kept
 
 
@@ -86,7 +87,7 @@ def test_a_port_that_is_taken_is_told_with_the_option(server: StatusServer) -> N
 
 
 def test_the_documentation_names_every_metric_and_every_cause() -> None:
-    text = Path("docs/operations.md").read_text()
+    text = guide("operations")
     causes = re.findall(r'cause="([a-z_]+)"', Path("detector/losses.py").read_text())
     names = [f"{name}_total" if kind is CounterMetricFamily else name for name, kind, *_ in (*DETECTOR, *STREAM, *RULE)]
     before = [cause.name.lower() for cause in Cause]
