@@ -45,16 +45,17 @@ def stream(name: str = "pose", key: str = "vehicles/${client:*}/pose", **fields:
     return Stream(name=name, key=key, encoding=Encoding.JSON, **fields)
 
 
-@contextmanager
-def router(**settings: Any) -> Iterator[zenoh.Session]:
-    """A Zenoh router with these settings, paths with __ for /."""
+def session(mode: str = "client", **settings: Any) -> zenoh.Session:
+    """A Zenoh session that finds others by its endpoints alone; paths of settings with __ for /."""
     config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    for path, value in settings.items():
+    for path, value in {"mode": mode, "scouting__multicast__enabled": False, **settings}.items():
         config.insert_json5(path.replace("__", "/"), json.dumps(value))
-    with zenoh.open(config) as session:
-        yield session
+    return zenoh.open(config)
+
+
+def router(**settings: Any) -> zenoh.Session:
+    """A Zenoh router with these settings."""
+    return session("router", **settings)
 
 
 @contextmanager

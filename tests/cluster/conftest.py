@@ -13,11 +13,13 @@ from pathlib import Path
 import pytest
 
 from tests.cluster.api import Api
+from tests.cluster.chain import Chain, Vehicles, detector, rule, template
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
+from tests.cluster.managed_world import start_manager
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.pods import kubelet as playing_kubelet
-from tests.cluster.processes import Processes
+from tests.cluster.processes import Process, Processes
 from tests.sharing import run_folder, shared
 
 HERE = Path(__file__).parent
@@ -95,6 +97,26 @@ def processes(control_plane: ControlPlane, namespace: str, tmp_path: Path) -> It
     started = Processes(folder, {"KUBECONFIG": str(control_plane.kubeconfig)})
     yield started
     started.kill_all()
+
+
+@pytest.fixture
+def manager(processes: Processes, namespace: str) -> Process:
+    """A manager of the test's namespace."""
+    return start_manager(processes, namespace)
+
+
+@pytest.fixture
+def chain(api: Api, namespace: str, processes: Processes, tmp_path: Path) -> Chain:
+    """A Detector with its rule and template, applied; neither program is started yet."""
+    made = Chain(api, namespace, processes, tmp_path / "out")
+    made.apply(template(), rule(), detector(made.endpoint))
+    return made
+
+
+@pytest.fixture
+def vehicles(chain: Chain) -> Iterator[Vehicles]:
+    with Vehicles(chain.endpoint) as driving:
+        yield driving
 
 
 @pytest.fixture

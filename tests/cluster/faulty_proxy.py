@@ -62,6 +62,10 @@ class Proxy:
         others = ("/leases", "/selfsubjectaccessreviews")
         return [each for each in self.seen if each.method != "GET" and not any(other in each.path for other in others)]
 
+    def lease_writes(self) -> list[Seen]:
+        """The requests that changed a Lease, and whose answers came."""
+        return [each for each in self.seen if each.method != "GET" and "/leases" in each.path and each.status]
+
 
 @contextmanager
 def faulty_proxy(kubeconfig: Path) -> Iterator[tuple[Proxy, Path]]:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
-from tests.cluster.api import Api
 from tests.cluster.chain import (
     BETWEEN,
     BUSES,
@@ -25,24 +21,9 @@ from tests.cluster.chain import (
     template,
     untouched,
 )
-from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 
 RUNS = f"Detector {HOLDER} runs with"
-
-
-@pytest.fixture
-def chain(api: Api, namespace: str, processes: Processes, tmp_path: Path) -> Chain:
-    """Applied, not yet started."""
-    made = Chain(api, namespace, processes, tmp_path / "out")
-    made.apply(template(), rule(), detector(made.endpoint))
-    return made
-
-
-@pytest.fixture
-def vehicles(chain: Chain) -> Iterator[Vehicles]:
-    with Vehicles(chain.endpoint) as driving:
-        yield driving
 
 
 def test_a_rule_that_means_something_else_ends_its_episodes_and_begins_anew(chain: Chain, vehicles: Vehicles) -> None:

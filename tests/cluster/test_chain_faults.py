@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import read_intake
 from tests import programs
-from tests.cluster.api import Api
 from tests.cluster.chain import (
     BETWEEN,
     BUSES,
@@ -24,32 +22,15 @@ from tests.cluster.chain import (
     VANS,
     Chain,
     Vehicles,
-    detector,
-    rule,
     template,
     untouched,
 )
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from wayside.times import parse_time
 
 SECOND = 10**9  # ns
 RUNS = f"Detector {HOLDER} runs with"
-
-
-@pytest.fixture
-def chain(api: Api, namespace: str, processes: Processes, tmp_path: Path) -> Chain:
-    """Applied, not yet started."""
-    made = Chain(api, namespace, processes, tmp_path / "out")
-    made.apply(template(), rule(), detector(made.endpoint))
-    return made
-
-
-@pytest.fixture
-def vehicles(chain: Chain) -> Iterator[Vehicles]:
-    with Vehicles(chain.endpoint) as driving:
-        yield driving
 
 
 def test_a_detector_killed_during_an_episode_takes_it_up_again(chain: Chain, vehicles: Vehicles) -> None:

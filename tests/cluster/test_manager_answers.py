@@ -6,8 +6,6 @@ import json
 import subprocess
 from typing import Any
 
-import pytest
-
 from application_manager.core.claims.claims import instance_name
 from tests import programs
 from tests.cluster.api import Api, Object
@@ -21,11 +19,6 @@ NORTH = instance_name("app", "north")
 RATED = {
     "parameters": {"region": {"type": "string"}, "rate": {"type": "number", "merge": "Max", "default": 1}},
 }
-
-
-@pytest.fixture
-def manager(processes: Processes, namespace: str) -> Process:
-    return start_manager(processes, namespace)
 
 
 def emitted(name: str, **parameters: Any) -> Object:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, end, start_manager, task, template, wait_settled
-from tests.cluster.processes import Process, Processes
+from tests.cluster.managed_world import condition, end, task, template, wait_settled
+from tests.cluster.processes import Process
 
 NORTH = instance_name("app", "north")
 SCALED = {
@@ -21,11 +19,6 @@ SCALED = {
         }
     ],
 }
-
-
-@pytest.fixture
-def manager(processes: Processes, namespace: str) -> Process:
-    return start_manager(processes, namespace)
 
 
 def annotate(api: Api, annotation: str, value: str | None) -> None:

@@ -16,12 +16,11 @@ from tests.cluster.managed_world import (
     config,
     deployment,
     end,
-    start_manager,
     task,
     template,
     wait_settled,
 )
-from tests.cluster.processes import Process, Processes
+from tests.cluster.processes import Process
 from tests.cluster.waiting import wait_until
 from wayside.times import parse_seconds
 
@@ -29,11 +28,6 @@ NORTH = instance_name("app", "north")
 SOUTH = instance_name("app", "south")
 LONG = 600  # s: of a Lease that lasts for as long as a test looks
 EVERY_KIND = ("ApplicationTemplate", "ApplicationTask", "ApplicationInstance", "Deployment", "ConfigMap")
-
-
-@pytest.fixture
-def manager(processes: Processes, namespace: str) -> Process:
-    return start_manager(processes, namespace)
 
 
 def versions(api: Api) -> dict[tuple[str, str], str]:

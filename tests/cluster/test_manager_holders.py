@@ -12,17 +12,12 @@ import pytest
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.holders.leases import LeaseView
 from tests.cluster.api import Api
-from tests.cluster.managed_world import condition, start_manager, task, template, wait_settled
-from tests.cluster.processes import Process, Processes
+from tests.cluster.managed_world import condition, task, template, wait_settled
+from tests.cluster.processes import Process
 from tests.cluster.waiting import wait_until
 
 NORTH = instance_name("app", "north")
 LOST = {"det": LeaseView(1000.0)}
-
-
-@pytest.fixture
-def manager(processes: Processes, namespace: str) -> Process:
-    return start_manager(processes, namespace)
 
 
 LONG = 600  # s: for as long as the test looks

@@ -13,23 +13,17 @@ from tests.cluster.managed_world import (
     config,
     deployment,
     end,
-    start_manager,
     task,
     template,
     wait_settled,
 )
-from tests.cluster.processes import Process, Processes
+from tests.cluster.processes import Process
 
 NORTH, SOUTH = instance_name("app", "north"), instance_name("app", "south")
 PARAMETERS = {
     "region": {"type": "string", "required": True},
     "rate": {"type": "number", "default": 10, "merge": "Max"},
 }
-
-
-@pytest.fixture
-def manager(processes: Processes, namespace: str) -> Process:
-    return start_manager(processes, namespace)
 
 
 def rated(**spec: Any) -> Object:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
 from tests.cluster.managed_world import (
@@ -22,11 +20,6 @@ from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until
 
 NORTH = instance_name("app", "north")
-
-
-@pytest.fixture
-def manager(processes: Processes, namespace: str) -> Process:
-    return start_manager(processes, namespace)
 
 
 def test_a_task_becomes_a_deployment_that_is_ready_when_its_pods_are(api: Api, manager: Process) -> None:

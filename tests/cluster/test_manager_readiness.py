@@ -7,22 +7,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, deployment, start_manager, task, template, wait_settled
+from tests.cluster.managed_world import condition, deployment, task, template, wait_settled
 from tests.cluster.pods import running
-from tests.cluster.processes import Process, Processes
+from tests.cluster.processes import Process
 from tests.cluster.waiting import wait_until
 
 NORTH = instance_name("app", "north")
 PODS = f"wayside.dev/instance={NORTH}"
-
-
-@pytest.fixture
-def manager(processes: Processes, namespace: str) -> Process:
-    return start_manager(processes, namespace)
 
 
 def its_pod(api: Api) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from application_manager.core.claims.claims import instance_name
+from application_manager.core.holders.leading import DURATION
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import Proxy, faulty_proxy
@@ -23,6 +24,8 @@ from tests.cluster.waiting import wait_until
 from tests.ports import free_ports
 
 ACTIVE = r"active: holds the Lease"
+GIVEN_UP = "requests are under way without an answer: the Lease is not released"
+LEASE = "application-manager"
 REGIONS = [f"r{index}" for index in range(30)]
 WAITING = {"232", "281", "22"}
 """The numbers of epoll_wait and epoll_pwait (x86-64), and epoll_pwait (arm64)."""
@@ -69,12 +72,24 @@ def demanded(api: Api) -> None:
     api.wait_list("Deployment", lambda found: len(found) >= 5, what="the manager is in the middle of it")
 
 
+def interrupted(api: Api, pair: Pair, how: Callable[[Pair], None]) -> None:
+    """Interrupt the active manager amid its work; the standby finishes it and makes nothing twice."""
+    demanded(api)
+    how(pair)
+    before = uids(api)
+    api.create(task("late"))
+    end(api, REGIONS[0])
+    pair.taken_over()
+    wait_settled(api)
+    api.wait_list("Deployment", lambda found: len(found) == len(REGIONS), what="what is demanded runs, and no more")
+    after = uids(api)
+    assert {name: uid for name, uid in before.items() if after.get(name, uid) != uid} == {}, "nothing was made twice"
+    pair.never_both()
+    assert api.get("Lease", LEASE)["spec"]["leaseTransitions"] == 1
+
+
 def uids(api: Api) -> dict[str, str]:
     return {each["metadata"]["name"]: each["metadata"]["uid"] for each in api.list("Deployment")}
-
-
-def killed(pair: Pair) -> None:
-    pair.active.kill9()
 
 
 def stopped(pair: Pair) -> None:
@@ -101,33 +116,14 @@ def cut_off(pair: Pair) -> None:
     pair.old.cut = True
 
 
-def terminated(pair: Pair) -> None:
-    assert pair.active.terminate() == 0
-
-
-@pytest.mark.parametrize("how", [killed, stopped, cut_off, terminated])
-def test_the_standby_takes_over_what_the_other_was_doing(how: Callable[[Pair], None], api: Api, pair: Pair) -> None:
-    demanded(api)
-    how(pair)
-    before = uids(api)
-    api.create(task("late"))
-    end(api, REGIONS[0])
-    pair.taken_over()
-    wait_settled(api)
-    api.wait_list("Deployment", lambda found: len(found) == len(REGIONS), what="what is demanded runs, and no more")
-    after = uids(api)
-    assert {name: uid for name, uid in before.items() if after.get(name, uid) != uid} == {}, "nothing was made twice"
-    pair.never_both()
-    how_often = api.get("Lease", "application-manager")["spec"]["leaseTransitions"]
-    assert how_often == 1
+def test_the_standby_takes_over_what_a_killed_one_was_doing(api: Api, pair: Pair) -> None:
+    interrupted(api, pair, lambda pair: pair.active.kill9())
 
 
 def test_one_that_stood_still_writes_nothing_when_it_goes_on(api: Api, pair: Pair) -> None:
-    demanded(api)
-    stopped(pair)
-    pair.taken_over()
-    for region in REGIONS:
-        end(api, region)
+    interrupted(api, pair, stopped)
+    for name in (*REGIONS[1:], "late"):
+        end(api, name)
     os.kill(pair.active.pid, signal.SIGCONT)
     pair.active.wait_for_output("not active any more|standby: manager_")
     api.wait_list("Deployment", lambda found: not found, what="nothing runs that nobody demands")
@@ -137,25 +133,23 @@ def test_one_that_stood_still_writes_nothing_when_it_goes_on(api: Api, pair: Pai
     )
     pair.never_both()
     # And it can take over in turn, with what it has seen meanwhile.
-    api.create(task("late"))
+    api.create(task("next"))
     api.wait_list("Deployment", lambda found: len(found) == 1, what="the other serves it")
     pair.standby.kill9()
-    end(api, "late")
-    api.create(task("later"))
+    end(api, "next")
+    api.create(task("last"))
     pair.active.wait_for_output(rf"(?s)(not active any more|standby: ).*{ACTIVE}")
-    only = [instance_name("app", "later")]
-    api.wait_list("Deployment", lambda found: [each["metadata"]["name"] for each in found] == only, what="only later")
+    only = [instance_name("app", "last")]
+    api.wait_list("Deployment", lambda found: [each["metadata"]["name"] for each in found] == only, what="only it")
     wait_settled(api)
 
 
 def test_one_that_was_cut_off_comes_back_as_a_standby(api: Api, pair: Pair) -> None:
-    demanded(api)
-    pair.old.cut = True
-    pair.taken_over()
+    interrupted(api, pair, cut_off)
     pair.active.wait_for_output("not active any more")
     pair.old.cut = False
     pair.active.wait_for_output("standby: manager_")
-    api.create(task("late"))
+    api.create(task("later"))
     wait_settled(api)
     pair.never_both()
 
@@ -170,7 +164,7 @@ def test_one_that_is_cut_off_ends_when_it_is_told_to(api: Api, pair: Pair) -> No
 
 
 def test_who_is_active_shows(api: Api, pair: Pair) -> None:
-    holder = api.get("Lease", "application-manager")["spec"]["holderIdentity"]
+    holder = api.get("Lease", LEASE)["spec"]["holderIdentity"]
     assert [scraped(port)["active",] for port in pair.ports] == [1, 0]
     wait_until(lambda: get(pair.ports[0], "/readyz"), lambda found: found == (200, "ok\n"), what="one is active")
     said = (200, f"ok, standby: {holder} is active\n")
@@ -181,21 +175,21 @@ def test_a_manager_that_ends_releases_the_lease(api: Api, processes: Processes, 
     manager = start_manager(processes, namespace)
     manager.wait_for_output(ACTIVE)
     assert manager.terminate() == 0
-    assert "holderIdentity" not in api.get("Lease", "application-manager")["spec"]
+    assert "holderIdentity" not in api.get("Lease", LEASE)["spec"]
 
 
 def test_a_standby_that_ends_leaves_the_lease_alone(api: Api, pair: Pair) -> None:
-    before = api.get("Lease", "application-manager")["spec"]["holderIdentity"]
+    before = api.get("Lease", LEASE)["spec"]["holderIdentity"]
     assert pair.standby.terminate() == 0
-    assert api.get("Lease", "application-manager")["spec"]["holderIdentity"] == before
+    assert api.get("Lease", LEASE)["spec"]["holderIdentity"] == before
 
 
 def test_a_lease_deleted_by_hand_comes_back(api: Api, processes: Processes, namespace: str) -> None:
     manager = start_manager(processes, namespace)
     manager.wait_for_output(ACTIVE)
-    uid = api.get("Lease", "application-manager")["metadata"]["uid"]
-    api.delete("Lease", "application-manager")
-    api.wait_for("Lease", "application-manager", lambda raw: raw["metadata"]["uid"] != uid, what="it is there again")
+    uid = api.get("Lease", LEASE)["metadata"]["uid"]
+    api.delete("Lease", LEASE)
+    api.wait_for("Lease", LEASE, lambda raw: raw["metadata"]["uid"] != uid, what="it is there again")
     api.create(template())
     api.create(task("north"))
     wait_settled(api)
@@ -203,11 +197,18 @@ def test_a_lease_deleted_by_hand_comes_back(api: Api, processes: Processes, name
 
 def test_what_is_under_way_at_the_end_is_finished_or_made_good(api: Api, pair: Pair) -> None:
     pair.old.slow = 0.3
-    demanded(api)
-    began = time.monotonic()
-    assert pair.active.terminate(patience=60) == 0
-    late = [each for each in pair.old.writes() if each.at > began and not each.status]
-    assert late == [], "every write that was sent after the signal was answered"
-    pair.taken_over()
-    wait_settled(api)
-    pair.never_both()
+    began = 0.0
+
+    def terminated(pair: Pair) -> None:
+        nonlocal began
+        began = time.monotonic()
+        assert pair.active.terminate(patience=60) == 0
+
+    interrupted(api, pair, terminated)
+    taken, last = pair.new.lease_writes()[0].at, pair.old.lease_writes()[-1].at
+    if GIVEN_UP in pair.active.output():
+        assert taken - last >= DURATION, "the Lease was not released: the standby waited for its end"
+    else:
+        late = [each for each in pair.old.writes() if each.at > began and not each.status]
+        assert late == [], "every write that was sent after the signal was answered"
+        assert "released the Lease" in pair.active.output()

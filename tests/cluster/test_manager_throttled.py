@@ -17,26 +17,26 @@ from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 
 WATCHERS = 8  # requests of watches that (re)list, and those about the Lease: apart from the bound
+BURST = 200  # tasks: many times what may run at once
 HOLD = 9  # s for which the API server wants to be left alone
 UNDER_WAY = 5.0  # s: what was sent before the answer had arrived at a manager on a machine that is busy otherwise
 
 
-def test_a_burst_of_a_thousand_tasks_is_worked_off_with_few_requests_at_once(
+def test_a_burst_of_tasks_is_worked_off_with_few_requests_at_once(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
 ) -> None:
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
-        start_manager(processes, namespace, kubeconfig=kubeconfig)
+        start_manager(processes, namespace, kubeconfig=kubeconfig).wait_for_output("active: holds the Lease")
         api.create(template())
-        proxy.most, proxy.slow = 0, 0.02  # slow enough that all that may run at once does
+        proxy.most, proxy.slow = 0, 0.2  # so slow that all that may run at once does
         with ThreadPoolExecutor(8) as pool:
-            list(pool.map(api.create, (task(f"t{index}", region=f"r{index % 20}") for index in range(1000))))
+            list(pool.map(api.create, (task(f"t{index}", region=f"r{index % 20}") for index in range(BURST))))
         wait_until(
             lambda: [each.get("status", {}).get("phase") for each in api.list("ApplicationTask")].count("Active"),
-            lambda active: active == 1000,
-            timeout=300,
+            BURST.__eq__,
             what="all tasks are answered, and served",
         )
-        assert proxy.most <= AT_ONCE + WATCHERS
+        assert AT_ONCE // 2 < proxy.most <= AT_ONCE + WATCHERS
         proxy.slow = 0
         wait_settled(api)
 

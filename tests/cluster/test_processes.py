@@ -12,13 +12,6 @@ import pytest
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until
 
-WAIT_FOR_SIGTERM = """
-import signal, sys
-signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # from here on it waits, whenever it comes
-print("started with", sys.argv[1:], flush=True)
-signal.sigwait({signal.SIGTERM})
-print("ended in peace", flush=True)
-"""
 IGNORE_SIGTERM = """
 import signal
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -37,7 +30,7 @@ child.wait()
 @pytest.fixture
 def processes(tmp_path: Path) -> Iterator[Processes]:
     """Not that of the control plane, which these tests do not need."""
-    started = Processes(tmp_path, {"FOR_ALL": "everybody"})
+    started = Processes(tmp_path, {})
     yield started
     started.kill_all()
 
@@ -50,15 +43,8 @@ def exists(pid: int) -> bool:
         return False
 
 
-def start(processes: Processes, program: str, *arguments: str, name: str = "program") -> Process:
-    return processes.start(sys.executable, "-c", program, *arguments, name=name)
-
-
-def test_sigterm_lets_a_program_end_in_peace(processes: Processes) -> None:
-    program = start(processes, WAIT_FOR_SIGTERM, "x")
-    program.wait_for_output(r"started with \['x'\]")
-    assert program.terminate() == 0
-    assert "ended in peace" in program.output()
+def start(processes: Processes, program: str) -> Process:
+    return processes.start(sys.executable, "-c", program, name="program")
 
 
 def test_a_program_that_does_not_heed_sigterm_is_a_failure_and_killed(processes: Processes) -> None:
@@ -69,22 +55,8 @@ def test_a_program_that_does_not_heed_sigterm_is_a_failure_and_killed(processes:
     assert not program.alive
 
 
-def test_a_killed_program_starts_again_with_the_same_command_line_and_log(processes: Processes) -> None:
-    program = start(processes, WAIT_FOR_SIGTERM, "x")
-    program.wait_for_output(r"started with \['x'\]")  # all of it: unbuffered, `print` writes each part by itself
-    first = program.pid
-    program.kill9()
-    assert program.returncode == -9
-
-    program.start()
-    program.wait_for_output(r"started with \['x'\]")
-    assert program.pid != first
-    assert program.log.read_text().count("started with ['x']") == 2
-    assert program.output().count("started with ['x']") == 1
-
-
 def test_starting_what_still_runs_is_refused(processes: Processes) -> None:
-    program = start(processes, WAIT_FOR_SIGTERM)
+    program = start(processes, IGNORE_SIGTERM)
     with pytest.raises(AssertionError, match="still runs"):
         program.start()
 
@@ -93,23 +65,6 @@ def test_a_program_that_ends_while_its_output_is_awaited_is_told_at_once_with_it
     program = start(processes, "raise SystemExit('no such template')")
     with pytest.raises(ChildProcessError, match=r"(?s)ended without writing 'ready'.*no such template"):
         program.wait_for_output("ready", timeout=60)
-
-
-def test_programs_get_the_environment_of_all_and_their_own(processes: Processes) -> None:
-    show = "import os; print(os.environ['FOR_ALL'], os.environ['OWN'], 'PATH' in os.environ)"
-    program = processes.start(sys.executable, "-c", show, environment={"OWN": "mine"})
-    program.wait_for_output("everybody mine True")
-
-
-def test_programs_of_one_name_are_numbered(processes: Processes) -> None:
-    names = [processes.start("true").name for _ in range(3)]
-    assert names == ["true", "true-2", "true-3"]
-
-
-def test_programs_beside_the_interpreter_need_no_path(processes: Processes) -> None:
-    program = processes.start("pytest", "--version", environment={"PATH": "/nowhere"})
-    program.wait_for_output("pytest")
-    assert program.wait() == 0
 
 
 def test_what_a_program_started_is_killed_with_it(processes: Processes) -> None:

@@ -232,21 +232,18 @@ def test_a_detector_that_was_applied_a_moment_before_its_pod_is_found(api: Api, 
 
 
 def test_a_manager_that_hangs_or_is_gone_keeps_no_pod_from_being_made(
-    api: Api, processes: Processes, namespace: str, tmp_path: Path, accounts: None
+    api: Api, processes: Processes, tmp_path: Path, accounts: None
 ) -> None:
     api.create(sidecar_detector("vehicle"))
-    webhook = Webhook(processes, api, tmp_path / "certificates", options=RUNS)
+    webhook = Webhook(processes, api, tmp_path / "certificates", patience=2, options=RUNS)
     with webhook.asked():
         wait_injecting(api)
-        webhook.injection["webhooks"][0]["timeoutSeconds"] = 1
-        api.apply(webhook.injection)
         os.kill(webhook.manager.pid, signal.SIGSTOP)
-        # Two of the API server's own timeouts: after the change of the webhook it may ask once more by the old one.
         assert not sidecars(api.create(pod("while-it-hangs")))
         os.kill(webhook.manager.pid, signal.SIGCONT)
         webhook.manager.kill9()
         assert not sidecars(api.create(pod("while-it-is-gone")))
-        start_manager(processes, namespace, *webhook.options)
+        webhook.manager.start()
         for name in ("while-it-hangs", "while-it-is-gone"):
             event_of(api, name, "it was made before its Detector, or while no manager answered the API server")
 

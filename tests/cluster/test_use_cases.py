@@ -7,7 +7,6 @@ the whole time, as with CAM, the clock goes on, but nobody sends anything: nothi
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +25,7 @@ from tests.cluster.managed_world import condition, start_manager, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.repeating import repeated
 from tests.cluster.waiting import INTERVAL, PATIENCE, wait_until
+from tests.networks import session
 from tests.ports import free_endpoint
 
 PACE = 2.5  # times as fast as it happens
@@ -165,19 +165,16 @@ class Player:
     @contextmanager
     def playing(self) -> Iterator[Player]:
         """Within this, somebody listens to all keys."""
-        config = zenoh.Config()
-        for key, value in {
-            "mode": "peer",
-            "connect/endpoints": [self._endpoint],
-            "connect/timeout_ms": round(PATIENCE * 1000),
-            "connect/exit_on_failure": True,
-            "listen/endpoints": [],
-            "scouting/multicast/enabled": False,
-        }.items():
-            config.insert_json5(key, json.dumps(value))
-        with zenoh.open(config) as session:
+        there = session(
+            "peer",
+            connect__endpoints=[self._endpoint],
+            connect__timeout_ms=round(PATIENCE * 1000),
+            connect__exit_on_failure=True,
+            listen__endpoints=[],
+        )
+        with there:
             for key in dict.fromkeys(each.key for each in self._messages):
-                self._publishers[key] = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+                self._publishers[key] = there.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
             wait_until(
                 lambda: [key for key, each in self._publishers.items() if not each.matching_status.matching],
                 lambda alone: not alone,

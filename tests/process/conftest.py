@@ -1,4 +1,4 @@
-"""A MongoDB server that the tests share, a database on it for each, and a way to it that can be cut."""
+"""A shared MongoDB server with a database and a way to it for each test, a free endpoint, and what streams took in."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import pytest
 
 from tests.mongodb import MongoServer, running
 from tests.mongodb.way import Way
+from tests.networks import Arrivals
+from tests.ports import free_endpoint
 from tests.sharing import run_folder, shared
 
 
@@ -38,3 +40,13 @@ def way(mongodb: MongoServer) -> Iterator[Way]:
     made = Way(mongodb)
     yield made
     made.cut()
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def arrivals() -> Arrivals:
+    return Arrivals()

@@ -17,6 +17,7 @@ from detector.status.model import Status, read_status
 from detector.streams.asking import NoAnswerError, ask
 from tests import programs
 from tests.driving import a_detector
+from tests.networks import session
 from tests.ports import free_port
 from wayside.api import Kind
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -46,14 +47,7 @@ class Process:
         files = [*options, "--detector", "detector.yaml", "--rules", "rules.yaml", "--metrics-port", str(self.port)]
         self.process = programs.Program(["detector", "run", *files], self.folder / "log", folder=self.folder)
         self.status_when(lambda status: bool(status.rules))
-        config = zenoh.Config()
-        for key, value in (
-            ("mode", '"client"'),
-            ("connect/endpoints", json.dumps([self.endpoint])),
-            ("scouting/multicast/enabled", "false"),
-        ):
-            config.insert_json5(key, value)
-        self.vehicle = zenoh.open(config)
+        self.vehicle = session(connect__endpoints=[self.endpoint])
 
     def send(self, client: str, value: Any, stream: str = "speed") -> None:
         self.vehicle.put(

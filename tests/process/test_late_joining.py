@@ -11,8 +11,7 @@ from detector.assembly import DetectorError, inlets
 from detector.streams.tally import Cause, Tally
 from detector.streams.zenoh import Network
 from tests.driving import a_detector, a_stream
-from tests.networks import PATIENCE, Arrivals, router, stream, wait_for
-from tests.ports import free_endpoint
+from tests.networks import PATIENCE, Arrivals, router, session, stream, wait_for
 from wayside.api.base import PositiveDuration
 from wayside.api.stream import History, Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -21,16 +20,6 @@ KEY = "vehicles/car1/pose"
 
 LOSSY = [{"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "vehicles/**", "freq": 4.0}]}]
 """The router lets only so many samples a second pass."""
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
 
 
 def network(endpoint: str, arrivals: Arrivals, tally: Tally, streams: list[Stream]) -> Network:
@@ -57,8 +46,8 @@ def test_a_late_joiner_gets_the_history_that_it_asks_for(endpoint: str, arrivals
         stream("young", history=History(age=PositiveDuration("1h"))),
         stream("all", history=History()),
     ]
-    with router(listen__endpoints=[endpoint]) as session:
-        publisher = remembering(session)
+    with router(listen__endpoints=[endpoint]) as there:
+        publisher = remembering(there)
         for number in range(10):
             publisher.put(str(number))
         running = network(endpoint, arrivals, Tally(), streams)
@@ -77,11 +66,7 @@ def test_samples_lost_on_the_way_are_counted_or_asked_for_again(endpoint: str, a
     streams = [stream("counted", history=History(samples=1)), stream("recovered", recover=True)]
     with router(listen__endpoints=[endpoint], downsampling=LOSSY):
         running = network(endpoint, arrivals, tally, streams)
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("scouting/multicast/enabled", "false")
-        config.insert_json5("connect/endpoints", f'["{endpoint}"]')
-        with zenoh.open(config) as vehicle:
+        with session(connect__endpoints=[endpoint]) as vehicle:
             publisher = remembering(vehicle)
             deadline, number = time.monotonic() + PATIENCE, 0
             while not tally.entries():

@@ -20,8 +20,7 @@ from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.streams.zenoh import Network
 from tests.driving import SECOND, START, Drive, a_detector, a_rule, a_stream, arrival, at, lines
-from tests.networks import Arrivals, router, stream, wait_for
-from tests.ports import free_endpoint
+from tests.networks import Arrivals, router, session, stream, wait_for
 from wayside.api import Detector
 from wayside.api.detector import Clock
 from wayside.api.zenoh import Zenoh, ZenohMode
@@ -128,22 +127,8 @@ def test_a_pattern_that_is_none_is_told_with_its_field() -> None:
         Zenoh(liveliness="alive/*")
 
 
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
-
-
 def vehicle(endpoint: str) -> zenoh.Session:
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
-    return zenoh.open(config)
+    return session(connect__endpoints=[endpoint])
 
 
 @pytest.fixture

@@ -24,11 +24,6 @@ def port() -> int:
     return free_port()
 
 
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
-
-
 @contextmanager
 def mqtt(
     arrivals: Arrivals, tally: Tally, *, key: str = "vehicles/${client:*}/pose", **parameters: Any

@@ -30,16 +30,6 @@ from wayside.api.zenoh import Zenoh, ZenohMode
 
 
 @pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
-
-
-@pytest.fixture
 def authority(tmp_path: Path) -> Authority:
     return Authority(tmp_path)
 

@@ -27,8 +27,8 @@ from tests.http_servers import (
     nobody,
     sends,
 )
+from tests.networks import session
 from tests.notifying import a_desk, an_episode
-from tests.ports import free_endpoint
 
 LOST = "events that nobody was told of"
 
@@ -373,9 +373,6 @@ class Session:
 
 
 def test_a_zenoh_key_gets_the_event() -> None:
-    config = zenoh.Config()
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("listen/endpoints", json.dumps([free_endpoint()]))
     arrived: list[tuple[str, str, dict[str, Any]]] = []
     changed = threading.Event()
 
@@ -384,9 +381,9 @@ def test_a_zenoh_key_gets_the_event() -> None:
         if len(arrived) == 2:
             changed.set()
 
-    with zenoh.open(config) as session:
-        subscriber = session.declare_subscriber("city/alerts", take)
-        desk = a_desk({"zenoh": {"key": "city/alerts"}, "title": "t"}, messenger=Session(session))
+    with session("peer") as alone:
+        subscriber = alone.declare_subscriber("city/alerts", take)
+        desk = a_desk({"zenoh": {"key": "city/alerts"}, "title": "t"}, messenger=Session(alone))
         desk.run(an_episode(rendered={"title": "braking"}))
         assert changed.wait(60), arrived
         desk.outcome("e1")

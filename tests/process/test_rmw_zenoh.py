@@ -26,7 +26,7 @@ from detector.streams.sequences import MAXIMUM_PUBLISHERS, Sequences
 from detector.streams.tally import Cause, Tally
 from detector.streams.zenoh import Network
 from tests.driving import Drive, a_detector, a_rule, at, compiled, lines
-from tests.networks import wait_for
+from tests.networks import session, wait_for
 from tests.ports import free_endpoint
 from tests.ros_messages import cdr, odometry, pose_stamped
 from wayside.api.documents import DocumentError, load_documents
@@ -117,14 +117,10 @@ def receiver(request: pytest.FixtureRequest) -> Iterator[Receiver]:
 
 @pytest.fixture
 def vehicle(receiver: Receiver) -> Iterator[zenoh.Session]:
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("connect/endpoints", f'["{receiver.endpoint}"]')
-    with zenoh.open(config) as session:
-        publisher = session.declare_publisher("7/vehicles/car1/pose/type/hash")
+    with session(connect__endpoints=[receiver.endpoint]) as driving:
+        publisher = driving.declare_publisher("7/vehicles/car1/pose/type/hash")
         wait_for(lambda: publisher.matching_status.matching)
-        yield session
+        yield driving
 
 
 def drained(receiver: Receiver, count: int) -> list[Any]:

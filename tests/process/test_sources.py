@@ -95,11 +95,6 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     entrypoints._load.cache_clear()
 
 
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
-
-
 def a_thread(plugin: str, arrivals: Arrivals, tally: Tally) -> SourceThread:
     source = DataSource(name="s", plugin=plugin)
     thread = SourceThread(source, (stream(source="s"),), arrivals.putter, tally, first_pause=0.01)

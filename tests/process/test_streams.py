@@ -9,30 +9,8 @@ import pytest
 import zenoh
 
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
-from tests.networks import PATIENCE, Arrivals, stream, wait_for
-from tests.ports import free_endpoint
+from tests.networks import PATIENCE, Arrivals, router, session, stream, wait_for
 from wayside.api.zenoh import Zenoh, ZenohMode
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
-
-
-def session(mode: str, *, listen: str | None = None, connect: str | None = None) -> zenoh.Session:
-    config = zenoh.Config()
-    config.insert_json5("mode", f'"{mode}"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    if listen is not None:
-        config.insert_json5("listen/endpoints", f'["{listen}"]')
-    if connect is not None:
-        config.insert_json5("connect/endpoints", f'["{connect}"]')
-    return zenoh.open(config)
 
 
 @pytest.fixture
@@ -46,7 +24,7 @@ def listening(endpoint: str, arrivals: Arrivals) -> Iterator[Network]:
 def test_samples_arrive_in_order_on_every_stream_that_their_key_belongs_to(
     listening: Network, endpoint: str, arrivals: Arrivals
 ) -> None:
-    with session("client", connect=endpoint) as vehicle:
+    with session(connect__endpoints=[endpoint]) as vehicle:
         for number in range(100):
             vehicle.put("vehicles/car1/pose", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
         vehicle.put("vehicles/car1/other", "no stream's")
@@ -57,7 +35,7 @@ def test_samples_arrive_in_order_on_every_stream_that_their_key_belongs_to(
 
 
 def test_deletions_are_no_samples_but_empty_payloads_are(listening: Network, endpoint: str, arrivals: Arrivals) -> None:
-    with session("client", connect=endpoint) as vehicle:
+    with session(connect__endpoints=[endpoint]) as vehicle:
         vehicle.delete("vehicles/car1/pose")
         vehicle.put("vehicles/car1/pose", b"")
         vehicle.put("vehicles/car1/pose", b"end")
@@ -74,17 +52,17 @@ def test_data_flows_once_the_router_exists_and_again_after_it_was_away(
     network.start()
     assert not network.connected
     for text in (b"first", b"second"):
-        with session("router", listen=endpoint) as router:
+        with router(listen__endpoints=[endpoint]) as there:
             deadline = time.monotonic() + PATIENCE
             while not any(payload == text for _, _, payload in arrivals.seen):
                 assert time.monotonic() < deadline, "nothing arrived"
-                router.put("vehicles/car1/pose", text)
+                there.put("vehicles/car1/pose", text)
             wait_for(lambda: network.connected)
     network.close()
 
 
 def test_events_are_published_with_their_encoding(listening: Network, endpoint: str) -> None:
-    with session("client", connect=endpoint) as listener:
+    with session(connect__endpoints=[endpoint]) as listener:
         subscriber = listener.declare_subscriber("wayside/events/**")
         deadline = time.monotonic() + PATIENCE
         while (event := subscriber.try_recv()) is None:  # the first ones may go out before the subscription is known

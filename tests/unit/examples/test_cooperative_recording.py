@@ -24,7 +24,7 @@ from rosbags.highlevel import AnyReader
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
 from tests.guides import ROOT
-from tests.networks import PATIENCE
+from tests.networks import PATIENCE, session
 from tests.ports import free_endpoint
 from tests.unit.manager_objects import instance
 from wayside.api import ApplicationTemplate, Detector, EventRule, Kind
@@ -71,13 +71,6 @@ from cooperative_recording.vehicles import (  # noqa: E402
 )
 
 NUMBER = r"-?\d+(?:\.\d+)?"
-
-
-def listening(endpoint: str) -> zenoh.Session:
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    return zenoh.open(config)
 
 
 def documents() -> list[Kind]:
@@ -324,8 +317,8 @@ def test_what_arrives_over_zenoh_is_the_drive_byte_for_byte() -> None:
         if len(arrived) == len(expected):
             done.put(None)
 
-    with listening(endpoint) as session:
-        subscriber = session.declare_subscriber("vehicles/**", take)
+    with session("peer", listen__endpoints=[endpoint]) as there:
+        subscriber = there.declare_subscriber("vehicles/**", take)
         published = publish(drive, 1.0, connect=[endpoint], start_ns=START_NS, speed=4.0)
         done.get(timeout=PATIENCE)
         subscriber.undeclare()
@@ -346,8 +339,8 @@ def test_nobody_to_connect_to_is_told_with_the_endpoint() -> None:
 def test_sigterm_ends_the_drive_in_good_order() -> None:
     endpoint = free_endpoint()
     first: queue.SimpleQueue[None] = queue.SimpleQueue()
-    with listening(endpoint) as session:
-        subscriber = session.declare_subscriber("vehicles/*/pose", lambda _: first.put(None))
+    with session("peer", listen__endpoints=[endpoint]) as there:
+        subscriber = there.declare_subscriber("vehicles/*/pose", lambda _: first.put(None))
         command = [sys.executable, str(EXAMPLE / "drive.py"), "--connect", endpoint, "--duration", "60"]
         drive = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         first.get(timeout=PATIENCE)
