@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests that wait on other processes: three a core keep it busy.
 WAITING := $(BIN)/python -m pytest -n 6 --dist loadgroup
 
-.PHONY: help demo demo-cluster tutorial examples test unit cluster e2e lint bench mutants requirements crds clean
+.PHONY: help demo demo-cluster tutorial examples test unit process cluster e2e lint bench mutants soak requirements crds clean
 
 help: ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -77,6 +77,9 @@ bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its basel
 
 mutants: $(BIN)/.installed-dev ## small wrong changes, one by one: for each, a test must fail
 	@$(BIN)/python -m tests.mutants
+
+soak: $(BIN)/.installed-dev ## an hour of traffic, faster than it happens: nothing grows, every loss is counted
+	@$(BIN)/python -m benchmarks.soak
 
 crds: $(BIN)/.installed ## write crds/ anew from the models, and what of the chart follows from the code
 	@$(BIN)/python -m wayside.api crds
