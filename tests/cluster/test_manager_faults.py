@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -16,12 +17,15 @@ from tests.cluster.managed_world import (
     config,
     deployment,
     end,
+    start_manager,
     task,
     template,
     wait_settled,
 )
-from tests.cluster.processes import Process
+from tests.cluster.processes import Process, Processes
+from tests.cluster.test_manager_metrics import scraped
 from tests.cluster.waiting import wait_until
+from tests.ports import free_port
 from wayside.times import parse_seconds
 
 NORTH = instance_name("app", "north")
@@ -282,7 +286,9 @@ def test_an_instance_deleted_by_hand_comes_back_after_its_objects_are_gone(api: 
     wait_settled(api)
 
 
-def test_a_restart_and_a_resync_write_nothing(api: Api, manager: Process) -> None:
+def test_a_restart_and_a_resync_write_nothing(api: Api, processes: Processes, namespace: str) -> None:
+    port = free_port()
+    manager = start_manager(processes, namespace, "--resync", "1s", "--metrics-port", str(port))
     api.create(template(manifests=[deployment(), config({"a": "b"})]))
     api.create(task("north"))
     api.create(task("twin", region="north"))
@@ -292,8 +298,16 @@ def test_a_restart_and_a_resync_write_nothing(api: Api, manager: Process) -> Non
     before = quiet(api)
     manager.restart()
     manager.wait_for_output("watching")
-    time.sleep(7)  # the first resync, and one of every five seconds
+    first = wait_until(lambda: resynced(port), bool, what="all was listed after the start")
+    wait_until(lambda: resynced(port), lambda at: at > first + 2, what="and twice again")
     assert versions(api) == before
+
+
+def resynced(port: int) -> float:
+    """When everything was last listed, in seconds since 1970; 0: not yet, or nobody answers."""
+    with suppress(OSError):
+        return scraped(port)["resync_time_seconds",]
+    return 0.0
 
 
 def test_a_namespace_that_goes_is_left_quietly(api: Api, manager: Process, namespace: str) -> None:
