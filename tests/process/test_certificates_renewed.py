@@ -26,11 +26,6 @@ CARS = ("car1", "car2", "car3")
 
 
 @pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    return Authority(tmp_path)
-
-
-@pytest.fixture
 def mounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
     return tmp_path / "own"
@@ -39,11 +34,6 @@ def mounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def at() -> str:
     return free_endpoint().replace("tcp/127.0.0.1", "tls/localhost")
-
-
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
 
 
 @contextmanager
