@@ -207,17 +207,6 @@ def test_a_rule_for_a_template_that_is_not_there_says_so_on_its_task(chain: Chai
         assert len(chain.api.list("Deployment")) == 2
 
 
-def test_a_rule_with_a_parameter_of_the_wrong_type_says_so_on_its_task(chain: Chain) -> None:
-    chain.apply(rule(), of_vans(recording(rate="fast")), detector(chain.endpoint))
-    running = chain.start(rules=2)
-    with Vehicles(chain.endpoint) as vehicles, unharmed(chain, vehicles, running):
-        vehicles.place(VANS, NEAR)
-        chain.wait_deployed(VANS)
-        told = refusal(chain, "bad")
-        for helpful in ("rate", "fast", "number"):
-            assert helpful in told["message"]
-
-
 def of_vans(actions: list[Object]) -> Object:
     """Another rule, which the well-behaved pair is no subject of."""
     bad = rule("bad", actions=actions)

@@ -126,7 +126,9 @@ def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process
     assert manager.alive
 
 
-def test_a_deployment_deleted_by_hand_comes_back(api: Api, manager: Process) -> None:
+def test_a_deployment_deleted_by_hand_comes_back_and_a_field_changed_by_hand_is_set_right(
+    api: Api, manager: Process
+) -> None:
     api.create(template())
     api.create(task("north"))
     there(api, NORTH)
@@ -134,13 +136,6 @@ def test_a_deployment_deleted_by_hand_comes_back(api: Api, manager: Process) -> 
     uid = api.get("Deployment", NORTH)["metadata"]["uid"]
     api.delete("Deployment", NORTH)
     api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, what="it is back")
-    wait_settled(api)
-
-
-def test_a_field_changed_by_hand_is_set_right(api: Api, manager: Process) -> None:
-    api.create(template())
-    api.create(task("north"))
-    there(api, NORTH)
     wait_settled(api)
     api.patch("Deployment", NORTH, {"spec": {"replicas": 5}})
     api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is set right")
