@@ -132,23 +132,6 @@ def test_a_detector_ends_and_starts_while_the_api_server_is_away(
     chain.settled()
 
 
-def test_a_task_deleted_by_hand_comes_back_and_its_deployment_does_not_notice(chain: Chain, vehicles: Vehicles) -> None:
-    chain.start()
-    vehicles.place(CARS, NEAR)
-    deployed = chain.wait_deployed(CARS)
-    task = chain.wait_task(CARS)
-    chain.api.delete("ApplicationTask", task["metadata"]["name"])
-    again = chain.api.wait_for(
-        "ApplicationTask",
-        task["metadata"]["name"],
-        lambda found: found["metadata"]["uid"] != task["metadata"]["uid"],
-        what="the task is back",
-    )
-    assert again["spec"] == task["spec"]
-    chain.settled()
-    assert untouched(deployed, chain.deployment(CARS))
-
-
 def test_a_detector_told_to_end_does_so_promptly_and_its_tasks_stay(chain: Chain, vehicles: Vehicles) -> None:
     running = chain.start()
     vehicles.place(CARS, NEAR)

@@ -18,6 +18,7 @@ from application_manager.core.objects.following import ANNOTATION, fingerprint
 from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import end, start_manager, task, wait_settled
 from tests.cluster.processes import Process, Processes
+from tests.cluster.repeating import repeated
 from tests.cluster.waiting import wait_until
 from tests.networks import router
 from tests.ports import free_endpoint
@@ -203,25 +204,6 @@ def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, man
     assert manager.terminate(patience=15) == 0
 
 
-class Repeated:
-    """Puts a value again and again, for the duration of a `with` block."""
-
-    def __init__(self, session: zenoh.Session, key: str, value: str) -> None:
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, args=(session, key, value), daemon=True)
-
-    def _run(self, session: zenoh.Session, key: str, value: str) -> None:
-        while not self._ended.wait(0.1):
-            session.put(key, value)
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._thread.join()
-
-
 class Mount:
     """A mounted ConfigMap, brought up to date as a kubelet does it that was told: when the pod's annotation changes."""
 
@@ -273,7 +255,8 @@ def test_the_example_follows_its_sources(
     if way == "file":
         mount.wait_for(api, "car1", "car2")
     application.wait_for_output(f"following car1, car2 .by {way}.")
-    with Repeated(network, "vehicles/car2/pose", "here"):  # its subscription takes a moment to reach us
+    # Its subscription takes a moment to reach us.
+    with repeated("vehicle", lambda: network.put("vehicles/car2/pose", "here"), 0.1):
         application.wait_for_output("vehicles/car2/pose: here")
     end(api, "car1")
     if way == "file":

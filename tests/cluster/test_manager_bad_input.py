@@ -71,18 +71,12 @@ def changed(container: Object) -> Object:
             ["spec.parameters.region: 7", "not of type string", "give a value of type string"],
         ),
         (
-            {"template": "good", "parameters": {"region": "x", "regoin": "y"}},
-            "InvalidParameters",
-            ["spec.parameters.regoin", "did you mean region?"],
-        ),
-        ({"template": "good"}, "InvalidParameters", ["spec.parameters.region: is missing"]),
-        (
             {"template": "good", "parameters": {"region": "x" * 70_000}},
             "InvalidParameters",
             ["spec.parameters: takes", "65536"],
         ),
     ],
-    ids=["unknown template", "wrong type", "misspelt", "missing", "too large"],
+    ids=["unknown template", "wrong type", "too large"],
 )
 @pytest.mark.usefixtures("unharmed")
 def test_a_task_that_cannot_be_served_is_told_why(api: Api, spec: Object, reason: str, parts: list[str]) -> None:
@@ -99,21 +93,15 @@ def test_a_task_that_cannot_be_served_is_told_why(api: Api, spec: Object, reason
             changed({"image": "app:${parameters.version}"}),
             ["spec.manifests[0].spec.template.spec.containers[0].image", "`parameters.version` is not known", "region"],
         ),
-        (changed({"image": "app:${version}"}), ["containers[0].image", "version"]),
-        (
-            changed({"command": ["sh", "-c", 'cd "${HOME}" && run']}),
-            ["containers[0].command[2]", "HOME", "write `$${` for a literal `${`"],
-        ),
-        (
-            {**config({}), "kind": "ServiceAccount"},
-            ["spec.manifests[0].kind", "v1/ServiceAccount is not of the kinds that the administrator allows"],
-        ),
         (
             {**config({}), "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role"},
-            ["spec.manifests[0].kind", "rbac.authorization.k8s.io/v1/Role"],
+            [
+                "spec.manifests[0].kind",
+                "rbac.authorization.k8s.io/v1/Role is not of the kinds that the administrator allows",
+            ],
         ),
     ],
-    ids=["unknown parameter", "unknown variable", "shell script", "forbidden kind", "forbidden group"],
+    ids=["unknown parameter", "forbidden kind"],
 )
 @pytest.mark.usefixtures("unharmed")
 def test_a_template_that_cannot_be_rendered_is_told_why(api: Api, manifest: Object, parts: list[str]) -> None:

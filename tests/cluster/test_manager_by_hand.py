@@ -88,23 +88,3 @@ def test_a_held_instance_runs_on_though_nobody_demands_it(api: Api, manager: Pro
     annotate(api, "hold", None)
     api.wait_gone("ApplicationInstance", NORTH)
     api.wait_gone("Deployment", NORTH)
-
-
-def test_a_persons_task_and_a_detectors_are_demands_alike(api: Api, manager: Process) -> None:
-    api.create(template(**SCALED))
-    persons: Object = task("by-anna", region="north", zones=["a"])
-    detectors: Object = task("by-town", region="north", zones=["b"], holder="town")
-    event = {"id": "e", "rule": "r", "action": "x", "subject": "car1"} | dict.fromkeys(
-        ("onsetTime", "startTime"), "2026-01-02T03:04:05Z"
-    )
-    detectors["spec"] |= {"event": event, "priority": -1}
-    api.create(persons)
-    api.create(detectors)
-    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["a","b"]!', what="both count")
-    for name in ("by-anna", "by-town"):
-        wait_condition(api, "Applied", "True", "ApplicationTask", name)
-    end(api, "by-town")
-    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["a"]!', what="the person's counts alone")
-    end(api, "by-anna")
-    api.wait_gone("ApplicationInstance", NORTH)
-    wait_condition(api, "Finished", "True", "ApplicationTask", "by-anna")

@@ -16,7 +16,16 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import faulty_proxy
 from tests.cluster.managed_world import condition, start_manager
 from tests.cluster.processes import Process, Processes
-from tests.cluster.test_manager_rbac import ALLOWED, granted, may, printed, put, used, wait_in_force, without
+from tests.cluster.test_manager_rbac import (
+    ALLOWED,
+    each_verb_is_missed,
+    granted,
+    may,
+    printed,
+    put,
+    used,
+    wait_in_force,
+)
 from tests.cluster.waiting import wait_until
 from tests.ports import free_endpoint
 from wayside.api import Detector
@@ -242,6 +251,4 @@ def test_each_verb_of_its_own_role_is_granted_and_for_one_fewer_it_is_refused(
     wait_until(lacks, lambda found: not found, what="nothing lacks")
     assert not may(account, namespace, "coordination.k8s.io", "leases", "update", "wayside-other")
     assert not may(account, namespace, "wayside.dev", "detectors", "hold", "other")
-    for verb in sorted(granted(roles)):
-        put(api, without(roles, *verb))
-        wait_until(lacks, lambda found, verb=verb: found == [verb], what=f"{verb} lacks, and nothing else")
+    each_verb_is_missed(api, roles, lacks)

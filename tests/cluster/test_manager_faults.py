@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -16,12 +17,15 @@ from tests.cluster.managed_world import (
     config,
     deployment,
     end,
+    start_manager,
     task,
     template,
     wait_settled,
 )
-from tests.cluster.processes import Process
+from tests.cluster.processes import Process, Processes
+from tests.cluster.test_manager_metrics import scraped
 from tests.cluster.waiting import wait_until
+from tests.ports import free_port
 from wayside.times import parse_seconds
 
 NORTH = instance_name("app", "north")
@@ -122,7 +126,9 @@ def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process
     assert manager.alive
 
 
-def test_a_deployment_deleted_by_hand_comes_back(api: Api, manager: Process) -> None:
+def test_a_deployment_deleted_by_hand_comes_back_and_a_field_changed_by_hand_is_set_right(
+    api: Api, manager: Process
+) -> None:
     api.create(template())
     api.create(task("north"))
     there(api, NORTH)
@@ -130,13 +136,6 @@ def test_a_deployment_deleted_by_hand_comes_back(api: Api, manager: Process) -> 
     uid = api.get("Deployment", NORTH)["metadata"]["uid"]
     api.delete("Deployment", NORTH)
     api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, what="it is back")
-    wait_settled(api)
-
-
-def test_a_field_changed_by_hand_is_set_right(api: Api, manager: Process) -> None:
-    api.create(template())
-    api.create(task("north"))
-    there(api, NORTH)
     wait_settled(api)
     api.patch("Deployment", NORTH, {"spec": {"replicas": 5}})
     api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is set right")
@@ -282,7 +281,9 @@ def test_an_instance_deleted_by_hand_comes_back_after_its_objects_are_gone(api: 
     wait_settled(api)
 
 
-def test_a_restart_and_a_resync_write_nothing(api: Api, manager: Process) -> None:
+def test_a_restart_and_a_resync_write_nothing(api: Api, processes: Processes, namespace: str) -> None:
+    port = free_port()
+    manager = start_manager(processes, namespace, "--resync", "1s", "--metrics-port", str(port))
     api.create(template(manifests=[deployment(), config({"a": "b"})]))
     api.create(task("north"))
     api.create(task("twin", region="north"))
@@ -292,8 +293,16 @@ def test_a_restart_and_a_resync_write_nothing(api: Api, manager: Process) -> Non
     before = quiet(api)
     manager.restart()
     manager.wait_for_output("watching")
-    time.sleep(7)  # the first resync, and one of every five seconds
+    first = wait_until(lambda: resynced(port), bool, what="all was listed after the start")
+    wait_until(lambda: resynced(port), lambda at: at > first + 2, what="and twice again")
     assert versions(api) == before
+
+
+def resynced(port: int) -> float:
+    """When everything was last listed, in seconds since 1970; 0: not yet, or nobody answers."""
+    with suppress(OSError):
+        return scraped(port)["resync_time_seconds",]
+    return 0.0
 
 
 def test_a_namespace_that_goes_is_left_quietly(api: Api, manager: Process, namespace: str) -> None:

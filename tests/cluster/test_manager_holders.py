@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +13,7 @@ from application_manager.core.holders.leases import LeaseView
 from tests.cluster.api import Api
 from tests.cluster.managed_world import condition, task, template, wait_settled
 from tests.cluster.processes import Process
+from tests.cluster.repeating import repeated
 from tests.cluster.waiting import wait_until
 
 NORTH = instance_name("app", "north")
@@ -21,20 +21,21 @@ LOST = {"det": LeaseView(1000.0)}
 
 
 LONG = 600  # s: for as long as the test looks
+SHORT = 10  # s: to be waited for, and long beside the half second of the renewals
 
 
 @pytest.fixture
-def renew(api: Api) -> Callable[[int], None]:
-    """Renews the Lease of the holder `det` for so many seconds; it begins with a long one."""
+def renew(api: Api) -> Callable[..., None]:
+    """Renews the Lease of a holder, by default `det`, for a number of seconds; that of `det` begins with a long one."""
     minutes = itertools.count()
 
-    def renew(duration: int) -> None:
+    def renew(duration: int, holder: str = "det") -> None:
         spec = {
-            "holderIdentity": "det",
+            "holderIdentity": holder,
             "leaseDurationSeconds": duration,
             "renewTime": "2020-01-01T{:02}:{:02}:00.000000Z".format(*divmod(next(minutes), 60)),  # a clock far behind
         }
-        metadata = {"name": "wayside-det"}
+        metadata = {"name": f"wayside-{holder}"}
         api.apply({"apiVersion": "coordination.k8s.io/v1", "kind": "Lease", "metadata": metadata, "spec": spec})
 
     renew(LONG)
@@ -50,7 +51,7 @@ def reason(raw: Any) -> Any:
 
 
 def test_a_lost_holder_releases_and_a_returning_one_counts_again(
-    api: Api, manager: Process, renew: Callable[[int], None]
+    api: Api, manager: Process, renew: Callable[..., None]
 ) -> None:
     api.create(lossy())
     api.create(task("north", holder="det"))
@@ -78,25 +79,23 @@ def test_a_lost_holder_releases_and_a_returning_one_counts_again(
     api.wait_for("ApplicationTask", "north", lambda raw: reason(raw) == "Accepted", what="the task is told")
 
 
-def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, renew: Callable[[int], None]) -> None:
+def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, renew: Callable[..., None]) -> None:
     api.create(lossy())
-    api.create(task("north", holder="det"))
-    api.create(task("unknown", holder="nobody"))
-    # There is patience with one that has no Lease: for 15 s, and one more.
-    api.wait_for("ApplicationTask", "unknown", lambda raw: reason(raw) == "Accepted", what="it counts")
-    uid = api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")["metadata"]["uid"]
-    began = time.monotonic()
-    while time.monotonic() - began < 25:  # s: without the renewals, the holder would be lost after 16
-        renew(15)
-        api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] == uid, what="it stays")
-        with pytest.raises(TimeoutError):  # half a second goes by, in which nothing may change
-            api.wait_gone("Deployment", NORTH, timeout=0.5)
-    assert reason(api.get("ApplicationTask", "north")) == "Accepted"
+    renew(SHORT, "silent")
+    for holder in ("det", "silent", "nobody"):
+        api.create(task(holder, holder=holder))
+        # There is patience with one that has no Lease: for 15 s, and one more.
+        api.wait_for("ApplicationTask", holder, lambda raw: reason(raw) == "Accepted", what="it counts")
+    name = instance_name("app", "det")
+    uid = api.wait_for("Deployment", name, lambda _: True, what="the Deployment exists")["metadata"]["uid"]
+    with repeated("renewing", lambda: renew(SHORT), 0.5):
+        renew(SHORT, "silent")  # for the last time
+        api.wait_for("ApplicationTask", "silent", lambda raw: reason(raw) == "HolderLost", what="it is lost")
+        assert reason(api.get("ApplicationTask", "det")) == "Accepted"
+    assert api.get("Deployment", name)["metadata"]["uid"] == uid
 
 
-def test_policy_hold_keeps_the_demands_of_a_lost_holder(
-    api: Api, manager: Process, renew: Callable[[int], None]
-) -> None:
+def test_policy_hold_keeps_the_demands_of_a_lost_holder(api: Api, manager: Process, renew: Callable[..., None]) -> None:
     api.create(lossy("Hold"))
     api.create({**lossy(), "metadata": {"name": "other"}})
     api.create(task("north", holder="det"))

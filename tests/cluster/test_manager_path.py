@@ -194,7 +194,3 @@ def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
     wait_settled(api)
     assert only_instance(api)["status"]["phase"] == "Applied"
     assert told() == expected
-
-
-def test_sigterm_ends_it_at_once(manager: Process) -> None:
-    assert manager.terminate(patience=15) == 0

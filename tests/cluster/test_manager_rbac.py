@@ -7,7 +7,7 @@ import copy
 import functools
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -96,6 +96,15 @@ def may(account: Api, namespace: str, group: str, resource: str, verb: str, name
     kind = "SelfSubjectAccessReview"
     asked = {"apiVersion": api_version, "kind": kind, "metadata": {}, "spec": {"resourceAttributes": about}}
     return bool(account.create(asked)["status"]["allowed"])
+
+
+def each_verb_is_missed(api: Api, whole: list[Object], lacks: Callable[[], list[Verb]]) -> None:
+    """Take away one verb of every resource at a time, until each was away; `lacks` must find these, and no other."""
+    by_resource = [sorted(each) for _, each in itertools.groupby(sorted(granted(whole)), key=lambda verb: verb[:2])]
+    for removed in itertools.zip_longest(*by_resource):
+        expected = sorted(filter(None, removed))
+        put(api, functools.reduce(lambda manifests, verb: without(manifests, *verb), expected, whole))
+        wait_until(lacks, expected.__eq__, what=f"{expected} lack, and nothing else")
 
 
 def used(seen: list[Seen], namespace: str) -> Iterator[Verb]:
@@ -232,11 +241,7 @@ def test_each_verb_that_lacks_is_noticed(
 
     put(api, whole)
     wait_until(lacks, lambda found: not found, what="nothing lacks")
-    by_resource = [sorted(each) for _, each in itertools.groupby(sorted(granted(whole)), key=lambda verb: verb[:2])]
-    for removed in itertools.zip_longest(*by_resource):  # of each resource one verb at a time
-        expected = sorted(filter(None, removed))
-        put(api, functools.reduce(lambda manifests, verb: without(manifests, *verb), expected, whole))
-        wait_until(lacks, expected.__eq__, what=f"{expected} lack, and nothing else")
+    each_verb_is_missed(api, whole, lacks)
 
 
 def test_what_nothing_works_without_ends_the_start_with_one_line(

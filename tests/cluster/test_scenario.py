@@ -9,10 +9,9 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +21,7 @@ import yaml
 
 from tests.cluster.api import Api
 from tests.cluster.processes import Processes
+from tests.cluster.repeating import repeated
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_endpoint
 
@@ -56,30 +56,21 @@ class Observer:
     api: Api
     seen: list[Seen] = field(default_factory=list)
 
-    @contextmanager
-    def watching(self) -> Iterator[None]:
-        ended = threading.Event()
-        thread = threading.Thread(target=self._run, args=(ended,), daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
+    def watching(self) -> AbstractContextManager[None]:
+        return repeated("observer", self.look, LOOKING)
 
-    def _run(self, ended: threading.Event) -> None:
-        while not ended.wait(LOOKING):
-            before, began = time.time_ns(), time.monotonic()
-            deployments = self.api.list("Deployment")
-            configurations = {each["metadata"]["name"]: each for each in self.api.list("ConfigMap")}
-            pairs = {_vehicles(each) for each in deployments if each["metadata"]["name"].startswith("scene-recorder")}
-            sources = {}
-            for each in deployments:
-                found = configurations.get(f"{each['metadata']['name']}-sources")
-                if found is not None:
-                    content = yaml.safe_load(found["data"]["sources.yaml"])
-                    sources[content["place"]] = tuple(content["sources"])
-            self.seen.append(Seen(before, time.monotonic() - began, frozenset(pairs), sources))
+    def look(self) -> None:
+        before, began = time.time_ns(), time.monotonic()
+        deployments = self.api.list("Deployment")
+        configurations = {each["metadata"]["name"]: each for each in self.api.list("ConfigMap")}
+        pairs = {_vehicles(each) for each in deployments if each["metadata"]["name"].startswith("scene-recorder")}
+        sources = {}
+        for each in deployments:
+            found = configurations.get(f"{each['metadata']['name']}-sources")
+            if found is not None:
+                content = yaml.safe_load(found["data"]["sources.yaml"])
+                sources[content["place"]] = tuple(content["sources"])
+        self.seen.append(Seen(before, time.monotonic() - began, frozenset(pairs), sources))
 
 
 def _vehicles(deployment: dict[str, Any]) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tests import programs
 from tests.cluster.api import Api
-from tests.cluster.chain import BUSES, CARS, FAR, HOLDER, NEAR, Chain, Vehicles, detector, rule, template
+from tests.cluster.chain import BUSES, CARS, FAR, HOLDER, NEAR, Chain, Vehicles, rule, template
 from tests.cluster.managed_world import end, start_manager
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
@@ -29,13 +29,6 @@ def receiver(processes: Processes) -> Iterator[Receiver]:
     with Receiver() as running:
         processes.environment |= {"OTEL_EXPORTER_OTLP_ENDPOINT": running.endpoint, "OTEL_BSP_SCHEDULE_DELAY": "100"}
         yield running
-
-
-@pytest.fixture
-def chain(api: Api, namespace: str, processes: Processes, tmp_path: Path) -> Chain:
-    made = Chain(api, namespace, processes, tmp_path / "detector")
-    made.apply(detector(made.endpoint), rule(), template())
-    return made
 
 
 def wait_spans(receiver: Receiver, *names: str) -> dict[str, Received]:
@@ -89,7 +82,7 @@ def test_a_trace_runs_from_the_event_to_the_readiness(
     for name in ("episode <rule>", "create task <action>", "reconcile <template>", "apply", "ready"):
         assert f"`{name}`" in guide
 
-    live = (tmp_path / "detector" / "events.jsonl").read_text(encoding="utf-8")
+    live = (chain.folder / "events.jsonl").read_text(encoding="utf-8")
     environment = dict(chain.processes.environment)
     assert replayed(intake, tmp_path / "on", environment) == live
     off = {key: value for key, value in environment.items() if not key.startswith("OTEL_")}

@@ -1,14 +1,18 @@
-"""A shared MongoDB server with a database and a way to it for each test, a free endpoint, and what streams took in."""
+"""What many of these tests stand on: a shared MongoDB server, free endpoints, an authority, an HTTP endpoint."""
 
 from __future__ import annotations
 
 import uuid
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pymongo
 import pytest
 
+from tests.certificates import Authority
+from tests.http_servers import Endpoint
+from tests.http_servers import endpoint as http_endpoint
 from tests.mongodb import MongoServer, running
 from tests.mongodb.way import Way
 from tests.networks import Arrivals
@@ -50,3 +54,14 @@ def endpoint() -> str:
 @pytest.fixture
 def arrivals() -> Arrivals:
     return Arrivals()
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path)
+
+
+@pytest.fixture
+def there() -> Iterator[Endpoint]:
+    with http_endpoint() as made:
+        yield made

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from tests.process.installing import installed
 from tests.process.running import PATIENCE, Process
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "action-plugin"
@@ -20,12 +21,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "action-plugin"
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the package is installed."""
-    target = tmp_path_factory.mktemp("site")
-    source = tmp_path_factory.mktemp("source") / "action-plugin"
-    subprocess.run(["cp", "-r", EXAMPLE, source], check=True)  # building leaves files behind
-    install = ["pip", "install", "--no-deps", "--no-build-isolation", "--quiet", "--target", str(target), str(source)]
-    subprocess.run([sys.executable, "-m", *install], check=True)
-    return target
+    return installed(EXAMPLE, tmp_path_factory.mktemp("site"))
 
 
 def check(path: Path | None) -> subprocess.CompletedProcess[str]:

@@ -26,11 +26,6 @@ CARS = ("car1", "car2", "car3")
 
 
 @pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    return Authority(tmp_path)
-
-
-@pytest.fixture
 def mounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
     return tmp_path / "own"
@@ -39,11 +34,6 @@ def mounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def at() -> str:
     return free_endpoint().replace("tcp/127.0.0.1", "tls/localhost")
-
-
-@pytest.fixture
-def arrivals() -> Arrivals:
-    return Arrivals()
 
 
 @contextmanager
@@ -103,7 +93,7 @@ def client(at: str, authority: Authority, name: str) -> zenoh.Session:
 
 
 @pytest.mark.parametrize("mode", ["client", "peer"])
-def test_ten_renewals_under_load_lose_nothing_and_give_nothing_twice(
+def test_renewals_under_load_lose_nothing_and_give_nothing_twice(
     mode: str, at: str, authority: Authority, mounted: Path, arrivals: Arrivals
 ) -> None:
     authority.mount(mounted, "detector")
@@ -116,7 +106,7 @@ def test_ten_renewals_under_load_lose_nothing_and_give_nothing_twice(
         subscriber_known = lambda: bool(arrivals.seen)  # noqa: E731
         with Traffic(vehicles) as traffic:
             wait_for(subscriber_known)
-            for renewal in range(1, 11):
+            for renewal in range(1, 6):
                 authority.mount(mounted, "detector")
                 wait_for(lambda renewal=renewal: running.standing.renewals == renewal)
             before = len(arrivals.seen)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from detector.testing import RefusedError, run
+from tests.process.installing import installed
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "signal-plugin"
 RULES, DETECTOR, DRIVE = (EXAMPLE / name for name in ("rules.yaml", "detector.yaml", "drive.jsonl"))
@@ -19,12 +20,7 @@ RULES, DETECTOR, DRIVE = (EXAMPLE / name for name in ("rules.yaml", "detector.ya
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the package is installed."""
-    target = tmp_path_factory.mktemp("site")
-    source = tmp_path_factory.mktemp("source") / "signal-plugin"
-    subprocess.run(["cp", "-r", EXAMPLE, source], check=True)  # building leaves files behind
-    install = ["pip", "install", "--no-deps", "--no-build-isolation", "--quiet", "--target", str(target), str(source)]
-    subprocess.run([sys.executable, "-m", *install], check=True)
-    return target
+    return installed(EXAMPLE, tmp_path_factory.mktemp("site"))
 
 
 def test_before_it_is_installed_it_is_missed() -> None:

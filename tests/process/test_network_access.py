@@ -29,11 +29,6 @@ from wayside.api.access import Access
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 
-@pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    return Authority(tmp_path)
-
-
 def tls_router(endpoint: str, authority: Authority, *, mutual: bool = False) -> Any:
     certificate, key = authority.sign("router")
     return router(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pytest
 
 from detector.actions import Completion, OutcomeState
 from detector.actions.notify import alerts
-from tests.http_servers import Endpoint, answers, endpoint, hangs, holds
+from tests.http_servers import Endpoint, answers, hangs, holds
 from tests.notifying import a_desk, an_episode
 from wayside.times import parse_time
 
@@ -24,12 +23,6 @@ NOBODY = "alerts that nobody heard of"
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alerts, "FIRST", 0.02)
     monkeypatch.setattr(alerts, "LONGEST", 0.1)
-
-
-@pytest.fixture
-def there() -> Iterator[Endpoint]:
-    with endpoint() as made:
-        yield made
 
 
 def notify(there: Endpoint, repeat: str = "1h", **fields: Any) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """The example of a third-party source: installed with pip, checked, and run by the detector's own command."""
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -14,6 +13,7 @@ import pytest
 
 from tests.networks import PATIENCE, wait_for
 from tests.ports import free_port
+from tests.process.installing import installed
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "source-plugin"
@@ -22,12 +22,7 @@ EXAMPLE = ROOT / "examples" / "source-plugin"
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
     """In it the example package is installed."""
-    folder = tmp_path_factory.mktemp("installed")
-    copy = folder / "source"  # building leaves files beside the sources
-    shutil.copytree(EXAMPLE, copy)
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
-    target = folder / "target"
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", target, copy], check=True)
+    target = installed(EXAMPLE, tmp_path_factory.mktemp("installed"))
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(target), str(ROOT)])}
 
 

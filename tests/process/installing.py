@@ -1,0 +1,17 @@
+"""Installing the package of an example, as a user would."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+
+def installed(example: Path, folder: Path) -> Path:
+    """Install the example's package below the folder; return where its modules are."""
+    source, target = folder / "source", folder / "target"
+    shutil.copytree(example, source)  # building leaves files beside the sources
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", target, source], check=True)
+    return target
