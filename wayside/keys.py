@@ -94,7 +94,9 @@ def _parts(text: str) -> Iterator[tuple[int, str]]:
 
 def _nonempty(text: str, offset: int, part: str) -> str:
     if not part:
-        raise KeyPatternError(text, offset, "a chunk is empty: no slash at the start, at the end, or after another")
+        raise KeyPatternError(
+            text, offset, "a chunk is empty: remove the slash at the start or the end, or the second of two in a row"
+        )
     return part
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+from detector.assembly import DetectorError
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.message import Message
 from wayside.api.stream import Encoding, Stream
 from wayside.keys import KeyPattern
+from wayside.rules import stream_problems
 
 _SHOWN = 20
 
@@ -17,7 +19,10 @@ class Router:
     """Sends recorded messages into the Detector's streams."""
 
     def __init__(self, streams: Sequence[Stream]) -> None:
-        """Raises KeyPatternError."""
+        """Raises DetectorError where a stream's key or an expression of its own is wrong."""
+        problems = [problem for index, stream in enumerate(streams) for problem in stream_problems(stream, index)]
+        if problems:
+            raise DetectorError(problems)
         self._streams = [(stream, KeyPattern.parse(stream.key)) for stream in streams]
         self._routes: dict[str, tuple[Stream, ...]] = {}
         self._fits: set[tuple[str, str, str | None]] = set()

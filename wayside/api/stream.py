@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from wayside.api.base import (
     Duration,
     Expression,
+    Key,
     Model,
     ObjectName,
     PositiveDuration,
@@ -105,11 +106,9 @@ class Stream(Model):
     )
 
     name: ObjectName = Field(description="The name by which rules refer to the stream.")
-    key: str = Field(
-        min_length=1,
-        max_length=512,
+    key: Key = Field(
         description="The Zenoh key expression in key-format notation: ${client:*} captures the client's name, "
-        "e.g. vehicles/${client:*}/pose. A ROS topic is the key without its leading slash.",
+        "e.g. vehicles/${client:*}/pose. A ROS topic may be written with or without its leading slash.",
     )
     source: ObjectName = Field(
         default=ZENOH, description="Where the samples come from: zenoh, or the name of one of the Detector's sources."

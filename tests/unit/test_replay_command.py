@@ -1,0 +1,104 @@
+"""`detector replay` and `detector check` as a person uses them: files in, lines and an exit code out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import yaml
+
+from detector.cli import main
+from tests.unit.driving import a_detector, a_rule, a_stream, at
+from tests.unit.test_recordings import write_lines
+
+
+class Ran(NamedTuple):
+    code: int
+    said: str
+    events: list[dict[str, Any]]
+
+
+class Desk:
+    """A folder with a Detector, a rule and recordings, and the command."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder = folder
+        self._monkeypatch = monkeypatch
+        self._capsys = capsys
+        self.write(a_detector(a_stream("speed")), a_rule("fast", **FAST))
+
+    def write(self, *objects: Any, **spec: Any) -> None:
+        documents = [each if isinstance(each, dict) else each.to_json() for each in objects]
+        (self.folder / "detector.yaml").write_text(yaml.safe_dump_all(d for d in documents if d["kind"] == "Detector"))
+        (self.folder / "rules.yaml").write_text(yaml.safe_dump_all(d for d in documents if d["kind"] == "EventRule"))
+
+    def drive(self, name: str, *samples: tuple[float, object], key: str = "vehicles/car/speed") -> Path:
+        """JSON lines; times are seconds after the start."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return write_lines(path, *({"t": at(time), "key": key, "value": value} for time, value in samples))
+
+    def run(self, *arguments: str) -> Ran:
+        self._monkeypatch.setattr(sys, "argv", ["detector", *arguments])
+        self._monkeypatch.chdir(self.folder)
+        with pytest.raises(SystemExit) as left:
+            main()
+        events = self.folder / "out" / "events.jsonl"
+        found = [json.loads(line) for line in events.read_text().splitlines()] if events.exists() else []
+        return Ran(int(left.value.code or 0), self._capsys.readouterr().err, found)
+
+    def replay(self, *recordings: str | Path, options: Sequence[str] = ()) -> Ran:
+        given = ["--detector", "detector.yaml", "--rules", "rules.yaml", "--output", "out"]
+        return self.run("replay", *map(str, recordings), *given, *options)
+
+
+FAST: dict[str, Any] = {
+    "signals": [{"name": "v", "stream": "speed", "value": "msg.v"}],
+    "when": "v > 10",
+    "until": "v < 5",
+}
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Desk:
+    return Desk(tmp_path, monkeypatch, capsys)
+
+
+def times(events: Sequence[dict[str, Any]]) -> list[tuple[str, str | None, str]]:
+    return [(e["subject"], e["data"].get("reason"), e["time"]) for e in events]
+
+
+def test_a_key_may_begin_with_the_slash_of_its_ros_topic(desk: Desk) -> None:
+    for key in ("vehicles/${client:*}/speed", "/vehicles/${client:*}/speed"):
+        detector = a_detector().to_json()
+        detector["spec"]["streams"] = [{"name": "speed", "key": key, "encoding": "json"}]
+        desk.write(detector, a_rule("fast", **FAST))
+        desk.drive("drive.jsonl", (0.5, {"v": 20}), (3.5, {"v": 1}), (5.0, {"v": 1}), key="/vehicles/car/speed")
+        assert desk.run("check", "detector.yaml", "rules.yaml").code == 0
+        ran = desk.replay("drive.jsonl")
+        assert (ran.code, len(ran.events)) == (0, 2), ran.said
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("odom/", ["spec.streams[0].key", "'odom/'", "column 6", "remove the slash at the start or the end"]),
+        ("a//b", ["spec.streams[0].key", "'a//b'", "column 3", "the second of two in a row"]),
+        ("v/${client}/x", ["key", "write ${client:*}"]),
+    ],
+)
+def test_a_key_that_is_none_is_explained_by_replay_as_by_check(desk: Desk, key: str, words: list[str]) -> None:
+    detector = a_detector().to_json()
+    client = {} if "client" in key else {"client": "ego"}
+    detector["spec"]["streams"] = [{"name": "odom", "key": key, "encoding": "json", **client}]
+    desk.write(detector, a_rule("fast", **FAST))
+    desk.drive("drive.jsonl", (0.5, {"v": 20}))
+    for ran in (desk.replay("drive.jsonl"), desk.run("check", "detector.yaml")):
+        assert ran.code != 0
+        assert "Traceback" not in ran.said
+        for word in words:
+            assert word in ran.said
