@@ -115,7 +115,7 @@ class Losses:
             yield Loss(unread, count, last, cause="undecodable", stream=name)
         for name, count in counters.unnamed.items():
             unnamed = f"samples of stream {name} dropped, naming no client by key or message"
-            yield Loss(unnamed, count, cause="unnamed", stream=name)
+            yield Loss(unnamed, count, counters.last_unnamed.get(name, ""), cause="unnamed", stream=name)
         for name, count in counters.crowded.items():
             crowded = f"samples of stream {name} dropped, too many clients being known"
             yield Loss(crowded, count, cause="crowded", stream=name)

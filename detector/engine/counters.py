@@ -50,13 +50,13 @@ class RuleCounters:
     notes: list[str] | None = None
     """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
 
-    def note(self, reason: Reason, message: str) -> None:
-        """Count an expression's unknown result."""
+    def note(self, reason: Reason, message: str, place: str = "") -> None:
+        """Count an expression's unknown result; `place` says of an error which client and stream it is about."""
         if self.notes is not None and len(self.notes) < _MAXIMUM_NOTES:
             self.notes.append(message)
         if reason is Reason.ERROR:
             self.errors += 1
-            self.last_error = message
+            self.last_error = f"{place}: {message}" if place else message
         else:
             self.unknowns += 1
             if message in self.absences or len(self.absences) < _MAXIMUM_REASONS:
@@ -86,7 +86,7 @@ class Counters:
     unnamed: Counter[str] = field(default_factory=Counter)
     """Samples dropped since neither their key nor their message names a valid client, by stream."""
     last_unnamed: dict[str, str] = field(default_factory=dict)
-    """What the last message said instead, by stream."""
+    """The key of the last one, and what its message said instead of a name, by stream."""
     crowded: Counter[str] = field(default_factory=Counter)
     """Samples dropped since too many clients were known already, by stream."""
     rules: dict[str, RuleCounters] = field(default_factory=dict)

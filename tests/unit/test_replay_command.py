@@ -102,3 +102,45 @@ def test_a_key_that_is_none_is_explained_by_replay_as_by_check(desk: Desk, key: 
         assert "Traceback" not in ran.said
         for word in words:
             assert word in ran.said
+
+
+def test_an_error_of_a_value_names_client_and_stream_and_what_was_there(desk: Desk) -> None:
+    signal = {"name": "x", "stream": "speed", "value": "msg.v.x"}
+    desk.write(a_detector(a_stream("speed")), a_rule("r", signals=[signal], when="x > 1"))
+    ran = desk.replay(desk.drive("drive.jsonl", (0.5, {"v": 3}), (2.0, {"v": {"x": 3}})))
+    assert (
+        "evaluation errors in EventRule r; the last: signal x of car, stream speed: "
+        "`msg.v` is 3.0, which has no field `x`: correct the path" in ran.said
+    )
+
+
+def test_an_error_of_a_condition_names_client_and_stream(desk: Desk) -> None:
+    desk.write(a_detector(a_stream("speed")), a_rule("r", **{**FAST, "when": "v > 10", "until": "v.low"}))
+    ran = desk.replay(desk.drive("drive.jsonl", (0.5, {"v": 30}), (3.0, {"v": 30})))
+    assert "the last: until of car (v of stream speed): `v` is 30.0, which has no field `low`" in ran.said
+
+
+def test_samples_that_name_no_client_are_counted_with_a_key(desk: Desk) -> None:
+    path = desk.drive("drive.jsonl", (0.5, {"v": 3}), (2.0, {"v": 3}), key="vehicles/no name/speed")
+    said = "2 samples of stream speed dropped, naming no client by key or message; the last: the key vehicles/no name/"
+    assert said in desk.replay(path).said
+
+
+def test_what_a_client_can_never_have_is_not_counted_as_unknown(desk: Desk) -> None:
+    """A station sends its own stream alone; vehicles send speeds, under names that begin with v."""
+    station = {"name": "station", "key": "station/state", "client": "rsu", "encoding": "json"}
+    speed = {"name": "speed", "key": "vehicles/${client:v$*}/speed", "encoding": "json"}
+    near = {"pairs": {"position": {"stream": "speed", "x": "msg.v", "y": "0.0"}, "within": 1}}
+    desk.write(
+        a_detector(station, speed),
+        a_rule("fast", **FAST),
+        a_rule("near", scope=near, when="distance < 1"),
+    )
+    lines = [{"t": at(time / 2), "key": "vehicles/v1/speed", "value": {"v": 3}} for time in range(1, 9)]
+    lines += [{"t": at(time / 2), "key": "station/state", "value": {}} for time in range(1, 9)]
+    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *sorted(lines, key=lambda line: str(line["t"]))))
+    assert "unknown values" not in ran.said
+    lines[3]["value"] = {}
+    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *sorted(lines, key=lambda line: str(line["t"]))))
+    assert "unknown values in " in ran.said
+    assert "EventRule fast" in ran.said
