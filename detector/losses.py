@@ -18,6 +18,9 @@ from detector.streams.tally import Tally
 
 _log = logging.getLogger(__name__)
 
+_APART = 1_000_000_000
+"""Nanoseconds: streams whose delays differ by more are not of one time."""
+
 _EVERY = 60.0
 """Seconds between two lines about the same kind of loss: bad input may come a thousand times a second."""
 
@@ -68,6 +71,10 @@ class Losses:
             if loss.count > said and now - since >= _EVERY:
                 self._said[loss.what] = loss.count, now
                 _log.warning("%s", _line(loss, loss.count - said))
+        for what, text in self._apart():
+            if what not in self._said:
+                self._said[what] = 1, now
+                _log.warning("%s", text)
 
     def sum_up(self) -> None:
         """Log how many samples came, all losses since the start, and how the evaluations went."""
@@ -81,6 +88,7 @@ class Losses:
         for loss in self.all():
             if loss.count:
                 yield _line(loss, loss.count)
+        yield from (text for _, text in self._apart())
         for name, rule in self._engine.counters.rules.items():
             if rule.unknowns:
                 often = "; ".join(f"{count} times {what}" for what, count in rule.absences.most_common(3))
@@ -88,6 +96,23 @@ class Losses:
                     f"{rule.unknowns} unknown values in {rule.evaluations} evaluations of EventRule {name}"
                     + (f": {often}" if often else ", samples not being there or stale")
                 )
+
+    def _apart(self) -> Iterator[tuple[str, str]]:
+        """With clock Data, streams whose stamps are not of one time with the others': a name for each line, and it."""
+        counters = self._engine.counters
+        prompt = min(counters.delays, key=counters.delays.__getitem__, default="")
+        all_unstamped = counters.delays.keys() <= counters.unstamped.keys()
+        for name, delay in sorted(counters.delays.items()):
+            remedy = f"give streams[{name}].stamp, e.g. msg.time or sample.received, or write clock: Wall"
+            if (unstamped := counters.unstamped[name]) and not all_unstamped:
+                what = f"{unstamped} samples of stream {name} carry no stamp, those of other streams do"
+                yield f"unstamped {name}", f"{what}: with clock Data their receive time counts; {remedy}"
+            if (behind := delay - counters.delays[prompt]) > _APART:
+                what = (
+                    f"stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those of"
+                )
+                late = "with clock Data its samples are late for the others; set the sender's clock"
+                yield f"behind {name}", f"{what} stream {prompt}: {late}, {remedy}"
 
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, also those that did not happen."""

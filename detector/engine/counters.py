@@ -87,6 +87,10 @@ class Counters:
     """Samples dropped since neither their key nor their message names a valid client, by stream."""
     last_unnamed: dict[str, str] = field(default_factory=dict)
     """The key of the last one, and what its message said instead of a name, by stream."""
+    unstamped: Counter[str] = field(default_factory=Counter)
+    """With clock Data, samples without a stamp, by stream: their receive time counts."""
+    delays: dict[str, int] = field(default_factory=dict)
+    """With clock Data, by stream: how far stamps were behind the receive times at least, in nanoseconds."""
     crowded: Counter[str] = field(default_factory=Counter)
     """Samples dropped since too many clients were known already, by stream."""
     rules: dict[str, RuleCounters] = field(default_factory=dict)
@@ -96,6 +100,15 @@ class Counters:
         if name not in self.rules:
             self.rules[name] = RuleCounters()
         return self.rules[name]
+
+    def stamped(self, stream: str, received: int, stamp: int | None) -> None:
+        """Note how a sample's stamp compares with its receive time; nanoseconds, None: it carries none."""
+        if stamp is None:
+            self.unstamped[stream] += 1
+            stamp = received
+        delay = received - stamp
+        if delay < self.delays.get(stream, delay + 1):
+            self.delays[stream] = delay
 
     def unreadable(self, stream: str, key: str, error: Exception) -> None:
         """Count a payload that could not be read."""

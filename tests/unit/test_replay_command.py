@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from detector.cli import main
-from tests.unit.driving import a_detector, a_rule, a_stream, at
+from tests.unit.driving import START, a_detector, a_rule, a_stream, at
 from tests.unit.test_recordings import write_lines
 
 
@@ -144,3 +144,61 @@ def test_what_a_client_can_never_have_is_not_counted_as_unknown(desk: Desk) -> N
     ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *sorted(lines, key=lambda line: str(line["t"]))))
     assert "unknown values in " in ran.said
     assert "EventRule fast" in ran.said
+
+
+def stamped(stream: str, delay: float, count: int = 40, **fields: Any) -> list[dict[str, Any]]:
+    """A sample every tenth of a second, stamped so many seconds before it was recorded."""
+    return [
+        {
+            "t": at(time / 10),
+            "key": f"vehicles/car/{stream}",
+            "value": {"time": (at(time / 10) - delay * 1e9) / 1e9, **fields},
+        }
+        for time in range(count)
+    ]
+
+
+def recorded(*streams: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return sorted((line for stream in streams for line in stream), key=lambda line: int(line["t"]))
+
+
+def test_with_clock_data_a_stream_without_stamps_is_named(desk: Desk) -> None:
+    without = a_detector(a_stream("pose", stamp="msg.time"), a_stream("speed"), clock="Data")
+    desk.write(without, a_rule("fast", **FAST))
+    path = write_lines(desk.folder / "drive.jsonl", *recorded(stamped("pose", 0), stamped("speed", 0, v=1)))
+    ran = desk.replay(path)
+    assert "40 samples of stream speed carry no stamp, those of other streams do" in ran.said
+    assert "streams[speed].stamp" in ran.said
+    ran = desk.run("check", "--strict", "detector.yaml", "rules.yaml")
+    assert (ran.code, "spec.streams[1]: stream speed carries no stamp, and others do" in ran.said) == (1, True)
+    with_stamps = a_detector(a_stream("pose", stamp="msg.time"), a_stream("speed", stamp="msg.time"), clock="Data")
+    desk.write(with_stamps, a_rule("fast", **FAST))
+    assert "stamp" not in desk.replay(path).said
+    assert desk.run("check", "--strict", "detector.yaml", "rules.yaml").code == 0
+
+
+def test_with_clock_data_a_header_that_is_seconds_behind_is_named_with_its_stream(desk: Desk) -> None:
+    streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
+    desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
+    recording = recorded(stamped("pose", 0.1), stamped("speed", 5.2, v=1))
+    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recording))
+    assert "stamps of stream speed are 5.1 s further behind the receive times than those of stream pose" in ran.said
+    assert "streams[speed].stamp" in ran.said
+
+
+def test_the_stamps_of_a_simulation_may_all_be_years_behind(desk: Desk) -> None:
+    streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
+    desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
+    recording = recorded(stamped("pose", START / 1e9), stamped("speed", START / 1e9, v=1))
+    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recording))
+    assert "behind" not in ran.said
+
+
+def test_the_t_of_json_lines_can_be_the_stamp(desk: Desk) -> None:
+    streams = [a_stream("pose", stamp="msg.time"), a_stream("speed", stamp="sample.received")]
+    latency = {"name": "late", "stream": "speed", "value": "sample.latency"}
+    desk.write(a_detector(*streams, clock="Data"), a_rule("r", signals=[latency], when="late == 0"))
+    recording = recorded(stamped("pose", 0), [{**line, "t": line["t"] + 1} for line in stamped("speed", 0, v=1)])
+    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recording))
+    assert (ran.code, len(ran.events)) == (0, 1)
+    assert "stamp" not in ran.said

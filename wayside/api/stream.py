@@ -152,8 +152,9 @@ class Stream(Model):
     )
     stamp: Expression | None = Field(
         default=None,
-        description="CEL over msg: the sender's time in seconds. Default: header.stamp where the type has one, "
-        "the time of generation in an ETSI ITS message, else the receive time.",
+        description="CEL over msg: the sender's time in seconds since the epoch, e.g. msg.time_ms / 1000; or "
+        "sample.received, the receive time (t of JSON lines). Default: header.stamp where the type has one, the time "
+        "of generation in an ETSI ITS message, else none.",
     )
     stale_after: Duration | str | None = Field(
         default=None,

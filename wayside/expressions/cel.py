@@ -72,31 +72,11 @@ _NAMED_KINDS: Final = {
     "UINT": Kind.DOUBLE,
     "STRING": Kind.STRING,
 }
-RESERVED_WORDS: Final = frozenset(
-    [
-        "as",
-        "break",
-        "const",
-        "continue",
-        "else",
-        "false",
-        "for",
-        "function",
-        "if",
-        "import",
-        "in",
-        "let",
-        "loop",
-        "namespace",
-        "null",
-        "package",
-        "return",
-        "true",
-        "var",
-        "void",
-        "while",
-    ]
+_WORDS: Final = (
+    "as break const continue else false for function if import in let loop namespace null package return true var void"
+    " while"
 )
+RESERVED_WORDS: Final = frozenset(_WORDS.split())
 """Words that CEL's grammar keeps for itself: no variable can have one as its name."""
 
 

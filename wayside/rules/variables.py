@@ -32,8 +32,8 @@ def sample_environment(element: str | None = None) -> Environment:
 
 @cache
 def stamp_environment() -> Environment:
-    """For a stream's `stamp`: the decoded message alone."""
-    return Environment({"msg": Kind.DYN})
+    """For a stream's `stamp`: the decoded message, and when the sample was received."""
+    return Environment({"msg": Kind.DYN, "sample": Kind.MAP}, {"sample.received": Kind.DOUBLE})
 
 
 @cache
