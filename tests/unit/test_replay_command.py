@@ -12,8 +12,10 @@ import pytest
 import yaml
 
 from detector.cli import main
+from detector.replay.errors import RecordingError
+from detector.replay.gathering import recordings_of
 from tests.unit.driving import START, a_detector, a_rule, a_stream, at
-from tests.unit.test_recordings import write_lines
+from tests.unit.test_recordings import MESSAGES, write_bag, write_lines, write_mcap
 
 
 class Ran(NamedTuple):
@@ -202,3 +204,112 @@ def test_the_t_of_json_lines_can_be_the_stamp(desk: Desk) -> None:
     ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recording))
     assert (ran.code, len(ran.events)) == (0, 1)
     assert "stamp" not in ran.said
+
+
+def test_that_no_message_belongs_to_a_stream_is_an_error_with_both_keys(desk: Desk) -> None:
+    path = desk.drive("drive.jsonl", (0.5, {"v": 3}), key="veh/car/speed")
+    ran = desk.replay(path)
+    assert ran.code == 2
+    assert "the recordings hold the keys veh/car/speed, the streams ask for vehicles/${client:*}/speed" in ran.said
+    assert not (desk.folder / "out").exists()
+    other = desk.drive("other.jsonl", (0.5, {"v": 3}), (2.0, {"v": 3}))
+    ran = desk.replay(path, other)
+    assert ran.code == 0
+    assert "drive.jsonl: no message belongs to a stream of the Detector; keys: veh/car/speed" in ran.said
+
+
+LEFT_OPEN = [(0.5, {"v": 20}), (4.0, {"v": 20})]
+YEAR = 365 * 24 * 3600.0
+
+
+def test_several_recordings_are_independent_of_each_other(desk: Desk) -> None:
+    """An episode that is open at the end of the first does not go on in the second, a year later."""
+    desk.drive("a.jsonl", *LEFT_OPEN)
+    desk.drive("b.jsonl", *((YEAR + time, {"v": 4}) for time in (0.0, 2.0, 4.0)))
+    alone = desk.replay("a.jsonl").events + desk.replay("b.jsonl").events
+    assert [event["type"] for event in alone] == ["dev.wayside.event.started"]
+    assert desk.replay("a.jsonl", "b.jsonl").events == alone
+    assert desk.replay("b.jsonl", "a.jsonl").events == alone
+    as_one = desk.replay("a.jsonl", "b.jsonl", options=["--as-one"]).events
+    assert [event["type"] for event in as_one] == ["dev.wayside.event.started", "dev.wayside.event.ended"]
+
+
+def test_simulated_recordings_that_all_begin_at_the_same_time_do_not_mix(desk: Desk) -> None:
+    for run in range(3):
+        desk.drive(f"run_{run}.jsonl", (0.5, {"v": 20 if run == 1 else 1}), (4.0, {"v": 1}))
+    ran = desk.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl")
+    assert "3 recordings, 6 samples, 1 episodes started, 1 ended" in ran.said
+    mixed = desk.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl", options=["--as-one"])
+    assert "recordings" not in mixed.said
+
+
+def test_the_files_of_a_numbered_split_are_one_recording(desk: Desk) -> None:
+    desk.drive("drive_9.jsonl", *LEFT_OPEN)
+    desk.drive("drive_10.jsonl", (4.5, {"v": 20}), (5.0, {"v": 1}), (7.0, {"v": 1}))
+    for given in (["drive_9.jsonl", "drive_10.jsonl"], ["drive_*.jsonl"], ["."]):
+        ran = desk.replay(*given)
+        assert [event["type"].rpartition(".")[2] for event in ran.events] == ["started", "ended"], given
+        assert "recordings" not in ran.said
+    # Numbered alike, but an hour apart: two drives.
+    desk.drive("drive_10.jsonl", *((time + 3600, {"v": 1}) for time in (0.0, 3.0)))
+    ran = desk.replay("drive_*.jsonl")
+    assert [event["type"].rpartition(".")[2] for event in ran.events] == ["started"]
+    assert "2 recordings" in ran.said
+
+
+def test_the_files_of_one_rosbag2_folder_are_one_recording(tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    first, second, other = MESSAGES[:3], MESSAGES[3:], MESSAGES
+    for name, messages in (("drive_0.mcap", first), ("late.mcap", second), ("other.mcap", other)):
+        write_mcap(bag / name, messages)
+    told = {"rosbag2_bagfile_information": {"relative_file_paths": ["drive_0.mcap", "late.mcap"]}}
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(told))
+    files = [bag / "late.mcap", bag / "other.mcap", bag / "drive_0.mcap"]
+    assert recordings_of(files) == [(files[2], files[0]), (files[1],)]
+    assert recordings_of(files, as_one=True) == [tuple(files)]
+    assert recordings_of([bag]) == [(bag,)]
+
+
+def test_a_split_recording_with_dates_in_its_names_is_one(tmp_path: Path) -> None:
+    names = ["run_2026-05-04-10-20-30_0", "run_2026-05-04-10-25-30_1"]
+    names += ["cap_00001_20260504102030", "cap_00002_20260504103030"]
+    for number, name in enumerate(names):
+        write_mcap(tmp_path / f"{name}.mcap", [each._replace(time=each.time + 10**9 * number) for each in MESSAGES])
+    paths = [tmp_path / f"{name}.mcap" for name in names]
+    assert recordings_of(paths) == [tuple(paths[:2]), tuple(paths[2:])]
+
+
+def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
+    (tmp_path / "day" / ".hidden").mkdir(parents=True)
+    bag = write_bag(tmp_path / "day" / "bag", MESSAGES)
+    files = [write_mcap(tmp_path / "day" / name, MESSAGES) for name in ("b.mcap", "a2.mcap", "a10.mcap")]
+    write_mcap(tmp_path / "day" / ".hidden" / "c.mcap", MESSAGES)
+    (tmp_path / "day" / "notes.txt").write_text("a sunny day")
+    expected = [(files[1],), (files[2],), (files[0],), (bag,)]
+    assert recordings_of([tmp_path]) == expected
+    assert recordings_of([tmp_path / "day", files[0]]) == expected
+    assert recordings_of([tmp_path / "d*" / "a*.mcap"]) == expected[:2]
+    with pytest.raises(RecordingError, match="nothing matches: correct the pattern"):
+        recordings_of([tmp_path / "*.bag"])
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(RecordingError, match="the folder holds no recording"):
+        recordings_of([empty])
+
+
+def test_a_cut_recording_is_replayed_with_a_warning_and_a_count(desk: Desk) -> None:
+    path = desk.drive("drive.jsonl", (0.5, {"v": 20}), (4.0, {"v": 20}), (6.0, {"v": 1}))
+    path.write_bytes(path.read_bytes()[:-10])
+    ran = desk.replay(path)
+    assert (ran.code, len(ran.events)) == (0, 1)
+    assert "warning: " in ran.said
+    assert "drive.jsonl: the recording is cut (line 3 has no end): 2 messages are read up to there" in ran.said
+
+
+def test_rules_are_compared_over_all_recordings(desk: Desk) -> None:
+    desk.write(a_detector(a_stream("speed")), a_rule("fast", **FAST), a_rule("faster", **{**FAST, "when": "v > 15"}))
+    for name, speed in (("a.jsonl", 20), ("b.jsonl", 12)):
+        desk.drive(name, (0.5, {"v": speed}), (4.0, {"v": 1}), (6.0, {"v": 1}))
+    ran = desk.replay("a.jsonl", "b.jsonl", options=["--compare", "fast", "faster"])
+    assert "fast and faster: 1 episodes in both, 1 only in fast, 0 only in faster" in ran.said
