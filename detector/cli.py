@@ -15,7 +15,8 @@ import typer
 from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
-from detector import inquiry, recordings
+from detector import inquiry
+from detector import recordings as requested_recordings
 from detector.actions.deploy.file_store import write_tasks_yaml
 from detector.assembly import DetectorError
 from detector.catalog.command import command as catalog_command
@@ -34,15 +35,16 @@ from detector.replay.playing import name_of, play
 from detector.replay.progress import Progress
 from detector.replay.replaying import Outcome, replay_intake
 from detector.rules.files import load_rules
+from detector.rules.selection import select
 from detector.service import Files, Named, Options
 from detector.service import run as run_service
 from detector.streams.asking import NoAnswerError
 from detector.streams.zenoh import NetworkError
 from detector.tracing import episode_traces
 from wayside import commandline
-from wayside.api import ApplicationTask
+from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.applicationtask import Holder
-from wayside.api.documents import DocumentError, load_documents
+from wayside.api.documents import Document, DocumentError, load_documents
 from wayside.commandline import leave, refuse
 
 app = typer.Typer(
@@ -187,6 +189,7 @@ def replay(
 def _lines(outcome: Outcome) -> Iterator[str]:
     """What a person should know of a recording."""
     yield from outcome.notes
+    yield from (f"warning: {doubt}" for doubt in outcome.doubts)
     if outcome.cut:
         yield "the intake file ends in the middle: its detector was killed"
     if outcome.lost:
@@ -206,6 +209,13 @@ def _counted(outcomes: Sequence[Outcome]) -> str:
 @app.command()
 def check(
     files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--recording",
+            help="Also replay this recording, and warn where rules use old samples; may be repeated.",
+        ),
+    ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where there is a warning, too.")] = False,
 ) -> None:
     """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong.
@@ -222,13 +232,29 @@ def check(
         typer.echo(str(problem), err=True)
     for warning in warnings:
         typer.echo(warning.as_warning(), err=True)
-    if problems or (strict and warnings):
+    doubted = [] if problems or not recordings else _doubts(documents, recordings)
+    for doubt in doubted:
+        typer.echo(f"warning: {doubt}", err=True)
+    if problems or (strict and (warnings or doubted)):
         raise typer.Exit(1)
-    doubts = f", {len(warnings)} warning{'s' if len(warnings) > 1 else ''}" if warnings else ""
+    count = len(warnings) + len(doubted)
+    doubts = f", {count} warning{'s' if count > 1 else ''}" if count else ""
     typer.echo(f"{summary(documents)}: nothing wrong{doubts}", err=True)
 
 
-app.add_typer(recordings.app, name="recordings")
+def _doubts(documents: Sequence[Document], recordings: Sequence[Path]) -> list[str]:
+    """What the recordings show of the Detectors and their rules."""
+    gathered = recordings_of(recordings)
+    rules = [document.object for document in documents if isinstance(document.object, EventRule)]
+    found: list[str] = []
+    for detector in (document.object for document in documents if isinstance(document.object, Detector)):
+        selected = select(detector, rules).rules
+        for outcome in play(gathered, detector, selected, lambda: _plugins(Outages(lambda: ()))):
+            found += outcome.doubts
+    return list(dict.fromkeys(found))
+
+
+app.add_typer(requested_recordings.app, name="recordings")
 app.command("catalog")(catalog_command)
 
 for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume):

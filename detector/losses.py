@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass
 
+from detector.engine.ages import OLD
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
 from detector.engine.timing.data import DataTimeline
@@ -96,6 +97,29 @@ class Losses:
                     f"{rule.unknowns} unknown values in {rule.evaluations} evaluations of EventRule {name}"
                     + (f": {often}" if often else ", samples not being there or stale")
                 )
+
+    def doubts(self) -> Iterator[str]:
+        """Where rules used many old samples, or cannot use most; only of an engine whose counters watch ages."""
+        spec = self._engine.detector.spec
+        for name, rule in self._engine.counters.rules.items():
+            for stream_name, use in {} if rule.ages is None else rule.ages.uses.items():
+                stream, period = spec.stream(stream_name), use.period
+                limit = None if stream is None else spec.stale_after_ns(stream)
+                if limit is None or period is None:
+                    continue  # it never goes stale: what was said last holds
+                every = f"every {period / 1e9:.2g} s"
+                if period > limit:
+                    yield (
+                        f"samples of stream {stream_name} come {every} and go stale after {limit / 1e9:g} s: EventRule "
+                        f"{name} finds them unknown in between; raise streams[{stream_name}].staleAfter"
+                    )
+                elif use.old:
+                    old = f"{use.old} of {use.count} times one older than {OLD * period / 1e9:.2g} s"
+                    yield (
+                        f"EventRule {name} used samples of stream {stream_name}, which come {every}, {old}: what a "
+                        "client sent last counted on after it fell silent; lower "
+                        f"streams[{stream_name}].staleAfter, or maxAge of the position"
+                    )
 
     def _apart(self) -> Iterator[tuple[str, str]]:
         """With clock Data, streams whose stamps are not of one time with the others': a name for each line, and it."""

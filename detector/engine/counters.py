@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from detector.engine.ages import Ages
 from wayside.expressions import Reason
 
 _MAXIMUM_NOTES = 1000
@@ -47,6 +48,8 @@ class RuleCounters:
     unfollowed: int = 0
     """Parameters that should follow and kept their last value, being unknown or failing; each at each evaluation."""
     last_unfollowed: str = ""
+    ages: Ages | None = None
+    """How old the samples were that it used; None while nobody wants to know."""
     notes: list[str] | None = None
     """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
 
@@ -94,11 +97,13 @@ class Counters:
     crowded: Counter[str] = field(default_factory=Counter)
     """Samples dropped since too many clients were known already, by stream."""
     rules: dict[str, RuleCounters] = field(default_factory=dict)
+    watch_ages: bool = False
+    """Whether it is noted, of rules from now on, how old the samples are that they use."""
 
     def rule(self, name: str) -> RuleCounters:
         """The counters of a rule."""
         if name not in self.rules:
-            self.rules[name] = RuleCounters()
+            self.rules[name] = RuleCounters(ages=Ages() if self.watch_ages else None)
         return self.rules[name]
 
     def stamped(self, stream: str, received: int, stamp: int | None) -> None:

@@ -159,7 +159,7 @@ class Stream(Model):
     stale_after: Duration | str | None = Field(
         default=None,
         description="Signals of the stream are unknown when its newest sample is older than this. "
-        "Default: clientTimeout. Never: not at all, for latched topics.",
+        "Default: 5s, or clientTimeout if that is shorter. Never: not at all, for latched topics.",
         json_schema_extra={"type": "string", "pattern": f"^({PositiveDuration.pattern}|Never)$", "maxLength": 20},
     )
     buffer: StreamBuffer = Field(

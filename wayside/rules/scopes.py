@@ -100,8 +100,14 @@ def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> Pai
     b = None if pairs.b is None else compiler.condition((*at, "b", "where"), pairs.b.where, role)
     if not complete:
         return None
+    max_age = position.max_age_ns(never_stale=stream is not None and stream.never_stale)
     return PairSubject(
-        CompiledPosition(position.stream, axes, compiler.parameters), pairs.within, where, a, b, pairs.max_pairs
+        CompiledPosition(position.stream, axes, compiler.parameters, max_age),
+        pairs.within,
+        where,
+        a,
+        b,
+        pairs.max_pairs,
     )
 
 

@@ -60,6 +60,8 @@ class Positions:
         if sample is None or not is_fresh(client, position.stream, self._limit(position), self._buffer, now):
             counters.unknowns += self._possible(position.stream, client)
             return None
+        if counters.ages is not None and lane is not None:
+            counters.ages.used(lane, now)
         return self._place(position, client, sample, counters)
 
     def then(self, position: CompiledPosition, client: str, then: int, counters: RuleCounters) -> Place | None:
@@ -72,7 +74,8 @@ class Positions:
         return self._place(position, client, sample, counters)
 
     def _limit(self, position: CompiledPosition) -> int | None:
-        return self._stale_after[position.stream]
+        stale, oldest = self._stale_after[position.stream], position.max_age_ns
+        return oldest if stale is None or (oldest is not None and oldest < stale) else stale
 
     def _place(self, position: CompiledPosition, client: str, sample: Sample, counters: RuleCounters) -> Place | None:
         place = []

@@ -78,6 +78,8 @@ class Signals:
             if always_known:
                 return _ALWAYS_KNOWN[signal.aggregate]
             return self._no_value(counters) if self.possible(signal.stream, client) else UNKNOWN
+        if counters.ages is not None and signal.rule is None:
+            counters.ages.used(lane, now)
         aggregate = signal.aggregate
         window = self._window(
             rule,
