@@ -188,8 +188,8 @@ def replay(
 
 def _lines(outcome: Outcome) -> Iterator[str]:
     """What a person should know of a recording."""
-    yield from outcome.notes
     yield from (f"warning: {doubt}" for doubt in outcome.doubts)
+    yield from outcome.notes
     if outcome.cut:
         yield "the intake file ends in the middle: its detector was killed"
     if outcome.lost:

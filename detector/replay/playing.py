@@ -50,13 +50,13 @@ def play(
         arrivals = recorded_arrivals(recording, router, completed, cuts.append)
         with plugins() as host:
             outcome = replay_arrivals(watch(arrivals), completed, rules, host)
-        outcome.notes[:0] = [f"warning: {cut}" for cut in cuts]
+        outcome.doubts[:0] = map(str, cuts)
         if not outcome.samples:
             outcome.notes.append(f"no message belongs to a stream of the Detector; keys: {_listed(router.unrouted)}")
         keys.update(router.unrouted)
         outcomes.append(outcome)
     if not any(outcome.samples for outcome in outcomes):
-        cut = "".join(f"{note}; " for outcome in outcomes for note in outcome.notes if note.startswith("warning: "))
+        cut = "".join(f"{doubt}; " for outcome in outcomes for doubt in outcome.doubts)
         asked = _listed([stream.key for stream in detector.spec.streams])
         raise RecordingError(
             f"{cut}no message belongs to a stream of the Detector: the recordings hold the keys "
