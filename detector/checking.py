@@ -10,8 +10,10 @@ from detector.assembly import DetectorError, Inlets, inlets, offer_problems
 from detector.models.binding import bind_models
 from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
+from wayside.api.detector import Clock
 from wayside.api.documents import Document, Problem
-from wayside.rules import RuleError, RuleProblem, compile_rule, dependency_problems, unknown_rules
+from wayside.api.stream import Encoding, Stream
+from wayside.rules import Fields, RuleError, RuleProblem, compile_rule, dependency_problems, unknown_rules
 from wayside.rules.contradictions import contradictions
 
 _CHECKED = (Detector, EventRule)
@@ -38,7 +40,9 @@ def findings(documents: Sequence[Document]) -> Findings:
         if isinstance(document.object, Detector):
             try:
                 problems += [document.problem(each.path, each.message) for each in plugin_problems(document.object)]
-                detectors.append((document, document.object, inlets(document.object)))
+                entries = inlets(document.object)
+                detectors.append((document, document.object, entries))
+                warnings += _without_stamps(document, document.object, entries)
             except DetectorError as error:
                 problems += [document.problem(each.path, each.message) for each in error.problems]
     any_detector = any(isinstance(document.object, Detector) for document in documents)
@@ -59,6 +63,33 @@ def findings(documents: Sequence[Document]) -> Findings:
     for of_detector, detector, _ in detectors if rules else ():
         problems += [of_detector.problem(path, text) for path, text in unknown_rules(detector, names)]
     return Findings(list(dict.fromkeys(problems)), list(dict.fromkeys(warnings)))
+
+
+def _without_stamps(document: Document, detector: Detector, entries: Inlets) -> Iterator[Problem]:
+    """With clock Data, the streams that carry no stamps beside others that do."""
+    streams = [] if detector.spec.clock is Clock.WALL else list(enumerate(detector.spec.streams))
+    without = [
+        (index, stream)
+        for index, stream in streams
+        if not stream.latched and not _has_stamp(stream, entries.fields.get(stream.name))
+    ]
+    if len(without) < sum(not stream.latched for _, stream in streams):
+        for index, stream in without:
+            yield document.problem(
+                ("spec", "streams", index),
+                f"stream {stream.name} carries no stamp, and others do: with clock Data the receive time counts for "
+                "it; give its stamp, e.g. msg.time or sample.received, or write clock: Wall",
+            )
+
+
+def _has_stamp(stream: Stream, fields: Fields | None) -> bool:
+    """Whether its messages can tell the sender's time."""
+    if stream.stamp is not None or stream.encoding is Encoding.UPER:
+        return True
+    if stream.encoding is not Encoding.CDR:
+        return False
+    header = None if fields is None else fields.get("header")
+    return fields is None or (header is not None and "stamp" in header)
 
 
 def _objects(documents: Iterable[Document]) -> Iterator[EventRule]:

@@ -122,7 +122,11 @@ def _holder_in_pod(name: str) -> str:
 @app.command()
 def replay(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Intake files, MCAP files, rosbag2 folders, ROS 1 bags, JSON lines.")
+        list[Path],
+        typer.Argument(
+            help="Intake files, MCAP files, rosbag2 folders, ROS 1 bags, captures, JSON lines; folders and patterns "
+            "of these. Each recording is replayed on its own."
+        ),
     ],
     output: Annotated[Path, typer.Option(help="The folder for events.jsonl and tasks.yaml.")],
     detector: DetectorFile = None,
@@ -131,17 +135,27 @@ def replay(
         tuple[str, str] | None,
         typer.Option("--compare", help="Compare the episodes of two rules, and write comparison.json."),
     ] = None,
+    as_one: Annotated[
+        bool, typer.Option("--as-one", help="Play all recordings as one, merged by time: they are of one drive.")
+    ] = False,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with importing():
         from detector.commands.replay import replay_files
 
-    replay_files(recordings, output, detector, rules or (), compared)
+    replay_files(recordings, output, detector, rules or (), compared, as_one=as_one)
 
 
 @app.command()
 def check(
     files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--recording",
+            help="Also replay this recording, and warn where rules use old samples; may be repeated.",
+        ),
+    ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where there is a warning, too.")] = False,
 ) -> None:
     """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong.
@@ -162,9 +176,18 @@ def check(
         typer.echo(str(problem), err=True)
     for warning in warnings:
         typer.echo(warning.as_warning(), err=True)
-    if problems or (strict and warnings):
+    doubted: list[str] = []
+    if recordings and not problems:
+        with importing():
+            from detector.commands.replay import doubts_of
+
+        doubted = doubts_of(documents, recordings)
+    for doubt in doubted:
+        typer.echo(f"warning: {doubt}", err=True)
+    if problems or (strict and (warnings or doubted)):
         raise typer.Exit(1)
-    doubts = f", {len(warnings)} warning{'s' if len(warnings) > 1 else ''}" if warnings else ""
+    count = len(warnings) + len(doubted)
+    doubts = f", {count} warning{'s' if count > 1 else ''}" if count else ""
     typer.echo(f"{summary(documents)}: nothing wrong{doubts}", err=True)
 
 

@@ -33,6 +33,7 @@ from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from detector.streams.codecs.ros import RosTypes
 from wayside.api import EventRule
+from wayside.api.detector import DEFAULTS
 from wayside.api.stream import Stream
 
 _log = logging.getLogger(__name__)
@@ -126,6 +127,7 @@ class Evaluator:
             start,
             {
                 "kind": "start",
+                "version": DEFAULTS,
                 "holder": self._engine.identity.holder,
                 "detector": rule_set.detector.to_json(),
                 "rules": [rule.to_json() for rule in rule_set.rules],

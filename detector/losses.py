@@ -11,12 +11,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass
 
+from detector.engine.ages import OLD
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
 from detector.engine.timing.data import DataTimeline
 from detector.streams.tally import Tally
 
 _log = logging.getLogger(__name__)
+
+_APART = 1_000_000_000
+"""Nanoseconds: streams whose delays differ by more are not of one time."""
 
 _EVERY = 60.0
 """Seconds between two lines about the same kind of loss: bad input may come a thousand times a second."""
@@ -68,6 +72,10 @@ class Losses:
             if loss.count > said and now - since >= _EVERY:
                 self._said[loss.what] = loss.count, now
                 _log.warning("%s", _line(loss, loss.count - said))
+        for what, text in self._apart():
+            if what not in self._said:
+                self._said[what] = 1, now
+                _log.warning("%s", text)
 
     def sum_up(self) -> None:
         """Log how many samples came, all losses since the start, and how the evaluations went."""
@@ -81,6 +89,7 @@ class Losses:
         for loss in self.all():
             if loss.count:
                 yield _line(loss, loss.count)
+        yield from (text for _, text in self._apart())
         for name, rule in self._engine.counters.rules.items():
             if rule.unknowns:
                 often = "; ".join(f"{count} times {what}" for what, count in rule.absences.most_common(3))
@@ -88,6 +97,46 @@ class Losses:
                     f"{rule.unknowns} unknown values in {rule.evaluations} evaluations of EventRule {name}"
                     + (f": {often}" if often else ", samples not being there or stale")
                 )
+
+    def doubts(self) -> Iterator[str]:
+        """Where rules used many old samples, or cannot use most; only of an engine whose counters watch ages."""
+        spec = self._engine.detector.spec
+        for name, rule in self._engine.counters.rules.items():
+            for stream_name, use in {} if rule.ages is None else rule.ages.uses.items():
+                stream, period = spec.stream(stream_name), use.period
+                limit = None if stream is None else spec.stale_after_ns(stream)
+                if limit is None or period is None:
+                    continue  # it never goes stale: what was said last holds
+                every = f"every {period / 1e9:.2g} s"
+                if period > limit:
+                    yield (
+                        f"samples of stream {stream_name} come {every} and go stale after {limit / 1e9:g} s: EventRule "
+                        f"{name} finds them unknown in between; raise streams[{stream_name}].staleAfter"
+                    )
+                elif use.old:
+                    old = f"{use.old} of {use.count} times one older than {OLD * period / 1e9:.2g} s"
+                    yield (
+                        f"EventRule {name} used samples of stream {stream_name}, which come {every}, {old}: what a "
+                        "client sent last counted on after it fell silent; lower "
+                        f"streams[{stream_name}].staleAfter, or maxAge of the position"
+                    )
+
+    def _apart(self) -> Iterator[tuple[str, str]]:
+        """With clock Data, streams whose stamps are not of one time with the others': a name for each line, and it."""
+        counters = self._engine.counters
+        prompt = min(counters.delays, key=counters.delays.__getitem__, default="")
+        all_unstamped = counters.delays.keys() <= counters.unstamped.keys()
+        for name, delay in sorted(counters.delays.items()):
+            remedy = f"give streams[{name}].stamp, e.g. msg.time or sample.received, or write clock: Wall"
+            if (unstamped := counters.unstamped[name]) and not all_unstamped:
+                what = f"{unstamped} samples of stream {name} carry no stamp, those of other streams do"
+                yield f"unstamped {name}", f"{what}: with clock Data their receive time counts; {remedy}"
+            if (behind := delay - counters.delays[prompt]) > _APART:
+                what = (
+                    f"stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those of"
+                )
+                late = "with clock Data its samples are late for the others; set the sender's clock"
+                yield f"behind {name}", f"{what} stream {prompt}: {late}, {remedy}"
 
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, also those that did not happen."""
@@ -115,7 +164,7 @@ class Losses:
             yield Loss(unread, count, last, cause="undecodable", stream=name)
         for name, count in counters.unnamed.items():
             unnamed = f"samples of stream {name} dropped, naming no client by key or message"
-            yield Loss(unnamed, count, cause="unnamed", stream=name)
+            yield Loss(unnamed, count, counters.last_unnamed.get(name, ""), cause="unnamed", stream=name)
         for name, count in counters.crowded.items():
             crowded = f"samples of stream {name} dropped, too many clients being known"
             yield Loss(crowded, count, cause="crowded", stream=name)

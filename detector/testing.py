@@ -13,11 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from detector.engine.episodes.events import Event
+from detector.replay.gathering import recordings_of
 from detector.replay.intake_file import is_intake_file, read_intake
-from detector.replay.latched import recorded_arrivals
-from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
-from detector.replay.routing import Router
+from detector.replay.playing import play
+from detector.replay.replaying import replay_intake
 from detector.rules.files import load_rules
 
 __all__ = ["Event", "RefusedError", "run"]
@@ -30,13 +29,14 @@ class RefusedError(ValueError):
     """A rule that is not evaluated; the text says why, and where."""
 
 
-def run(rules: Paths, detector: str | Path, recording: Paths) -> list[Event]:
+def run(rules: Paths, detector: str | Path, recording: Paths, *, as_one: bool = False) -> list[Event]:
     """The events of these rules over a recording, in order.
 
     Args:
         rules: files or folders with EventRules.
         detector: the file with the Detector that evaluates them.
-        recording: whatever `detector replay` reads; several are merged by time.
+        recording: whatever `detector replay` reads. Several are replayed one after another, each on its own;
+            `as_one`: as one, merged by time.
 
     Raises:
         RefusedError: a rule has problems, or the Detector does not select it.
@@ -46,16 +46,15 @@ def run(rules: Paths, detector: str | Path, recording: Paths) -> list[Event]:
     if loaded.warnings:
         raise RefusedError("; ".join(loaded.warnings))
     recordings = _paths(recording)
-    outcome: Outcome
     if recordings[0].exists() and is_intake_file(recordings[0]):
-        outcome = replay_intake(read_intake(recordings[0]), loaded.rule_set.detector, loaded.rule_set.rules)
+        outcomes = [replay_intake(read_intake(recordings[0]), loaded.rule_set.detector, loaded.rule_set.rules)]
     else:
-        completed = with_recorded_types(loaded.rule_set.detector, recordings)
-        arrivals = recorded_arrivals(recordings, Router(completed.spec.streams), completed)
-        outcome = replay_arrivals(arrivals, completed, loaded.rule_set.rules)
-    if outcome.refusals:
-        raise RefusedError("; ".join(map(str, outcome.refusals)))
-    return outcome.events
+        gathered = recordings_of(recordings, as_one=as_one)
+        outcomes = play(gathered, loaded.rule_set.detector, loaded.rule_set.rules)
+    refusals = dict.fromkeys(str(refusal) for outcome in outcomes for refusal in outcome.refusals)
+    if refusals:
+        raise RefusedError("; ".join(refusals))
+    return [event for outcome in outcomes for event in outcome.events]
 
 
 def _paths(given: Paths) -> list[Path]:

@@ -147,8 +147,8 @@ def _become(arguments: list[str], files: tuple[Path, Path], environment: dict[st
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
-    for path in reversed([each for each in environment.get("PYTHONPATH", "").split(os.pathsep) if each]):
-        sys.path.insert(1, path)
+    given = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
+    sys.path[1:1] = given
     sys.path[0] = str(BIN)
     sys.argv = [str(BIN / arguments[0]), *arguments[1:]]
     for output in (sys.stdout, sys.stderr):

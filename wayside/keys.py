@@ -8,7 +8,7 @@ covers whole chunks, wildcards match no chunk that begins with `@`, and where tw
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -44,13 +44,15 @@ class KeyPattern:
     captures: tuple[str, ...]
     """The captured names, in order."""
     _regex: re.Pattern[str] = field(repr=False, compare=False)
+    _captured: Mapping[str, re.Pattern[str]] = field(repr=False, compare=False)
+    """By the captured name, what its text must match."""
 
     @classmethod
     def parse(cls, text: str) -> KeyPattern:
         """Reads the notation. Raises KeyPatternError."""
         elements: list[_Element] = []
         expression: list[str] = []
-        captures: list[str] = []
+        captures: dict[str, re.Pattern[str]] = {}
         for offset, part in _parts(text):
             if "${" not in part:
                 elements.append(_chunk(text, offset, part))
@@ -63,10 +65,15 @@ class KeyPattern:
             if name == "client" and (len(inner) > 1 or inner[0].many):
                 raise KeyPatternError(text, offset, "a client's name is one chunk: write ${client:*}")
             many = all(element.many for element in inner)
-            elements.append(_Element(f"(?P<{name}>{_CHUNKS if many else _joined(inner)})", many))
+            regex = _CHUNKS if many else _joined(inner)
+            elements.append(_Element(f"(?P<{name}>{regex})", many))
             expression.append(pattern)
-            captures.append(name)
-        return cls(text, "/".join(expression), tuple(captures), re.compile(_joined(elements)))
+            captures[name] = re.compile(regex)
+        return cls(text, "/".join(expression), tuple(captures), re.compile(_joined(elements)), captures)
+
+    def can_capture(self, name: str, text: str) -> bool:
+        """Whether some key gives this text to the capture of that name."""
+        return self._captured[name].fullmatch(text) is not None
 
     def match(self, key: str) -> dict[str, str] | None:
         """The captured texts by name if the key belongs to the stream, else None. A capture of no chunk is empty."""
@@ -94,7 +101,9 @@ def _parts(text: str) -> Iterator[tuple[int, str]]:
 
 def _nonempty(text: str, offset: int, part: str) -> str:
     if not part:
-        raise KeyPatternError(text, offset, "a chunk is empty: no slash at the start, at the end, or after another")
+        raise KeyPatternError(
+            text, offset, "a chunk is empty: remove the slash at the start or the end, or the second of two in a row"
+        )
     return part
 
 

@@ -1,9 +1,9 @@
-"""What `detector replay` runs: recordings in, events and tasks out."""
+"""What `detector replay` and `detector check --recording` run: recordings in, events, tasks and doubts out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 
 import typer
@@ -16,15 +16,16 @@ from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
+from detector.replay.gathering import recordings_of
 from detector.replay.intake_file import is_intake_file, read_intake, recorded_outages
-from detector.replay.latched import recorded_arrivals
+from detector.replay.playing import name_of, play
 from detector.replay.progress import Progress
-from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
-from detector.replay.routing import Router
+from detector.replay.replaying import Outcome, replay_intake
 from detector.rules.files import load_rules
+from detector.rules.selection import select
 from detector.tracing import episode_traces
-from wayside.api import ApplicationTask
+from wayside.api import ApplicationTask, Detector, EventRule
+from wayside.api.documents import Document
 from wayside.commandline import refuse
 
 
@@ -34,81 +35,115 @@ def replay_files(
     detector: Path | None,
     rules: Sequence[Path],
     compared: tuple[str, str] | None,
+    *,
+    as_one: bool,
 ) -> None:
     """Replay, write the results into the folder, and print a summary; exits with 1 where a rule is refused.
 
     Args:
-        recordings: at least one.
+        recordings: at least one file, folder or pattern.
         output: the folder for events.jsonl and tasks.yaml, made where it is missing.
         detector: a file with one Detector; None: the intake file brings its own.
         rules: files or folders with EventRules.
         compared: the names of two rules whose episodes are compared; None: nothing is compared.
+        as_one: merge all recordings by time; otherwise each is replayed on its own.
 
     Raises:
         DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text says why.
     """
-    plugins = ProcessHost(
-        Outages(lambda: recorded_outages(recordings[0]) if detector is None else ()),
-        wait=True,
-        patience=REPLAY_PATIENCE,
-    )
-    with Progress(Console(stderr=True)) as progress, closing(plugins):
-        outcome = _replayed(recordings, detector, rules, progress, plugins)
+    with Progress(Console(stderr=True)) as progress:
+        played = _replayed(recordings, detector, rules, as_one, progress)
+    outcomes = [outcome for _, outcome in played]
     output.mkdir(parents=True, exist_ok=True)
-    events, tasks = _traced(outcome)
+    traced = [_traced(outcome) for outcome in outcomes]
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
-        file.writelines(event.to_json() + "\n" for event in events)
-    write_tasks_yaml(output / "tasks.yaml", tasks)
+        file.writelines(event.to_json() + "\n" for events, _ in traced for event in events)
+    write_tasks_yaml(output / "tasks.yaml", [task for _, tasks in traced for task in tasks])
     if compared is not None:
-        write_comparison(outcome, compared, output)
-    for refusal in outcome.refusals:
-        typer.echo(str(refusal), err=True)
-    for note in outcome.notes:
-        typer.echo(note, err=True)
-    if outcome.cut:
-        typer.echo("the intake file ends in the middle: its detector was killed", err=True)
-    if outcome.lost:
-        typer.echo(
-            f"the intake file lacks {outcome.lost} samples, the disk being too slow: events may differ", err=True
-        )
-    started = sum(event.started for event in outcome.events)
-    typer.echo(
-        f"{outcome.samples} samples, {started} episodes started, {len(outcome.events) - started} ended, "
-        f"{len(outcome.tasks)} tasks: {output}",
-        err=True,
-    )
-    if outcome.refusals:
+        write_comparison(outcomes, compared, output)
+    refusals = dict.fromkeys(str(refusal) for outcome in outcomes for refusal in outcome.refusals)
+    for refusal in refusals:
+        typer.echo(refusal, err=True)
+    for name, outcome in played:
+        for line in _lines(outcome):
+            typer.echo(line if len(played) == 1 else f"{name}: {line}", err=True)
+    typer.echo(f"{_counted(outcomes)}: {output}", err=True)
+    if refusals:
         raise typer.Exit(1)
 
 
+def _lines(outcome: Outcome) -> Iterator[str]:
+    """What a person should know of a recording."""
+    yield from (f"warning: {doubt}" for doubt in outcome.doubts)
+    yield from outcome.notes
+    if outcome.cut:
+        yield "the intake file ends in the middle: its detector was killed"
+    if outcome.lost:
+        yield f"the intake file lacks {outcome.lost} samples, the disk being too slow: events may differ"
+
+
+def _counted(outcomes: Sequence[Outcome]) -> str:
+    events = [event for outcome in outcomes for event in outcome.events]
+    started = sum(event.started for event in events)
+    several = f"{len(outcomes)} recordings, " if len(outcomes) > 1 else ""
+    return (
+        f"{several}{sum(outcome.samples for outcome in outcomes)} samples, {started} episodes started, "
+        f"{len(events) - started} ended, {sum(len(outcome.tasks) for outcome in outcomes)} tasks"
+    )
+
+
+def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> list[str]:
+    """What the recordings show of the Detectors and their rules."""
+    gathered = recordings_of(recordings)
+    rules = [document.object for document in documents if isinstance(document.object, EventRule)]
+    found: list[str] = []
+    for detector in (document.object for document in documents if isinstance(document.object, Detector)):
+        selected = select(detector, rules).rules
+        for outcome in play(gathered, detector, selected, lambda: _plugins(Outages(lambda: ()))):
+            found += outcome.doubts
+    return list(dict.fromkeys(found))
+
+
+def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:
+    """Runs the plugins of one replay in processes of their own."""
+    return closing(ProcessHost(outages, wait=True, patience=REPLAY_PATIENCE))
+
+
 def _replayed(
-    recordings: Sequence[Path], detector: Path | None, rules: Sequence[Path], progress: Progress, plugins: PluginHost
-) -> Outcome:
+    recordings: Sequence[Path], detector: Path | None, rules: Sequence[Path], as_one: bool, progress: Progress
+) -> list[tuple[str, Outcome]]:
+    """What each recording came to, by its name."""
     if recordings[0].exists() and is_intake_file(recordings[0]):
         if len(recordings) > 1:
             refuse("an intake file is replayed alone: give one recording")
-        if detector is None and rules:
-            refuse("give --detector as well: rules are compiled against their Detector")
-        given = None if detector is None else load_rules(detector, rules).rule_set
-        return replay_intake(
-            progress.watch(read_intake(recordings[0])),
-            None if given is None else given.detector,
-            given.rules if given is not None and rules else None,
-            plugins,
-        )
+        return [(str(recordings[0]), _intake_replayed(recordings[0], detector, rules, progress))]
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
     loaded = load_rules(detector, rules)
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
-    completed = with_recorded_types(loaded.rule_set.detector, recordings)
-    router = Router(completed.spec.streams)
-    arrivals = recorded_arrivals(recordings, router, completed)
-    outcome = replay_arrivals(progress.watch(arrivals), completed, loaded.rule_set.rules, plugins)
-    if not outcome.samples:
-        keys = ", ".join(router.unrouted) or "none"
-        typer.echo(f"no message belongs to a stream of the Detector; keys in the recording: {keys}", err=True)
-    return outcome
+    gathered = recordings_of(recordings, as_one=as_one)
+    outcomes = play(
+        gathered,
+        loaded.rule_set.detector,
+        loaded.rule_set.rules,
+        lambda: _plugins(Outages(lambda: ())),
+        progress.watch,
+    )
+    return list(zip(map(name_of, gathered), outcomes, strict=True))
+
+
+def _intake_replayed(recording: Path, detector: Path | None, rules: Sequence[Path], progress: Progress) -> Outcome:
+    if detector is None and rules:
+        refuse("give --detector as well: rules are compiled against their Detector")
+    given = None if detector is None else load_rules(detector, rules).rule_set
+    with _plugins(Outages(lambda: recorded_outages(recording) if detector is None else ())) as plugins:
+        return replay_intake(
+            progress.watch(read_intake(recording)),
+            None if given is None else given.detector,
+            given.rules if given is not None and rules else None,
+            plugins,
+        )
 
 
 def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from detector.engine.ages import Ages
 from wayside.expressions import Reason
 
 _MAXIMUM_NOTES = 1000
@@ -47,16 +48,18 @@ class RuleCounters:
     unfollowed: int = 0
     """Parameters that should follow and kept their last value, being unknown or failing; each at each evaluation."""
     last_unfollowed: str = ""
+    ages: Ages | None = None
+    """How old the samples were that it used; None while nobody wants to know."""
     notes: list[str] | None = None
     """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
 
-    def note(self, reason: Reason, message: str) -> None:
-        """Count an expression's unknown result."""
+    def note(self, reason: Reason, message: str, place: str = "") -> None:
+        """Count an expression's unknown result; `place` says of an error which client and stream it is about."""
         if self.notes is not None and len(self.notes) < _MAXIMUM_NOTES:
             self.notes.append(message)
         if reason is Reason.ERROR:
             self.errors += 1
-            self.last_error = message
+            self.last_error = f"{place}: {message}" if place else message
         else:
             self.unknowns += 1
             if message in self.absences or len(self.absences) < _MAXIMUM_REASONS:
@@ -86,16 +89,31 @@ class Counters:
     unnamed: Counter[str] = field(default_factory=Counter)
     """Samples dropped since neither their key nor their message names a valid client, by stream."""
     last_unnamed: dict[str, str] = field(default_factory=dict)
-    """What the last message said instead, by stream."""
+    """The key of the last one, and what its message said instead of a name, by stream."""
+    unstamped: Counter[str] = field(default_factory=Counter)
+    """With clock Data, samples without a stamp, by stream: their receive time counts."""
+    delays: dict[str, int] = field(default_factory=dict)
+    """With clock Data, by stream: how far stamps were behind the receive times at least, in nanoseconds."""
     crowded: Counter[str] = field(default_factory=Counter)
     """Samples dropped since too many clients were known already, by stream."""
     rules: dict[str, RuleCounters] = field(default_factory=dict)
+    watch_ages: bool = False
+    """Whether it is noted, of rules from now on, how old the samples are that they use."""
 
     def rule(self, name: str) -> RuleCounters:
         """The counters of a rule."""
         if name not in self.rules:
-            self.rules[name] = RuleCounters()
+            self.rules[name] = RuleCounters(ages=Ages() if self.watch_ages else None)
         return self.rules[name]
+
+    def stamped(self, stream: str, received: int, stamp: int | None) -> None:
+        """Note how a sample's stamp compares with its receive time; nanoseconds, None: it carries none."""
+        if stamp is None:
+            self.unstamped[stream] += 1
+            stamp = received
+        delay = received - stamp
+        if delay < self.delays.get(stream, delay + 1):
+            self.delays[stream] = delay
 
     def unreadable(self, stream: str, key: str, error: Exception) -> None:
         """Count a payload that could not be read."""

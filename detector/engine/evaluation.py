@@ -18,11 +18,11 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.subjects import Subject, fits
 from detector.engine.scoping.plugins import PluginSignals
-from detector.engine.scoping.scopes import Candidate, Views, candidates
+from detector.engine.scoping.scopes import Candidate, Views, candidates, condition
 from detector.engine.scoping.snapshots import snapshot
 from detector.engine.timing.schedule import Only
 from wayside.api.base import JsonValue
-from wayside.expressions import UNKNOWN, Expression, Unknown
+from wayside.expressions import Expression, Unknown
 from wayside.rules import CompiledRule
 
 
@@ -57,6 +57,8 @@ class RuleRun:
 
     def __init__(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> None:
         self.rule = rule
+        self._read = {field: _read(rule, each) for field, each in (("when", rule.when), ("until", rule.until))}
+        """By condition, the signals and streams that it reads, for errors."""
         self.counters = counters
         self._identity = identity
         self._timing = _timing(rule)
@@ -222,8 +224,8 @@ class RuleRun:
         if state is None:
             state = self._states[candidate.subject] = SubjectState()
         variables = candidate.variables
-        when = self._truth(self.rule.when, variables)
-        until = negation(when) if self.rule.until is None else self._truth(self.rule.until, variables)
+        when = self._truth("when", self.rule.when, candidate)
+        until = negation(when) if self.rule.until is None else self._truth("until", self.rule.until, candidate)
         match state.step(now, self._timing, Observation(candidate.in_scope, candidate.near, when, until)):
             case Started(onset):
                 limit = self.rule.maximum_per_hour
@@ -258,9 +260,9 @@ class RuleRun:
             None if episode is None else episode.start,
         )
 
-    def _truth(self, expression: Expression, variables: Mapping[str, Any]) -> Truth:
-        value = expression.evaluate_or_unknown(variables, self.counters.note)
-        return value if isinstance(value, bool) else UNKNOWN
+    def _truth(self, field: str, expression: Expression, candidate: Candidate) -> Truth:
+        place = f"{field} of {candidate.subject.text}{self._read[field]}"
+        return condition(expression, candidate.variables, place, candidate.never, self.counters)
 
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
         subject = candidate.subject
@@ -283,6 +285,13 @@ class RuleRun:
 def same_semantics(run: RuleRun, rule: CompiledRule) -> bool:
     """Whether open episodes go on under the new rule."""
     return run.rule.digest == rule.digest and run.rule.enabled == rule.enabled
+
+
+def _read(rule: CompiledRule, expression: Expression | None) -> str:
+    """The signals that an expression reads, with their streams, for people."""
+    steps = frozenset(step for path in expression.paths for step in path) if expression is not None else frozenset()
+    found = [f"{each.name} of stream {each.stream}" for each in rule.signals if each.name in steps and not each.rule]
+    return f" ({', '.join(found)})" if found else ""
 
 
 def _timing(rule: CompiledRule) -> Timing:

@@ -13,6 +13,7 @@ from detector.engine.buffering.inflow import Inflow
 from detector.engine.buffering.lanes import lane_makers
 from detector.engine.buffering.messages import KeyReader, Messages
 from detector.engine.buffering.naming import MessageClients
+from detector.engine.buffering.possible import Possible
 from detector.engine.counters import Counters
 from detector.engine.evaluation import RuleRun
 from detector.engine.queries.queries import BufferQueries
@@ -96,8 +97,11 @@ class Knowledge:
         self.messages = Messages(decoders, compiled, read_key, self._counters)
         self.transforms = Transforms(_transform_streams(detector), self.buffer, self.messages, self._counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
-        self.signals = Signals(self.buffer, self.clients, self.messages, self._stale_after, self._starts, self._floor)
-        self._positions = Positions(self.buffer, self.messages, self._stale_after, self._floor)
+        possible = Possible(spec.streams)
+        self.signals = Signals(
+            self.buffer, self.clients, self.messages, self._stale_after, self._starts, possible, self._floor
+        )
+        self._positions = Positions(self.buffer, self.messages, self._stale_after, possible, self._floor)
 
     def age(self, time: int) -> list[str]:
         """Forget old samples and lost clients; returns who is lost."""

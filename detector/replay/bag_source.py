@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 from pydantic import BaseModel, Field
 
+from detector.replay.gathering import paths_of
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from detector.sources.base import Feed, Source
 from wayside.api.base import Model
+
+_log = logging.getLogger(__name__)
 
 _LONGEST_WAIT = 0.5
 """Seconds at most between two looks whether to stop."""
@@ -23,7 +27,8 @@ class BagParameters(Model):
     paths: list[Annotated[str, Field(min_length=1, max_length=1024)]] = Field(
         min_length=1,
         max_length=16,
-        description="The recordings: rosbag2 folders, ROS 1 bags, MCAP files, JSON lines. They are played as one.",
+        description="The recordings: rosbag2 folders, ROS 1 bags, MCAP files, JSON lines, or folders and patterns of "
+        "these. They are played as one.",
     )
     rate: float = Field(default=1.0, gt=0, le=1000, description="How many times as fast as recorded.")
     loop: bool = Field(default=False, description="Whether to begin anew at the end.")
@@ -44,7 +49,8 @@ class BagSource(Source[BagParameters]):
 
     def _play(self, feed: Feed) -> None:
         router = Router([stream.spec for stream in feed.streams])
-        recordings = open_recordings([Path(path) for path in self.parameters.paths], router.wanted)
+        paths = paths_of(Path(path) for path in self.parameters.paths)
+        recordings = open_recordings(paths, router.wanted, lambda cut: _log.warning("%s", cut))
         first: int | None = None
         began = time.monotonic()
         for arrival in router.arrivals(recordings):

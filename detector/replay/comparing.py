@@ -122,6 +122,17 @@ def compare(events: Iterable[Event], first: str, second: str, end: int) -> Compa
     return _matched(first, second, sorted(of_rule[first]), sorted(of_rule[second]))
 
 
+def joined(comparisons: Sequence[Comparison]) -> Comparison:
+    """Those of several recordings as one; there is at least one."""
+    return Comparison(
+        comparisons[0].first,
+        comparisons[0].second,
+        tuple(pair for each in comparisons for pair in each.both),
+        tuple(span for each in comparisons for span in each.only_first),
+        tuple(span for each in comparisons for span in each.only_second),
+    )
+
+
 def _matched(first: str, second: str, spans: Sequence[Span], others: Sequence[Span]) -> Comparison:
     left: dict[str, list[Span]] = {}
     for other in others:

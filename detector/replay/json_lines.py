@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from detector.replay.errors import RecordingError
-from detector.replay.message import Message, Wanted, key_of
+from detector.replay.message import Cut, Message, OnCut, Wanted, key_of
 
 EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x": 1.5}}'
 
@@ -22,12 +22,13 @@ class _Line(msgspec.Struct, forbid_unknown_fields=True):
 _read = msgspec.json.Decoder(_Line).decode
 
 
-def read_json_lines(path: Path, wanted: Wanted) -> Iterator[Message]:
+def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
     """The lines' messages; their values stay the text that they are. Empty lines are passed over.
 
-    Raises RecordingError, with file and line, for what is no such line and where `t` goes back.
+    A last line that was not written to its end is a cut. Raises RecordingError, with file and line, for what is no
+    such line and where `t` goes back.
     """
-    last = 0
+    last = messages = 0
     with path.open("rb") as file:
         for number, text in enumerate(file, start=1):
             if text.isspace():
@@ -35,6 +36,9 @@ def read_json_lines(path: Path, wanted: Wanted) -> Iterator[Message]:
             try:
                 line = _read(text)
             except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                if not text.endswith(b"\n"):
+                    on_cut(Cut(path, messages, f"line {number} has no end"))
+                    return
                 raise RecordingError(f"{path}:{number}: {error}: a line reads {EXAMPLE}") from error
             key = key_of(line.key)
             if line.t < last:
@@ -44,4 +48,5 @@ def read_json_lines(path: Path, wanted: Wanted) -> Iterator[Message]:
                 raise RecordingError(f"{path}:{number}: key is empty: a line reads {EXAMPLE}")
             last = line.t
             if wanted(key):
+                messages += 1
                 yield Message(line.t, key, bytes(line.value), "json", None)

@@ -14,19 +14,22 @@ from detector.assembly import inlets
 from detector.engine.buffering.lanes import latched_topics
 from detector.engine.buffering.latched import Topic
 from detector.engine.samples.sample import Arrival
+from detector.replay.message import OnCut, ignore
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from wayside.api import Detector
 
 
-def recorded_arrivals(recordings: Sequence[Path], router: Router, detector: Detector) -> Iterator[Arrival]:
+def recorded_arrivals(
+    recordings: Sequence[Path], router: Router, detector: Detector, on_cut: OnCut = ignore
+) -> Iterator[Arrival]:
     """What the recordings hold for the Detector's streams, that of latched ones first.
 
     Raises:
         DetectorError: the Detector cannot run.
         RecordingError: a recording is missing or damaged, or does not fit the streams.
     """
-    arrivals = router.arrivals(open_recordings(recordings, router.wanted))
+    arrivals = router.arrivals(open_recordings(recordings, router.wanted, on_cut))
     topics = latched_topics(detector, inlets(detector).decoders)
     if not topics:
         return arrivals

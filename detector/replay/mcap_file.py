@@ -3,75 +3,168 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
-from mcap.records import Channel
+from mcap.records import Channel, Schema
 from mcap.records import Message as McapMessage
 from mcap.summary import Summary
 
 from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Message, RecordedType, Wanted, key_of
+from detector.replay.mcap_cut import MAGIC, Contents, Place, contents_of, messages_at
+from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, in_order, key_of
+from detector.replay.protobuf import ENCODING as PROTOBUF
+from detector.replay.protobuf import Decoders
 
-MAGIC = b"\x89MCAP0\r\n"
+__all__ = ["MAGIC", "Left", "is_cut", "mcap_span", "mcap_types", "read_mcap"]
 
 _DAMAGE = (*DAMAGE, McapError, zstandard.ZstdError)
-
 
 Left = Callable[[Channel, McapMessage], bool]
 """Whether a message is to be passed over."""
 
 
-def read_mcap(path: Path, wanted: Wanted, left: Left = lambda channel, message: False) -> Iterator[Message]:
-    """The file's messages, in the order of their log times. Raises RecordingError if it is cut or damaged."""
+class _Index(NamedTuple):
+    """The reader of a file that has an index, and that."""
+
+    reader: SeekingReader
+    summary: Summary
+
+
+def read_mcap(
+    path: Path, wanted: Wanted, on_cut: OnCut, left: Left = lambda channel, message: False
+) -> Iterator[Message]:
+    """The file's messages, in the order of their log times. One that is cut is read up to there.
+
+    Raises RecordingError if it is damaged, or holds Protobuf messages that cannot be read.
+    """
+    protobuf = Decoders(path)
+
+    def made(schema: Schema | None, channel: Channel, message: McapMessage) -> Message:
+        return Message(
+            message.log_time,
+            key_of(channel.topic),
+            message.data,
+            channel.message_encoding,
+            _type(schema.name) if schema is not None and channel.message_encoding == "cdr" else None,
+            protobuf.decoder(schema, channel.topic) if channel.message_encoding == PROTOBUF else None,
+        )
+
     with path.open("rb") as file:
         try:
-            reader, summary = _opened(file)
-            topics = {channel.topic for channel in summary.channels.values() if wanted(key_of(channel.topic))}
+            index = _index(file)
+            if index is None:
+                yield from _without_index(path, file, wanted, on_cut, left, made)
+                return
+            topics = {channel.topic for channel in index.summary.channels.values() if wanted(key_of(channel.topic))}
             if not topics:
                 return
-            for schema, channel, message in reader.iter_messages(topics):
-                if left(channel, message):
-                    continue
-                yield Message(
-                    message.log_time,
-                    key_of(channel.topic),
-                    message.data,
-                    channel.message_encoding,
-                    _type(schema.name) if schema is not None and channel.message_encoding == "cdr" else None,
-                )
+            for schema, channel, message in index.reader.iter_messages(topics):
+                if not left(channel, message):
+                    yield made(schema, channel, message)
+        except RecordingError:
+            raise
         except _DAMAGE as error:
             raise _damaged(path, error) from error
 
 
+def _without_index(
+    path: Path,
+    file: BinaryIO,
+    wanted: Wanted,
+    on_cut: OnCut,
+    left: Left,
+    made: Callable[[Schema | None, Channel, McapMessage], Message],
+) -> Iterator[Message]:
+    contents = contents_of(file)
+
+    def messages(place: Place) -> Iterator[Message]:
+        try:
+            for message in messages_at(file, place, contents):
+                channel = contents.channels[message.channel_id]
+                if wanted(key_of(channel.topic)) and not left(channel, message):
+                    yield made(contents.schemas.get(channel.schema_id), channel, message)
+        except _DAMAGE:
+            if contents.cut is None or place is not contents.places[-1]:
+                raise  # else it is what the recorder wrote last
+
+    if contents.places != sorted(contents.places):
+        _define_all(file, contents)  # a channel's first chunk in the file is not the first in time
+    count = 0
+    for message in in_order(Piece(place[0], partial(messages, place)) for place in contents.places):
+        count += 1
+        yield message
+    if contents.cut is not None:
+        on_cut(Cut(path, count, contents.cut))
+
+
 def mcap_types(path: Path) -> list[RecordedType]:
-    """The ROS 2 message types that the file defines. Raises RecordingError if it is cut or damaged."""
+    """The ROS 2 message types that the file defines. Raises RecordingError if it is damaged."""
     with path.open("rb") as file:
         try:
-            _, summary = _opened(file)
+            index = _index(file)
+            schemas = _define_all(file, contents_of(file)) if index is None else index.summary.schemas
             return [
                 RecordedType(_type(schema.name), schema.data.decode(errors="replace"), schema.encoding == "ros2idl")
-                for schema in summary.schemas.values()
+                for schema in schemas.values()
                 if schema.encoding in ("ros2msg", "ros2idl")
             ]
         except _DAMAGE as error:
             raise _damaged(path, error) from error
 
 
-def _opened(file: BinaryIO) -> tuple[SeekingReader, Summary]:
+def mcap_span(path: Path) -> tuple[int, int] | None:
+    """The first and the last log time, as the file's index tells; None where it does not."""
+    with path.open("rb") as file:
+        index = _index(file)
+        statistics = None if index is None else index.summary.statistics
+        if statistics is None or not statistics.message_count:
+            return None
+        return statistics.message_start_time, statistics.message_end_time
+
+
+def is_cut(path: Path) -> bool:
+    """Whether the file's end is missing."""
+    with path.open("rb") as file:
+        file.seek(0, 2)
+        size = file.tell()
+        file.seek(max(0, size - len(MAGIC)))
+        return size < 2 * len(MAGIC) or file.read() != MAGIC
+
+
+def _define_all(file: BinaryIO, contents: Contents) -> dict[int, Schema]:
+    """Takes in the schemas and channels that stand in chunks as well; returns the schemas."""
+    for place in contents.places:
+        try:
+            for _ in messages_at(file, place, contents):
+                pass
+        except _DAMAGE:
+            if contents.cut is None or place is not contents.places[-1]:
+                raise
+    return contents.schemas
+
+
+def _index(file: BinaryIO) -> _Index | None:
+    """The file's index; None where it has none, having been cut or written without one."""
+    file.seek(0, 2)
+    size = file.tell()
+    file.seek(max(0, size - len(MAGIC)))
+    whole = size >= 2 * len(MAGIC) and file.read() == MAGIC
+    file.seek(0)
+    if not whole:
+        return None
     reader = SeekingReader(file, validate_crcs=True, record_size_limit=1 << 30)
     summary = reader.get_summary()
-    if summary is None:
-        raise McapError("it has no summary")
-    return reader, summary
+    return None if summary is None else _Index(reader, summary)
 
 
 def _damaged(path: Path, error: Exception) -> RecordingError:
     reason = str(error) or type(error).__name__
-    return RecordingError(f"{path}: the MCAP file is cut or damaged ({reason}): repair it with `mcap recover {path}`")
+    return RecordingError(f"{path}: the MCAP file is damaged ({reason}): repair it with `mcap recover {path}`")
 
 
 def _type(schema: str) -> str:

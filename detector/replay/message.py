@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import heapq
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from operator import itemgetter
+from pathlib import Path
 from typing import NamedTuple
 
 Wanted = Callable[[str], bool]
@@ -22,6 +26,8 @@ class Message(NamedTuple):
     """As MCAP names it: cdr, json, ros1 and others."""
     type: str | None
     """The message type, e.g. geometry_msgs/msg/PoseStamped, where the recording tells it."""
+    decode: Callable[[bytes], object] | None = None
+    """Makes plain values of the payload, where the recording alone says how: Protobuf."""
 
 
 class RecordedType(NamedTuple):
@@ -32,6 +38,49 @@ class RecordedType(NamedTuple):
     """Its definition with all that it refers to; empty where the recording has none."""
     idl: bool
     """Whether the text is IDL; else it is as in a .msg file."""
+
+
+class Cut(NamedTuple):
+    """A recording whose end is missing, since its recorder was killed or the file was not copied whole."""
+
+    path: Path
+    messages: int
+    """How many of the wanted messages were read up to there."""
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.path}: the recording is cut ({self.reason}): {self.messages} messages are read up to there"
+
+
+OnCut = Callable[[Cut], None]
+"""Told when the reading of a recording ends at a cut."""
+
+
+def ignore(cut: Cut) -> None:
+    """For those who read a recording a second time."""
+
+
+class Piece(NamedTuple):
+    """Messages that lie together in a file, none of them earlier than `start` (nanoseconds)."""
+
+    start: int
+    read: Callable[[], Iterable[Message]]
+
+
+def in_order(pieces: Iterable[Piece]) -> Iterator[Message]:
+    """The messages of all pieces in the order of their times, those of equal times as they lie in the file.
+
+    A piece is read when its start is reached, so no more of them are in memory than overlap.
+    """
+    waiting: list[tuple[int, int, Message]] = []
+    numbers = itertools.count()
+    for piece in sorted(pieces, key=itemgetter(0)):
+        while waiting and waiting[0][0] < piece.start:
+            yield heapq.heappop(waiting)[2]
+        for message in piece.read():
+            heapq.heappush(waiting, (message.time, next(numbers), message))
+    while waiting:
+        yield heapq.heappop(waiting)[2]
 
 
 def key_of(topic: str) -> str:

@@ -16,7 +16,7 @@ from mcap.records import Message as McapMessage
 from detector.actions.record.description import DESCRIPTION, FORMAT
 from detector.replay.errors import RecordingError
 from detector.replay.mcap_file import mcap_types, read_mcap
-from detector.replay.message import Message, RecordedType, Wanted
+from detector.replay.message import Message, OnCut, RecordedType, Wanted
 
 
 def is_own_recording(path: Path) -> bool:
@@ -28,7 +28,7 @@ def is_own_recording(path: Path) -> bool:
     return isinstance(told, dict) and told.get("format") == FORMAT
 
 
-def read_own_recording(path: Path, wanted: Wanted) -> Iterator[Message]:
+def read_own_recording(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
     """The messages, file by file, in the order of their times. Raises RecordingError where a file is not as it was."""
     taken: set[tuple[str, str, int]] = set()
 
@@ -42,7 +42,7 @@ def read_own_recording(path: Path, wanted: Wanted) -> Iterator[Message]:
         return False
 
     for file in _files(path):
-        yield from read_mcap(file, wanted, repeated)
+        yield from read_mcap(file, wanted, on_cut, repeated)
 
 
 def own_recording_types(path: Path) -> list[RecordedType]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from detector.engine.samples.sample import DecodeError
 from detector.replay.errors import RecordingError
-from detector.replay.message import Message, Wanted
+from detector.replay.message import Cut, Message, OnCut, Wanted
 from detector.streams.codecs.etsi.messages import BY_NUMBER, PREFIX
 from detector.streams.codecs.etsi.packets import ETHERTYPE, message_in
 
@@ -42,15 +42,22 @@ class _Frame(NamedTuple):
     data: bytes
 
 
-def read_pcap(path: Path, wanted: Wanted) -> Iterator[Message]:
-    """The file's ITS packets in the order of their times. Raises RecordingError if it is cut or damaged."""
+class _CutError(ValueError):
+    """The file ends inside a packet or block."""
+
+
+def read_pcap(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+    """The file's ITS packets in the order of their times. Raises RecordingError if it is damaged."""
     messages = []
-    for time, link, data in _frames(path):
-        packet = _geonetworking(link, data)
-        if packet is not None:
-            key = _key(packet)
-            if wanted(key):
-                messages.append(Message(time, key, packet, "uper", None))
+    try:
+        for time, link, data in _frames(path):
+            packet = _geonetworking(link, data)
+            if packet is not None:
+                key = _key(packet)
+                if wanted(key):
+                    messages.append(Message(time, key, packet, "uper", None))
+    except _CutError as error:
+        on_cut(Cut(path, len(messages), str(error)))
     # Captures of several interfaces go back in time by a little; they are small enough to be put in order as a whole.
     yield from sorted(messages, key=attrgetter("time"))
 
@@ -97,8 +104,14 @@ def _frames(path: Path) -> Iterator[_Frame]:
     data = path.read_bytes()
     try:
         yield from _pcapng(data) if data.startswith(_PCAPNG) else _pcap(data)
-    except (struct.error, ValueError) as error:
-        raise RecordingError(f"{path}: the capture is cut or damaged: {error}") from error
+    except _CutError:
+        raise
+    except struct.error as error:  # something is read beyond the end
+        raise _CutError("the file ends inside a header") from error
+    except ValueError as error:
+        raise RecordingError(
+            f"{path}: the capture is damaged: {error}; what is whole of it, `editcap` or Wireshark can save"
+        ) from error
 
 
 def _pcap(data: bytes) -> Iterator[_Frame]:
@@ -112,7 +125,7 @@ def _pcap(data: bytes) -> Iterator[_Frame]:
         seconds, fraction, length, _ = record.unpack_from(data, position)
         position += record.size
         if position + length > len(data):
-            raise ValueError(f"a packet of {length} bytes reaches beyond the end")
+            raise _CutError(f"a packet of {length} bytes reaches beyond the end")
         yield _Frame(seconds * _SECOND + fraction * step, link, data[position : position + length])
         position += length
 
@@ -126,8 +139,10 @@ def _pcapng(data: bytes) -> Iterator[_Frame]:
             order = "<" if data[position + 8 : position + 12] == b"\x4d\x3c\x2b\x1a" else ">"
             interfaces = []
         (length,) = struct.unpack_from(order + "I", data, position + 4)
-        if length < 12 or length % 4 or length > _LARGEST or position + length > len(data):
+        if length < 12 or length % 4 or length > _LARGEST:
             raise ValueError(f"a block of {length} bytes at byte {position}")
+        if position + length > len(data):
+            raise _CutError(f"a block of {length} bytes at byte {position} reaches beyond the end")
         body = data[position + 8 : position + length - 4]
         if kind == _INTERFACE:
             interfaces.append(_interface(body, order))

@@ -24,7 +24,9 @@ from detector.engine.scoping.plugins import PluginHost
 from detector.losses import Losses
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control
+from detector.replay.intake_versions import detector_as_of, rule_as_of
 from wayside.api import ApplicationTask, Detector, EventRule
+from wayside.api.detector import DEFAULTS
 from wayside.times import format_time
 
 _BATCH = 4096
@@ -43,6 +45,8 @@ class Outcome:
     samples: int = 0
     notes: list[str] = field(default_factory=list)
     """What a person should know: pauses, losses, and what was unknown or failed."""
+    doubts: list[str] = field(default_factory=list)
+    """A recording that is cut, rules that used many old samples, streams that go stale between their samples."""
     cut: bool = False
     """The intake file ends in the middle: its writer was killed."""
     end: int = 0
@@ -65,19 +69,24 @@ class Replay:
         start: int,
         outcome: Outcome,
         plugins: PluginHost | None = None,
+        version: int = DEFAULTS,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
+
+        `version` is that of the intake file that the rules stand in.
 
         Raises:
             DetectorError: the Detector cannot run.
         """
         self.outcome = outcome
+        self._version = version
         self._entries: Inlets = inlets(detector)
         self._detector = detector
         self._rule_book = RuleBook()
         self._engine: Engine = make_engine(detector, self._entries, holder=holder, start=start, plugins=plugins)
+        self._engine.counters.watch_ages = True
         self._demands: dict[str, Demand] = {}
-        self._version: tuple[int, int] | None = None
+        self._demands_version: tuple[int, int] | None = None
         self.set_rules(rules)
 
     def take(self, arrivals: Sequence[Arrival], until: int) -> None:
@@ -85,6 +94,11 @@ class Replay:
         self.outcome.samples += len(arrivals)
         for part, time in self._tick_by_tick(arrivals, until):
             self._note(self._engine.advance(part, time))
+
+    @property
+    def version(self) -> int:
+        """That of the intake file."""
+        return self._version
 
     @property
     def engine(self) -> Engine:
@@ -111,7 +125,7 @@ class Replay:
         compiled, refused = self._rule_book.compile(rules, self._detector, self._entries.fields)
         self.outcome.refusals += refused
         self.outcome.rules = tuple(sorted({*self.outcome.rules, *(rule.name for rule in rules)}))
-        self._note(self._engine.set_rules(compiled))
+        self._note(self._engine.set_rules([rule_as_of(rule, self._version) for rule in compiled]))
 
     def restore(self, demands: Sequence[Demand], time: int, episodes: Sequence[OpenEpisode] = ()) -> None:
         """Take up the episodes that were open before the recording."""
@@ -122,7 +136,9 @@ class Replay:
 
     def report(self) -> Iterator[str]:
         """What was lost, and how the evaluations went, a line each."""
-        return Losses(self._engine).report()
+        losses = Losses(self._engine)
+        self.outcome.doubts += losses.doubts()
+        return losses.report()
 
     def _tick_by_tick(self, arrivals: Sequence[Arrival], until: int) -> Iterator[tuple[Sequence[Arrival], int]]:
         """In steps so small that no episode starts and ends in one: its tasks would not be seen."""
@@ -147,9 +163,9 @@ class Replay:
     def _note(self, events: list[Event]) -> None:
         self.outcome.events += events
         self.outcome.end = max(self.outcome.end, self._engine.now)
-        if self._engine.demands_version == self._version:
+        if self._engine.demands_version == self._demands_version:
             return
-        self._version = self._engine.demands_version
+        self._demands_version = self._engine.demands_version
         demands = self._engine.demands()
         ends = {event.episode: event.end_time for event in events if event.end_time is not None}
         for name in self._demands.keys() - demands.keys():
@@ -216,13 +232,15 @@ def _begin(
     document = record.document
     if record.kind != "start":
         raise RecordingError(f"the intake file begins with {record.kind!r}, not with a start: record again")
+    version = int(document.get("version", 1))
     return Replay(
-        detector or Detector.model_validate(document["detector"]),
+        detector or Detector.model_validate(detector_as_of(document["detector"], version)),
         _rules(document) if rules is None else rules,
         holder=document["holder"],
         start=record.time,
         outcome=outcome,
         plugins=plugins,
+        version=version if rules is None else DEFAULTS,
     )
 
 
@@ -237,7 +255,7 @@ def _control(
             replay.restore(demands, record.time, [from_document(each) for each in document.get("episodes", ())])
         case "rules":
             if detector is None and "detector" in document:
-                replay.set_detector(Detector.model_validate(document["detector"]))
+                replay.set_detector(Detector.model_validate(detector_as_of(document["detector"], replay.version)))
             if rules is None:
                 replay.set_rules(_rules(document))
         case "gap":

@@ -6,7 +6,8 @@ must hold the same fields in the same order as its ROS 2 namesake, or have none.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from rosbags.interfaces import Connection
@@ -17,7 +18,8 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Message, RecordedType, Wanted, key_of
+from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, in_order, key_of
+from detector.replay.rosbag1_cut import Chunk, Contents, contents_of, messages_of
 
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 
@@ -25,39 +27,98 @@ _HEADER = "std_msgs/msg/Header"
 _BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", _HEADER)
 
 
-def read_rosbag1(path: Path, wanted: Wanted) -> Iterator[Message]:
-    """The bag's messages as CDR, in the order of their times.
+def read_rosbag1(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+    """The bag's messages as CDR, in the order of their times. One that was not closed is read as far as it goes.
 
     Raises RecordingError if it is damaged, or holds a type that ROS 2 defines otherwise.
     """
     try:
+        cut = _contents(path)
+        if cut is not None:
+            yield from _read_cut(path, cut, wanted, on_cut)
+            return
         with Reader(path) as reader:
             connections = [connection for connection in reader.connections if wanted(key_of(connection.topic))]
             if not connections:  # rosbags would read none as all
                 return
-            types = _types(connections)
-            _compare(path, types, connections)
+            convert = _converter(path, connections)
             for connection, time, payload in reader.messages(connections):
-                try:
-                    cdr = bytes(types.ros1_to_cdr(payload, connection.msgtype))
-                except (*DAMAGE, SerdeError) as error:
-                    raise RecordingError(
-                        f"{path}: a message on {connection.topic} is no {connection.msgtype} as the bag defines it: "
-                        f"{error}"
-                    ) from error
-                yield Message(time, key_of(connection.topic), cdr, "cdr", connection.msgtype)
+                yield convert(connection, time, payload)
+    except RecordingError:
+        raise
     except (*DAMAGE, ReaderError, TypesysError) as error:
         raise _damaged(path, error) from error
+
+
+def _read_cut(path: Path, contents: Contents, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+    connections = {
+        number: connection for number, connection in contents.connections.items() if wanted(key_of(connection.topic))
+    }
+    convert = _converter(path, list(connections.values())) if connections else None
+
+    def messages(chunk: Chunk) -> Iterator[Message]:
+        for time, connection, payload in messages_of(path, chunk, contents):
+            if convert is not None and connection in connections:
+                yield convert(connections[connection], time, payload)
+
+    count = 0
+    for message in in_order(Piece(chunk.start, partial(messages, chunk)) for chunk in contents.chunks):
+        count += 1
+        yield message
+    on_cut(Cut(path, count, contents.cut or "it has no index"))
+
+
+def _contents(path: Path) -> Contents | None:
+    """What a bag that has no index holds; None where it has one."""
+    try:
+        with Reader(path):
+            return None
+    except (*DAMAGE, ReaderError, TypesysError):
+        return contents_of(path, ROSBAG1_MAGIC)
+
+
+def _converter(path: Path, connections: Sequence[Connection]) -> Callable[[Connection, int, bytes], Message]:
+    """Turns the messages of these connections into CDR. Raises RecordingError, TypesysError."""
+    types = _types(connections)
+    _compare(path, types, connections)
+
+    def convert(connection: Connection, time: int, payload: bytes) -> Message:
+        try:
+            cdr = bytes(types.ros1_to_cdr(payload, connection.msgtype))
+        except (*DAMAGE, SerdeError) as error:
+            raise RecordingError(
+                f"{path}: a message on {connection.topic} is no {connection.msgtype} as the bag defines it: {error}: "
+                f"repair the bag with `rosbag fix {path}`, or take the topic out of the Detector's streams"
+            ) from error
+        return Message(time, key_of(connection.topic), cdr, "cdr", connection.msgtype)
+
+    return convert
+
+
+def rosbag1_span(path: Path) -> tuple[int, int] | None:
+    """The times of the first and the last message, as the bag's index tells; None where it has none."""
+    try:
+        with Reader(path) as reader:
+            return (reader.start_time, reader.end_time) if reader.message_count else None
+    except (*DAMAGE, ReaderError):
+        return None
 
 
 def rosbag1_types(path: Path) -> list[RecordedType]:
     """The message types that the bag defines, as ROS 2 would. Raises RecordingError if it is damaged."""
     try:
+        cut = _contents(path)
+        if cut is not None:
+            return _recorded_types(cut.connections.values())
         with Reader(path) as reader:
-            by_name = {connection.msgtype: connection for connection in reader.connections}
-            return [RecordedType(name, _as_ros2(by_name[name]), idl=False) for name in sorted(by_name)]
-    except (*DAMAGE, ReaderError) as error:
+            return _recorded_types(reader.connections)
+    except (*DAMAGE, ReaderError, TypesysError) as error:
         raise _damaged(path, error) from error
+
+
+def _recorded_types(connections: Iterable[Connection]) -> list[RecordedType]:
+    by_name = {connection.msgtype: connection for connection in connections}
+    return [RecordedType(name, _as_ros2(by_name[name]), idl=False) for name in sorted(by_name)]
 
 
 def _as_ros2(connection: Connection) -> str:

@@ -2,22 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+import cbor2
+import msgspec
+
+from detector.assembly import DetectorError
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.message import Message
 from wayside.api.stream import Encoding, Stream
 from wayside.keys import KeyPattern
+from wayside.rules import stream_problems
 
 _SHOWN = 20
+
+_WRITERS: Mapping[Encoding, Callable[[object], bytes]] = {
+    Encoding.JSON: msgspec.json.encode,  # bytes become base64, NaN and infinities null
+    Encoding.CBOR: cbor2.dumps,
+}
+"""How a message that the recording alone can decode is handed to a stream."""
+
+
+def _written(message: Message, stream: Stream) -> bytes:
+    """The payload as the stream's encoding has it; as it is where it cannot be read, for the stream to count it."""
+    write = _WRITERS.get(stream.encoding)
+    if write is None or message.decode is None:
+        return message.payload
+    try:
+        return write(message.decode(message.payload))
+    except ValueError:
+        return message.payload
 
 
 class Router:
     """Sends recorded messages into the Detector's streams."""
 
     def __init__(self, streams: Sequence[Stream]) -> None:
-        """Raises KeyPatternError."""
+        """Raises DetectorError where a stream's key or an expression of its own is wrong."""
+        problems = [problem for index, stream in enumerate(streams) for problem in stream_problems(stream, index)]
+        if problems:
+            raise DetectorError(problems)
         self._streams = [(stream, KeyPattern.parse(stream.key)) for stream in streams]
         self._routes: dict[str, tuple[Stream, ...]] = {}
         self._fits: set[tuple[str, str, str | None]] = set()
@@ -46,7 +71,8 @@ class Router:
             for stream in self._route(message.key):
                 self._check(message, stream)
                 last = max(last + 1, message.time)
-                yield Arrival(last, stream.name, message.key, message.payload)
+                payload = message.payload if message.decode is None else _written(message, stream)
+                yield Arrival(last, stream.name, message.key, payload)
 
     def _route(self, key: str) -> tuple[Stream, ...]:
         streams = self._routes.get(key)
@@ -60,7 +86,13 @@ class Router:
         recorded = (stream.name, message.encoding, message.type)
         if recorded in self._fits:
             return
-        if stream.encoding is not Encoding.RAW and message.encoding != stream.encoding.value:
+        if message.decode is not None and stream.encoding not in (*_WRITERS, Encoding.RAW):
+            raise RecordingError(
+                f"{message.key} is recorded as {message.encoding}, which replay turns into json, or cbor, but "
+                f"streams[{stream.name}].encoding is {stream.encoding.value}: write json, cbor or raw"
+            )
+        as_recorded = message.decode is None and stream.encoding is not Encoding.RAW
+        if as_recorded and message.encoding != stream.encoding.value:
             raise RecordingError(
                 f"{message.key} is recorded as {message.encoding}, but streams[{stream.name}].encoding is "
                 f"{stream.encoding.value}: correct it, or the stream's key"

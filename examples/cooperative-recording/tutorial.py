@@ -325,7 +325,7 @@ def _make_patient(spec: Object) -> None:
     """However slow the machine is: no vehicle is lost because its data come late."""
     spec["clientTimeout"] = "10m"
     for stream in spec["streams"]:
-        stream["staleAfter"] = "10m"
+        stream["staleAfter"] = "Never"
 
 
 def _of_namespace(api: Api, folder: Path) -> Path:

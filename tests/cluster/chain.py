@@ -233,7 +233,12 @@ def cdr_stream() -> Object:
 def rule(name: str = "close", *, position: str = "msg", **spec: Any) -> Object:
     deploy = {"template": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}}
     full = {
-        "scope": {"pairs": {"position": {"stream": "pose", "x": f"{position}.x", "y": f"{position}.y"}, "within": 400}},
+        "scope": {
+            "pairs": {
+                "position": {"stream": "pose", "x": f"{position}.x", "y": f"{position}.y", "maxAge": "2s"},
+                "within": 400,
+            }
+        },
         "evaluation": {"every": "200ms"},
         "when": "distance < 150",
         "until": "distance > 200",

@@ -9,7 +9,7 @@ from itertools import permutations
 from typing import Any
 
 from tests.reference.episodes import Truth
-from tests.reference.signals import truth
+from tests.reference.signals import nanoseconds, truth
 from tests.reference.world import SECOND, World
 
 MEMBER = ("client", "labels", "streams")
@@ -136,8 +136,9 @@ def _place(position: dict[str, str], client: str, world: World, then: int, now: 
     mine = [each for each in world.kept(client, position["stream"], now) if each.time <= then]
     if then < now:
         mine = [each for each in mine if world.floor is None or each.time > world.floor]
-    limit = world.stale_after[position["stream"]]
-    if not mine or (limit is not None and then - mine[-1].time > limit):
+    stale = world.stale_after[position["stream"]]
+    oldest = nanoseconds(position["maxAge"]) if "maxAge" in position else None if stale is None else SECOND
+    if not mine or any(limit is not None and then - mine[-1].time > limit for limit in (stale, oldest)):
         return None
     axes = [mine[-1].message.get(position[axis].removeprefix("msg.")) for axis in ("x", "y")]
     if not all(isinstance(axis, float) and abs(axis) <= 1e12 for axis in axes):

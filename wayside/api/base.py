@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.alias_generators import to_camel
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
@@ -125,6 +125,9 @@ TemplateName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[a-z
 
 ClientName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9._:-]+$")]
 """The name of a vehicle or station."""
+
+Key = Annotated[str, Field(min_length=1, max_length=512), AfterValidator(lambda key: key.removeprefix("/"))]
+"""A Zenoh key expression. The leading slash of a ROS topic is taken off."""
 
 Identifier = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """A name that expressions can use as a variable."""

@@ -31,6 +31,12 @@ from wayside.api.stream import (
 )
 from wayside.api.zenoh import Zenoh
 
+DEFAULTS = 2
+"""The version of the kinds' defaults. A recording of the intake names it, and replays with the defaults of its time."""
+
+STALE_AFTER = PositiveDuration("5s")
+"""The default of a stream's `staleAfter`: what is sent once a second, as the slowest CAMs are, may fail a few times."""
+
 
 class Client(Model):
     """What is known of a client beforehand."""
@@ -274,7 +280,9 @@ class DetectorSpec(Model):
         """When a stream's newest sample is too old to be believed, in nanoseconds; None: never."""
         if stream.never_stale:
             return None
-        return self.client_timeout.ns if stream.stale_after_ns is None else stream.stale_after_ns
+        if stream.stale_after_ns is not None:
+            return stream.stale_after_ns
+        return min(STALE_AFTER.ns, self.client_timeout.ns)
 
 
 class DetectorStatus(Model):

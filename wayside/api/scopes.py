@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field, model_validator
 
-from wayside.api.base import ClientName, Expression, Identifier, Model, ObjectName, validations
+from wayside.api.base import ClientName, Expression, Identifier, Model, ObjectName, PositiveDuration, validations
 
 _POSITION = "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees"
+_MAX_AGE = PositiveDuration("1s")
 _SCOPE = "exactly one of client, pairs and fleet must be given"
 
 
@@ -33,6 +34,17 @@ class Position(Model):
     longitude: Expression | None = Field(
         default=None, description="CEL over msg: degrees east (WGS 84), e.g. msg.longitude."
     )
+    max_age: PositiveDuration | None = Field(
+        default=None,
+        description="A client whose newest sample is older than this has no known position, as where the stream is "
+        "stale. Default: 1s; no limit where the stream never goes stale.",
+    )
+
+    def max_age_ns(self, *, never_stale: bool) -> int | None:
+        """When a position is too old to be believed, in nanoseconds; None: as long as its stream is not stale."""
+        if self.max_age is not None:
+            return self.max_age.ns
+        return None if never_stale else _MAX_AGE.ns
 
     @model_validator(mode="after")
     def _complete(self) -> Position:

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from wayside.api.base import (
     Duration,
     Expression,
+    Key,
     Model,
     ObjectName,
     PositiveDuration,
@@ -105,11 +106,9 @@ class Stream(Model):
     )
 
     name: ObjectName = Field(description="The name by which rules refer to the stream.")
-    key: str = Field(
-        min_length=1,
-        max_length=512,
+    key: Key = Field(
         description="The Zenoh key expression in key-format notation: ${client:*} captures the client's name, "
-        "e.g. vehicles/${client:*}/pose. A ROS topic is the key without its leading slash.",
+        "e.g. vehicles/${client:*}/pose. A ROS topic may be written with or without its leading slash.",
     )
     source: ObjectName = Field(
         default=ZENOH, description="Where the samples come from: zenoh, or the name of one of the Detector's sources."
@@ -153,13 +152,14 @@ class Stream(Model):
     )
     stamp: Expression | None = Field(
         default=None,
-        description="CEL over msg: the sender's time in seconds. Default: header.stamp where the type has one, "
-        "the time of generation in an ETSI ITS message, else the receive time.",
+        description="CEL over msg: the sender's time in seconds since the epoch, e.g. msg.time_ms / 1000; or "
+        "sample.received, the receive time (t of JSON lines). Default: header.stamp where the type has one, the time "
+        "of generation in an ETSI ITS message, else none.",
     )
     stale_after: Duration | str | None = Field(
         default=None,
         description="Signals of the stream are unknown when its newest sample is older than this. "
-        "Default: clientTimeout. Never: not at all, for latched topics.",
+        "Default: 5s, or clientTimeout if that is shorter. Never: not at all, for latched topics.",
         json_schema_extra={"type": "string", "pattern": f"^({PositiveDuration.pattern}|Never)$", "maxLength": 20},
     )
     buffer: StreamBuffer = Field(

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.access import ACCESS_VALIDATIONS, Access
-from wayside.api.base import validations
+from wayside.api.base import Key, validations
 
 Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
 """A Zenoh endpoint such as tcp/zenoh:7447."""
@@ -67,10 +67,8 @@ class Zenoh(Access):
         "the pods must then share /dev/shm.",
     )
 
-    liveliness: str | None = Field(
+    liveliness: Key | None = Field(
         default=None,
-        min_length=1,
-        max_length=512,
         description="The key of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a token is "
         "there, however long it sends nothing; once its last token is gone it is lost at once.",
     )

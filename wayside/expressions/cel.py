@@ -21,13 +21,13 @@ from cel_expr_python import cel
 
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
-from wayside.expressions.failures import clean, says_absent
+from wayside.expressions.failures import NO_MEMBERS, clean, says_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import settle
 from wayside.expressions.growth import MOST, growth
 from wayside.expressions.handles import begin, end, value_of
 from wayside.expressions.numbers import MAX_EXACT, doubled
-from wayside.expressions.projection import Leaf, missing_path, normalise, project, tree
+from wayside.expressions.projection import Leaf, missing_path, no_member, normalise, project, tree
 from wayside.expressions.syntax import Node, Path, arguments, nothing_but_arguments, parse, paths
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
 
@@ -72,10 +72,12 @@ _NAMED_KINDS: Final = {
     "UINT": Kind.DOUBLE,
     "STRING": Kind.STRING,
 }
-_RESERVED: Final = (
+_WORDS: Final = (
     "as break const continue else false for function if import in let loop namespace null package return true var void"
     " while"
 )
+RESERVED_WORDS: Final = frozenset(_WORDS.split())
+"""Words that CEL's grammar keeps for itself: no variable can have one as its name."""
 
 
 _SMALLER: Final = "a loop within a loop multiplies what it joins with `+`: join less"
@@ -92,7 +94,7 @@ class Environment:
         for name in variables:
             if not _NAME.fullmatch(name):
                 raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
-            if name in _RESERVED.split():
+            if name in RESERVED_WORDS:
                 raise ValueError(f"variable {name!r}: a word that CEL reserves; choose another name")
         self.variables: Mapping[str, Kind] = MappingProxyType(dict(variables))
         self._members: Mapping[str, Kind] = MappingProxyType(dict(members or {}))
@@ -195,7 +197,8 @@ class Expression:
             value = self._run(values, known=True)
         except EvaluationError as error:
             if on_unknown is not None:
-                on_unknown(Reason.ABSENT if error.absent else Reason.ERROR, error.message)
+                message = no_member(self.paths, values) if error.message in NO_MEMBERS else None
+                on_unknown(Reason.ABSENT if error.absent else Reason.ERROR, message or error.message)
             return UNKNOWN
         if value is None or (isinstance(value, float) and math.isnan(value)):
             if on_unknown is not None:

@@ -8,6 +8,9 @@ from typing import Final
 from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.numbers import DIGITS
 
+NO_MEMBERS: Final = frozenset({"a member is read of what has none"})
+"""What `clean` makes of a read of a member of a number, a text or a list."""
+
 _ABSENT = ("no value for ", "no key ", "no index ")
 _OVERLOAD: Final = re.compile(r"^\w+: No matching overloads found : (.*)$")
 _CALL: Final = re.compile(r"^(\w+)\((.*)\)$")
@@ -15,6 +18,7 @@ _CLEANING: Final = (
     (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
     (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
     (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list"),
+    (re.compile(r"^(?:\w+: )?Applying SELECT to non-message type.*$"), "a member is read of what has none"),
     (re.compile(r"^[A-Z_]+: (.*?)(?: \[[A-Z_]+\])?$", re.DOTALL), r"\1"),
 )
 _TYPES: Final = {

@@ -93,6 +93,26 @@ def missing_path(paths: Iterable[Path], values: Mapping[str, object]) -> str | N
     return None
 
 
+def no_member(paths: Iterable[Path], values: Mapping[str, object]) -> str | None:
+    """Says which of the paths goes through what has no members, and what that is; None if none does."""
+    for path in sorted(paths, key=str):
+        at: object = values
+        for depth, step in enumerate(path):
+            if isinstance(at, Mapping):
+                if step not in at:
+                    break
+                at = at[step]
+            elif isinstance(at, list) and isinstance(step, int) and step < len(at):
+                at = at[step]
+            elif isinstance(at, list | str | bool | int | float) and isinstance(step, str):
+                written = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path[:depth])[1:]
+                value = f"the list of {len(at)}" if isinstance(at, list) else f"{at!r:.40}"
+                return f"`{written}` is {value}, which has no field `{step}`: correct the path"
+            else:
+                break
+    return None
+
+
 def _project(below: Tree | Leaf | None, value: object, known: bool) -> object:
     if below is None:
         return _convert(value, known)

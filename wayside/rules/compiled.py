@@ -60,6 +60,8 @@ class CompiledPosition:
     axes: Mapping[str, Expression]
     """x and y, perhaps z, in metres; or latitude and longitude, in degrees (WGS 84)."""
     parameters: Parameters = NO_PARAMETERS
+    max_age_ns: int | None = None
+    """Of older samples the position is unknown; None: as long as the stream is not stale."""
 
     @property
     def geographic(self) -> bool:

@@ -37,6 +37,7 @@ from wayside.rules.compiled import (
 )
 from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.models import compile_models
+from wayside.rules.naming import signal_name_problem
 from wayside.rules.parameters import kinds_of, override_problems, parameters_of
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.scopes import (
@@ -49,11 +50,9 @@ from wayside.rules.scopes import (
 )
 from wayside.rules.variables import (
     EPISODE_MEMBERS,
-    RESERVED,
     SAMPLE_MEMBERS,
     condition_environment,
     element_of,
-    is_taken,
     sample_environment,
 )
 
@@ -148,10 +147,8 @@ class _RuleCompiler:
 
     def _signal(self, index: int, signal: Signal) -> CompiledSignal | None:
         at: FieldPath = ("spec", "signals", index)
-        if signal.name in RESERVED:
-            self.problem((*at, "name"), f"{signal.name} is a name that every scope gives itself: choose another")
-        elif is_taken(signal.name):
-            self.problem((*at, "name"), f"{signal.name} is a word of CEL itself: choose another name")
+        if (problem := signal_name_problem(signal.name, self.spec)) is not None:
+            self.problem((*at, "name"), problem)
         if signal.rule is not None:
             return self._episode_signal(at, signal, signal.rule)
         if signal.stream is None:

@@ -23,13 +23,12 @@ from wayside.rules.compiled import (
     PairSubject,
 )
 from wayside.rules.fields import Fields
+from wayside.rules.naming import element_name_problem
 from wayside.rules.parameters import Parameters
 from wayside.rules.variables import (
     MEMBER_OF_CLIENT,
-    RESERVED,
     client_environment,
     element_of,
-    is_taken,
     pairs_environment,
     signal_names,
 )
@@ -101,8 +100,14 @@ def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> Pai
     b = None if pairs.b is None else compiler.condition((*at, "b", "where"), pairs.b.where, role)
     if not complete:
         return None
+    max_age = position.max_age_ns(never_stale=stream is not None and stream.never_stale)
     return PairSubject(
-        CompiledPosition(position.stream, axes, compiler.parameters), pairs.within, where, a, b, pairs.max_pairs
+        CompiledPosition(position.stream, axes, compiler.parameters, max_age),
+        pairs.within,
+        where,
+        a,
+        b,
+        pairs.max_pairs,
     )
 
 
@@ -111,12 +116,8 @@ def compile_elements(compiler: Expressions, each: Each | None) -> tuple[Compiled
     if each is None:
         return (CompiledElement(),)
     spec, name, at = compiler.rule.spec, each.as_, ("spec", "each", "as")
-    if name in RESERVED:
-        compiler.problem(at, f"{name} is a name that scopes and samples give themselves: choose another")
-    elif is_taken(name):
-        compiler.problem(at, f"{name} is a word of CEL itself: choose another name")
-    elif any(signal.name == name for signal in spec.signals):
-        compiler.problem(at, f"{name} is a signal's name as well: choose another")
+    if (problem := element_name_problem(name, spec)) is not None:
+        compiler.problem(at, problem)
     return tuple(
         CompiledElement(element.name, {name: element.to_json()}) for element in sorted(each.of, key=lambda e: e.name)
     )

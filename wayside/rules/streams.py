@@ -44,8 +44,9 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
     except ExpressionError as error:
         yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
         return
-    if fields is not None:
-        yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, "msg", fields))
+    for variable, members in (("sample", {"received": None}), ("msg", fields)):
+        if members is not None:
+            yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, variable, members))
 
 
 def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:

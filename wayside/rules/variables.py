@@ -8,12 +8,6 @@ from wayside.api.eventrule import EventRuleSpec
 from wayside.expressions import Environment, ExpressionError, Kind
 from wayside.rules.fields import Fields
 
-RESERVED = frozenset(
-    {"client", "labels", "streams", "parameters", "position", "a", "b", "distance", "closingSpeed", "members"}
-    | {"msg", "key", "sample"}
-)
-"""Names that the scopes and samples give; neither a signal nor the element of `each` may take them."""
-
 MEMBER_OF_CLIENT = ("client", "labels", "streams", "parameters")
 
 EPISODE_MEMBERS: Fields = dict.fromkeys(
@@ -33,13 +27,13 @@ def sample_environment(element: str | None = None) -> Environment:
     """
     fixed = {"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP}
     members = {f"sample.{member}": Kind.DOUBLE for member in SAMPLE_MEMBERS}
-    return Environment({**fixed, **_element(element)}, members)
+    return Environment(_with_element(fixed, element), members)
 
 
 @cache
 def stamp_environment() -> Environment:
-    """For a stream's `stamp`: the decoded message alone."""
-    return Environment({"msg": Kind.DYN})
+    """For a stream's `stamp`: the decoded message, and when the sample was received."""
+    return Environment({"msg": Kind.DYN, "sample": Kind.MAP}, {"sample.received": Kind.DOUBLE})
 
 
 @cache
@@ -62,24 +56,25 @@ def is_taken(name: str) -> bool:
 def client_environment(signals: tuple[str, ...] = (), element: str | None = None) -> Environment:
     """For one client: client, labels, streams (those that are not stale), the signals and the element of `each`."""
     fixed = {"client": Kind.STRING, "labels": Kind.MAP, "streams": Kind.LIST, "parameters": Kind.MAP}
-    return Environment({**fixed, **dict.fromkeys(signals, Kind.DYN), **_element(element)})
+    return Environment(_with_element({**dict.fromkeys(signals, Kind.DYN), **fixed}, element))
 
 
 @lru_cache(maxsize=256)
 def pairs_environment(element: str | None = None) -> Environment:
     """For a pair: a and b (maps of what a client scope has, and position), distance in metres, closingSpeed in m/s."""
     numbers = {"distance": Kind.DOUBLE, "closingSpeed": Kind.DOUBLE}
-    return Environment({"a": Kind.MAP, "b": Kind.MAP, "parameters": Kind.MAP, **numbers, **_element(element)})
+    return Environment(_with_element({"a": Kind.MAP, "b": Kind.MAP, "parameters": Kind.MAP, **numbers}, element))
 
 
 @lru_cache(maxsize=256)
 def fleet_environment(element: str | None = None) -> Environment:
     """For the fleet: members (a list of maps of what a client scope has)."""
-    return Environment({"members": Kind.LIST, "parameters": Kind.MAP, **_element(element)})
+    return Environment(_with_element({"members": Kind.LIST, "parameters": Kind.MAP}, element))
 
 
-def _element(name: str | None) -> dict[str, Kind]:
-    return {} if name is None or name in RESERVED or is_taken(name) else {name: Kind.MAP}
+def _with_element(variables: dict[str, Kind], name: str | None) -> dict[str, Kind]:
+    """And the element of `each`; one whose name cannot be is left out, and told of elsewhere."""
+    return variables if name is None or name in variables or is_taken(name) else {**variables, name: Kind.MAP}
 
 
 def element_of(spec: EventRuleSpec) -> str | None:

@@ -151,7 +151,7 @@ class Inflow:
             return
         whose = self._read_key(LIVELINESS, key)
         if whose is None:
-            self._counters.unnamed[LIVELINESS] += 1
+            self._unnamed(LIVELINESS, key)
         elif (whose[0] not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS) or not tokens.declare(
             key, whose[0]
         ):
@@ -190,14 +190,18 @@ class Inflow:
 
     def _read(self, stream: str, key: str) -> str | None:
         whose = self._read_key(stream, key) if stream in self._lane_makers else None
-        if whose is None:
-            self._counters.unnamed[stream] += 1  # also what still came in on a stream that the Detector no longer has
+        if whose is None:  # also what still came in on a stream that the Detector no longer has
+            self._unnamed(stream, key)
             return None
         return whose[0]
+
+    def _unnamed(self, stream: str, key: str) -> None:
+        self._counters.unnamed[stream] += 1
+        self._counters.last_unnamed[stream] = f"the key {key}: a name takes 1 to 63 of A-Z a-z 0-9 . _ : -"
 
     def _read_message(self, stream: str, key: str, payload: bytes) -> str | None:
         whose = self._read_key(stream, key)
         if whose is None:
-            self._counters.unnamed[stream] += 1
+            self._unnamed(stream, key)
             return None
         return self._message_clients.client(stream, key, whose[1], payload)

@@ -12,6 +12,9 @@ from wayside.rules import CompiledStream
 
 _MISSING = object()
 
+_RECEIVED = "sample.received"
+"""A stream's `stamp` where the receive time is the sender's: in JSON lines, `t`."""
+
 _SECOND = 10**9
 """An integer: Python divides integers to the nearest double, where a double of nanoseconds would be 256 ns off."""
 
@@ -92,6 +95,7 @@ class Messages:
         except (DecodeError, EvaluationError, ValueError) as error:
             self._unreadable(stream, key, error)
             return None
+        self._counters.stamped(stream, received, stamp)
         return received if stamp is None else stamp
 
     def _stamp(self, stream: str, payload: bytes, received: int) -> int | None:
@@ -100,7 +104,12 @@ class Messages:
         if expression is None:
             near = self._near.get(stream)
             return decoder.stamp(payload) if near is None else near.stamp_near(payload, received)
-        return _nanoseconds(expression.evaluate({"msg": decoder.decode(payload)}))
+        if expression.source.strip() == _RECEIVED:
+            return received  # exactly: as a double of seconds it would be rounded
+        values: dict[str, Any] = {"sample": {"received": received / _SECOND}}
+        if "msg" in expression.names:
+            values["msg"] = decoder.decode(payload)
+        return _nanoseconds(expression.evaluate(values))
 
     def _unreadable(self, stream: str, key: str, error: Exception) -> None:
         self._counters.unreadable(stream, key, error)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.buffering.clients import is_fresh
 from detector.engine.buffering.messages import Messages
+from detector.engine.buffering.possible import Possible
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Sample
 from wayside import geodesy
@@ -31,12 +32,21 @@ class Positions:
     """Looks up positions in the buffer."""
 
     def __init__(
-        self, buffer: Buffer, messages: Messages, stale_after: Mapping[str, int | None], floor: int | None
+        self,
+        buffer: Buffer,
+        messages: Messages,
+        stale_after: Mapping[str, int | None],
+        possible: Possible,
+        floor: int | None,
     ) -> None:
-        """`floor`: no look goes back to this time or beyond, in nanoseconds."""
+        """`floor`: no look goes back to this time or beyond, in nanoseconds.
+
+        Who can never have a position, as `possible` says, is not counted as one whose position is unknown.
+        """
         self._buffer = buffer
         self._messages = messages
         self._stale_after = stale_after
+        self._possible = possible
         self._floor = floor
 
     def gap(self, time: int) -> None:
@@ -48,8 +58,10 @@ class Positions:
         lane = self._buffer.lane(client, position.stream)
         sample = None if lane is None else lane.newest
         if sample is None or not is_fresh(client, position.stream, self._limit(position), self._buffer, now):
-            counters.unknowns += 1
+            counters.unknowns += self._possible(position.stream, client)
             return None
+        if counters.ages is not None and lane is not None:
+            counters.ages.used(lane, now)
         return self._place(position, client, sample, counters)
 
     def then(self, position: CompiledPosition, client: str, then: int, counters: RuleCounters) -> Place | None:
@@ -62,12 +74,13 @@ class Positions:
         return self._place(position, client, sample, counters)
 
     def _limit(self, position: CompiledPosition) -> int | None:
-        return self._stale_after[position.stream]
+        stale, oldest = self._stale_after[position.stream], position.max_age_ns
+        return oldest if stale is None or (oldest is not None and oldest < stale) else stale
 
     def _place(self, position: CompiledPosition, client: str, sample: Sample, counters: RuleCounters) -> Place | None:
         place = []
         for axis, expression in position.axes.items():
-            value = self._evaluate(expression, position, client, sample, counters)
+            value = self._evaluate(axis, expression, position, client, sample, counters)
             if not isinstance(value, int | float):
                 counters.misplace(f"{axis} of {client} is absent, NaN, no number, or cannot be read")
                 return None
@@ -80,14 +93,21 @@ class Positions:
         return tuple(place)
 
     def _evaluate(
-        self, expression: Expression, position: CompiledPosition, client: str, sample: Sample, counters: RuleCounters
+        self,
+        axis: str,
+        expression: Expression,
+        position: CompiledPosition,
+        client: str,
+        sample: Sample,
+        counters: RuleCounters,
     ) -> Value | Unknown:
         parameters = position.parameters.of(client)
         values = self._messages.values(position.stream, sample, expression.names, parameters)
         if values is None:
             counters.unknowns += 1
             return UNKNOWN
-        return expression.evaluate_or_unknown(values, counters.note)
+        place = f"{axis} of {client}, stream {position.stream}"
+        return expression.evaluate_or_unknown(values, lambda reason, message: counters.note(reason, message, place))
 
 
 def described(position: CompiledPosition, place: Place) -> dict[str, float]:

@@ -16,8 +16,10 @@ from detector.engine.scoping.positions import Place, Positions, described, dista
 from detector.engine.signals.models import add_models
 from detector.engine.signals.signals import Signals
 from detector.engine.timing.schedule import Only
-from wayside.expressions import UNKNOWN, Expression
+from wayside.expressions import UNKNOWN, Expression, Path, Reason
 from wayside.rules import ClientSubject, CompiledElement, CompiledRule, CompiledSignal, FleetSubject, PairSubject
+
+_NONE: frozenset[Path] = frozenset()
 
 CLOSING_NS = 1_000_000_000
 """Over so long the closing speed is measured, in nanoseconds."""
@@ -34,6 +36,8 @@ class Candidate:
     """What `where` says, and the roles of a pair; false ends an open episode."""
     near: Truth
     """Whether an episode may start; unknown for a pair of which one's position is."""
+    never: frozenset[Path] = frozenset()
+    """The beginnings of the paths to signals that its clients can never have."""
 
 
 class Views:
@@ -109,16 +113,40 @@ class Views:
             self._earlier[client] = self._positions.then(subject.position, client, then, self._counters)
         return self._earlier[client]
 
-    def truth(self, expression: Expression | None, variables: Mapping[str, Any]) -> Truth:
-        """What a condition says; one that is absent holds."""
+    def truth(self, expression: Expression | None, variables: Mapping[str, Any], place: str) -> Truth:
+        """What a condition says; one that is absent holds. `place` names field and subject, for errors."""
         if expression is None:
             return True
-        value = expression.evaluate_or_unknown(variables, self._counters.note)
-        return value if isinstance(value, bool) else UNKNOWN
+        never = self.never(str(variables["client"])) if "client" in variables else frozenset()
+        return condition(expression, variables, place, never, self._counters)
+
+    def never(self, client: str, *role: str) -> frozenset[Path]:
+        """The beginnings of the paths to signals that the client can never have; behind a pair's role, where given."""
+        possible = self._signals.possible
+        if not possible.limited:
+            return _NONE
+        return frozenset((*role, signal.name) for signal in self._rule.signals if not possible(signal.stream, client))
 
     def left_out(self, pairs: int) -> None:
         """So many pairs within reach were left out."""
         self._counters.crowded_pairs += pairs
+
+
+def condition(
+    expression: Expression, variables: Mapping[str, Any], place: str, never: frozenset[Path], counters: RuleCounters
+) -> Truth:
+    """What a condition says. Unknown is counted, unless it reads what can never be there."""
+
+    def note(reason: Reason, message: str) -> None:
+        if (
+            reason is Reason.ERROR
+            or not never
+            or not any(path[: len(each)] == each for path in expression.paths for each in never)
+        ):
+            counters.note(reason, message, place)
+
+    value = expression.evaluate_or_unknown(variables, note)
+    return value if isinstance(value, bool) else UNKNOWN
 
 
 def candidates(
@@ -138,8 +166,9 @@ def candidates(
                     if only is not None and not only.takes(Subject((client,), element.name)):
                         continue
                     variables = _with(views, client, element)
-                    in_scope = views.truth(each.where, variables)
-                    yield Candidate(Subject((client,), element.name), variables, in_scope, near=True)
+                    in_scope = views.truth(each.where, variables, f"where of {client}")
+                    never = views.never(client)
+                    yield Candidate(Subject((client,), element.name), variables, in_scope, near=True, never=never)
         case PairSubject() as pairs:
             yield from _pairs(rule, pairs, views, clients, pending, only)
         case FleetSubject() as fleet:
@@ -148,7 +177,9 @@ def candidates(
                     continue
                 seen = ((client, _with(views, client, element)) for client in clients)
                 members = [
-                    views.of(client, element) for client, view in seen if views.truth(fleet.members, view) is True
+                    views.of(client, element)
+                    for client, view in seen
+                    if views.truth(fleet.members, view, f"members, of {client}") is True
                 ]
                 yield Candidate(
                     Subject((), element.name),
@@ -203,15 +234,20 @@ def _pairs(
                 variables["distance"] = between(a, b)
                 if subject.closing_speed:
                     _closing_speed(views, subject, a, b, variables)
-            in_scope = both(both(a_truth[a], b_truth[b]), views.truth(subject.where, variables))
-            yield Candidate(each, variables, in_scope, near=each in near if placed else UNKNOWN)
+            in_scope = both(
+                both(a_truth[a], b_truth[b]), views.truth(subject.where, variables, f"where of {each.text}")
+            )
+            never = views.never(a, "a") | views.never(b, "b")
+            yield Candidate(each, variables, in_scope, near=each in near if placed else UNKNOWN, never=never)
 
 
 def _role(where: Expression | None, element: CompiledElement, views: Views, clients: Clients) -> dict[str, Truth]:
     """Of each client, whether it can have the role."""
     if where is None:
         return dict.fromkeys(clients, True)
-    return {client: views.truth(where, _with(views, client, element)) for client in clients}
+    return {
+        client: views.truth(where, _with(views, client, element), f"where of a role, of {client}") for client in clients
+    }
 
 
 def _possible(role: Mapping[str, Truth]) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Final, cast
 from detector.engine.buffering.buffer import NEVER, Buffer, Lane
 from detector.engine.buffering.clients import Clients, is_fresh
 from detector.engine.buffering.messages import Messages
+from detector.engine.buffering.possible import Possible
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Sample
 from detector.engine.signals.aggregates import Timed, calculated, distinct, is_number
@@ -27,14 +28,19 @@ class Signals:
         messages: Messages,
         stale_after: Mapping[str, int | None],
         starts: Starts,
+        possible: Possible,
         floor: int | None = None,
     ) -> None:
-        """`starts` has the samples of signals over rules; windows do not reach back to `floor` (ns) or beyond."""
+        """`starts` has the samples of signals over rules; windows do not reach back to `floor` (ns) or beyond.
+
+        What a client can never have, as `possible` says, is unknown without being counted.
+        """
         self._buffer = buffer
         self._clients = clients
         self._messages = messages
         self._stale_after = stale_after
         self._starts = starts
+        self.possible = possible
         self._extracted: dict[tuple[str, str, str], dict[Sample, Value | Unknown | None]] = {}
         self._picked: dict[tuple[str, str, str], int] = {}
         """When the last sample came that an Age's `where` picks."""
@@ -69,7 +75,11 @@ class Signals:
             return self._age(rule, signal, lane, client, now, counters)
         always_known = signal.aggregate in _ALWAYS_KNOWN
         if lane is None or not (always_known or self._is_fresh(client, signal.stream, now)):
-            return _ALWAYS_KNOWN[signal.aggregate] if always_known else self._no_value(counters)
+            if always_known:
+                return _ALWAYS_KNOWN[signal.aggregate]
+            return self._no_value(counters) if self.possible(signal.stream, client) else UNKNOWN
+        if counters.ages is not None and signal.rule is None:
+            counters.ages.used(lane, now)
         aggregate = signal.aggregate
         window = self._window(
             rule,
@@ -81,7 +91,7 @@ class Signals:
             at_most=_ENOUGH.get(aggregate),
             oldest_first=aggregate is Aggregate.FIRST,
         )
-        value = _aggregated(signal, window, counters)
+        value = _aggregated(signal, client, window, counters)
         return self._no_value(counters) if value is UNKNOWN else value
 
     def window(
@@ -180,7 +190,15 @@ class Signals:
             return UNKNOWN
         if signal.element is not None:
             values.update(signal.element.variables)
-        return expression.evaluate_or_unknown(values, counters.note)
+        return expression.evaluate_or_unknown(
+            values, lambda reason, message: counters.note(reason, message, _place(signal, lane.client))
+        )
+
+
+def _place(signal: CompiledSignal, client: str) -> str:
+    """Where an error is, for people."""
+    source = f"stream {signal.stream}" if signal.rule is None else f"rule {signal.rule}"
+    return f"signal {signal.name} of {client}, {source}"
 
 
 _ENOUGH: Final = {Aggregate.LAST: 1, Aggregate.PREVIOUS: 2, Aggregate.FIRST: 1}
@@ -191,7 +209,7 @@ _ALWAYS_KNOWN: Final[Mapping[Aggregate, Value]] = {Aggregate.COUNT: 0.0, Aggrega
 
 
 def _aggregated(
-    signal: CompiledSignal, window: Sequence[tuple[Sample, Value | Unknown]], counters: RuleCounters
+    signal: CompiledSignal, client: str, window: Sequence[tuple[Sample, Value | Unknown]], counters: RuleCounters
 ) -> Value | Unknown:
     """The window's value; the window is given from the newest on."""
     aggregate = signal.aggregate
@@ -207,16 +225,17 @@ def _aggregated(
         case Aggregate.DISTINCT:
             return distinct([value for _, value in known])
         case Aggregate.ALL | Aggregate.ANY:
-            truths = [value for _, value in _fitting(signal, known, _is_boolean, "booleans", counters)]
+            truths = [value for _, value in _fitting(signal, client, known, _is_boolean, "booleans", counters)]
             if aggregate is Aggregate.ANY:
                 return any(truths)
             return all(truths) if truths else UNKNOWN
-    numbers = _fitting(signal, known, is_number, "numbers", counters)
+    numbers = _fitting(signal, client, known, is_number, "numbers", counters)
     return calculated(aggregate, cast("list[Timed]", numbers))
 
 
 def _fitting(
     signal: CompiledSignal,
+    client: str,
     known: Sequence[tuple[int, Value]],
     fits: Callable[[object], bool],
     wanted: str,
@@ -229,7 +248,8 @@ def _fitting(
             fitting.append((time, value))
         else:
             counters.errors += 1
-            counters.last_error = f"signal {signal.name}: {signal.aggregate} needs {wanted}, is {value!r:.80}"
+            needs = f"{signal.aggregate} needs {wanted}, is {value!r:.80}"
+            counters.last_error = f"{_place(signal, client)}: {needs}"
     return fitting
 
 

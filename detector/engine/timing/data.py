@@ -235,7 +235,8 @@ class DataTimeline:
                 return True
         else:
             self._row = _Row(client, stamp, stamp, arrival.received)
-        self.last = f"{client} is {abs(stamp - newest) / 1e9:g} s {'ahead of' if stamp > newest else 'behind'} the rest"
+        way = "ahead of" if stamp > newest else "behind"
+        self.last = f"{client} is {abs(stamp - newest) / 1e9:g} s {way} the rest on stream {arrival.stream}"
         if stamp > newest:
             self.dropped_ahead += 1
         else:

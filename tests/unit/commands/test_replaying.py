@@ -93,3 +93,28 @@ def test_with_clock_data_the_evaluation_rests_between_its_looks_however_old_the_
         an_engine(detector), Intake(lambda: START), Nowhere(), now=lambda: at(1e6), on_failure=lambda error: None
     )
     assert evaluator.pause() > 0.01
+
+
+def test_an_intake_file_replays_with_the_defaults_of_its_time() -> None:
+    """Before there was maxAge, a place held as long as its stream was not stale, by default for clientTimeout."""
+    place = {"stream": "pose", "x": "msg.x", "y": "msg.y"}
+    near = a_rule("near", scope={"pairs": {"position": place, "within": 9}}, when="distance < 9", until="false")
+    old = a_rule("old", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 10", **{"for": "20s"})
+    start = {
+        "kind": "start",
+        "holder": "h",
+        "detector": a_detector().to_json(),
+        "rules": [near.to_json(), old.to_json()],
+    }
+    arrivals = [
+        arrival(1, "a", {"v": 20}),
+        arrival(1, "a", {"x": 0, "y": 0}, "pose"),
+        arrival(11, "b", {"x": 0, "y": 0}, "pose"),
+    ]
+    for version, expected in (({}, ["near a+b", "old a"]), ({"version": 2}, [])):
+        records = [Control(START, {**start, **version}), *arrivals, Control(at(25), {"kind": "end"})]
+        outcome = replay_intake(records, None, None)
+        assert [f"{event.rule} {event.subject}" for event in outcome.events] == expected
+    changed = Control(at(2), {"kind": "rules", "detector": a_detector().to_json(), "rules": start["rules"]})
+    outcome = replay_intake([Control(START, start), *arrivals[:2], changed, arrivals[2], records[-1]], None, None)
+    assert [f"{event.rule} {event.subject}" for event in outcome.events] == ["near a+b", "old a"]

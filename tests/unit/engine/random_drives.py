@@ -152,6 +152,9 @@ _scopes = st.sampled_from(
         None,
         {"client": {"where": '"speed" in streams'}},
         {"pairs": {"position": _POSITION, "within": 5}},
+        {"pairs": {"position": {**_POSITION, "maxAge": "500ms"}, "within": 10}},
+        {"pairs": {"position": {**_POSITION, "maxAge": "2s"}, "within": 10}},
+        {"pairs": {"position": {**_POSITION, "maxAge": "10s"}, "within": 10}},
         {"pairs": {"position": _POSITION, "within": 10, "where": '"speed" in a.streams || distance < 5'}},
         {"pairs": {"position": _POSITION, "within": 10, "a": {"where": '"speed" in streams'}}},
         {

@@ -61,7 +61,7 @@ def test_a_condition_may_use_the_clients_name_labels_and_streams() -> None:
     assert drive.take(speed(0.5, 0, "car"), place(0.5, "rsu", 0), until=1) == []  # no sample on speed
     assert drive.take(speed(1.5, 0, "rsu"), until=2) == ["r rsu started 2"]
     told = drive.take(*(place(2 + n, "rsu", 0) for n in range(35)), until=36)
-    assert told == ["r rsu OutOfScope 32"]  # speed is stale, the client is not lost
+    assert told == ["r rsu OutOfScope 7"]  # speed is stale, the client is not lost
 
 
 def near(name: str = "near", **spec: Any) -> Any:

@@ -158,7 +158,7 @@ def test_only_rules_with_on_demand_can_be_asked() -> None:
 
 
 def test_a_paused_rule_keeps_its_open_episodes_and_forgets_what_was_pending() -> None:
-    drive = Drive(a_detector(), fast(**{"for": "2s"}, evaluation={"every": "1s"}))
+    drive = Drive(a_detector(a_stream("speed", staleAfter="30s")), fast(**{"for": "2s"}, evaluation={"every": "1s"}))
     assert drive.take(speed(0.1, 20, "a"), speed(1.1, 20, "b"), until=3) == ["r a started 3"]
     drive.engine.set_paused({"r"})
     assert drive.take(speed(3.1, 5, "a"), until=6) == []

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from detector.cli import app
 from detector.replay.errors import RecordingError
-from detector.replay.message import Message
+from detector.replay.message import Cut, Message
 from detector.replay.recordings import open_recordings
 from detector.streams.codecs.etsi.times import its_ms
 from tests.unit.encodings.its_messages import a_cam, random_message
@@ -109,12 +109,27 @@ def test_packets_go_to_the_keys_of_their_messages_and_other_frames_are_passed_ov
 
 
 @pytest.mark.parametrize("write", [pcap, pcapng])
-def test_a_capture_that_is_cut_or_damaged_is_told(write: object, tmp_path: Path) -> None:
-    raw = write([(START, ethernet(CAM))] * 3)  # type: ignore[operator]
+def test_a_capture_that_is_cut_is_read_up_to_there(write: object, tmp_path: Path) -> None:
+    raw = write([(START + index, ethernet(CAM)) for index in range(3)])  # type: ignore[operator]
     path = tmp_path / "capture"
-    for cut in (len(raw) - 1, len(raw) - 40, 30):
-        with pytest.raises(RecordingError, match="capture: the capture is cut or damaged"):
-            read(path, raw[:cut])
+    whole = read(path, raw)
+    counts = set()
+    for size in range(30, len(raw)):
+        path.write_bytes(raw[:size])
+        told: list[Cut] = []
+        messages = list(open_recordings([path], on_cut=told.append))
+        assert messages == whole[: len(messages)]
+        assert all(cut.messages == len(messages) for cut in told)
+        counts.add((len(messages), len(told)))
+    # Between two packets nothing shows that there were more.
+    assert {(0, 1), (1, 1), (2, 1)} <= counts <= {(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)}
+
+
+def test_a_capture_that_is_damaged_is_told(tmp_path: Path) -> None:
+    raw = bytearray(pcapng([(START, ethernet(CAM))]))
+    raw[4:8] = struct.pack("<I", 27)  # no length of a block
+    with pytest.raises(RecordingError, match="capture: the capture is damaged: a block of 27 bytes at byte 0"):
+        read(tmp_path / "capture", bytes(raw))
 
 
 DETECTOR = """

@@ -1,19 +1,19 @@
 """Recordings of every kind read as the same messages, in order of time; what is wrong is said with its place."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
+from detector.replay.gathering import recordings_of
 from detector.replay.intake_writer import IntakeWriter
-from detector.replay.message import Message
+from detector.replay.message import Cut, Message
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from detector.streams.codecs.ros import standard
@@ -185,16 +185,102 @@ def write_sqlite(path: Path, messages: list[Message]) -> Path:
     return write_bag(path, messages, StoragePlugin.SQLITE3)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1, 0.3, 0.5, 0.8, 0.99])
-@pytest.mark.parametrize("write", [write_mcap, write_bag, write_sqlite])
-def test_a_cut_recording_is_an_error_that_names_it(
-    tmp_path: Path, write: Callable[[Path, list[Message]], Path], share: float
-) -> None:
-    path = write(tmp_path / "drive", MESSAGES * 20)
-    for file in [path] if path.is_file() else path.glob("*.[md][cb]*"):
+SHARES = [0.01, 0.1, 0.3, 0.5, 0.8, 0.99]
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_a_cut_sqlite_bag_is_an_error_that_names_it(tmp_path: Path, share: float) -> None:
+    path = write_sqlite(tmp_path / "drive", MESSAGES * 20)
+    for file in path.glob("*.db3"):
         damage(file, share)
     with pytest.raises(RecordingError, match=str(tmp_path)):
         list(open_recordings([path]))
+
+
+def read_up_to_a_cut(path: Path, written: list[Message]) -> int:
+    """How many messages are read: those written first, in the order of their times."""
+    told: list[Cut] = []
+    read = list(open_recordings([path], on_cut=told.append))
+    assert read == sorted(written[: len(read)], key=lambda message: message.time)
+    assert told or len(read) == len(written)  # where only the index is missing, nothing is
+    for cut in told:
+        assert cut.messages == len(read)
+        assert f"{len(read)} messages are read up to there" in str(cut)
+    return len(read)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"chunk_size": 1000},
+        {"chunk_size": 1000, "compression": CompressionType.LZ4},
+        {"chunk_size": 1000, "compression": CompressionType.NONE},
+        {"compression": CompressionType.NONE},
+        {"use_chunking": False},
+    ],
+    ids=["zstd", "lz4", "uncompressed", "one chunk", "unchunked"],
+)
+def test_an_mcap_file_that_is_cut_is_read_up_to_there(tmp_path: Path, options: dict[str, Any]) -> None:
+    written = MESSAGES * 20
+    whole = write_mcap(tmp_path / "whole.mcap", written, **options).read_bytes()
+    counts = []
+    for share in SHARES:
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(whole[: int(len(whole) * share)])
+        counts.append(read_up_to_a_cut(path, written))
+    assert counts == sorted(counts)
+    assert counts[0] == 0 < counts[2] < counts[3] <= counts[-1]
+
+
+def test_an_mcap_file_whose_last_bytes_were_never_written_is_read_up_to_them(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "drive.mcap", MESSAGES * 20, chunk_size=1000)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] + bytes(len(whole) // 2))
+    assert read_up_to_a_cut(path, MESSAGES * 20) > 50
+
+
+def test_an_mcap_file_without_an_index_that_was_closed_is_whole(tmp_path: Path) -> None:
+    none = IndexType.NONE
+    path = write_mcap(tmp_path / "drive.mcap", MESSAGES, chunk_size=500, index_types=none, use_statistics=False)
+    told: list[Cut] = []
+    assert list(open_recordings([path], on_cut=told.append)) == MESSAGES
+    assert told == []
+
+
+def test_an_mcap_file_that_is_damaged_inside_is_an_error_with_the_remedy(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "drive.mcap", MESSAGES * 20, chunk_size=1000)
+    whole = bytearray(path.read_bytes())
+    for place in range(len(whole) // 3, len(whole) // 3 + 400):
+        whole[place] ^= 0xFF
+    path.write_bytes(whole)
+    with pytest.raises(RecordingError, match=r"drive\.mcap: the MCAP file is damaged .*mcap recover"):
+        list(open_recordings([path]))
+
+
+@pytest.mark.parametrize("share", SHARES[1:-1])
+def test_a_rosbag2_whose_recorder_was_killed_is_read_up_to_there(tmp_path: Path, share: float) -> None:
+    path = write_bag(tmp_path / "drive", MESSAGES * 20)
+    (file,) = path.glob("*.mcap")
+    damage(file, share)
+    told: list[Cut] = []
+    read = list(open_recordings([path], on_cut=told.append))
+    assert [(cut.path, cut.messages) for cut in told] == [(file, len(read))]
+    (path / "metadata.yaml").unlink()  # it is written when the recorder ends
+    assert recordings_of([path]) == [(file,)]
+    assert list(open_recordings([file])) == read
+
+
+def test_a_last_line_that_was_not_written_to_its_end_is_a_cut(tmp_path: Path) -> None:
+    path = write_lines(tmp_path / "drive.jsonl", *({"t": n, "key": "a", "value": n} for n in range(10)))
+    whole = path.read_bytes()
+    for size in range(len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        told: list[Cut] = []
+        read = list(open_recordings([path], on_cut=told.append))
+        lines, rest = whole[:size].count(b"\n"), whole[:size].rpartition(b"\n")[2]
+        complete = rest.endswith(b"}") or not rest
+        assert [message.time for message in read] == list(range(lines + (bool(rest) and complete)))
+        assert [cut.messages for cut in told] == ([] if complete else [len(read)])
 
 
 def stream(name: str, key: str, type_name: str | None = POSE_TYPE) -> Stream:

@@ -62,7 +62,9 @@ def test_a_loop_without_end_is_an_error_of_its_rule_and_harms_no_other() -> None
     )
     begin = time.monotonic()
     assert drive.take(arrival(0.5, "car", {"v": 20}), until=1) == ["fast car started 1"]
-    assert drive.engine.rules["endless"].counters.last_error == "Iteration budget exceeded"
+    assert drive.engine.rules["endless"].counters.last_error == (
+        "when of car (v of stream speed): Iteration budget exceeded"
+    )
     assert time.monotonic() - begin < 60, "it would take years"
 
 

@@ -109,7 +109,11 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
         ({"when": "v > parameters.maxSped"}, "spec.when", ["no field maxSped", "did you mean maxSpeed?"]),
         ({"parameters": {}}, "spec.when", ["no field maxSpeed", "it has no fields"]),
         ({"signals": [{**SPEED, "value": "msg.v + parameters.of"}]}, "spec.signals[0].value", ["no field of"]),
-        ({"signals": [{**SPEED, "name": "parameters"}]}, "spec.signals[0].name", ["parameters is a name", "choose"]),
+        (
+            {"signals": [{**SPEED, "name": "parameters"}]},
+            "spec.signals[0].name",
+            ["it is the rule's parameters", "such as parametersValue"],
+        ),
         (
             {"actions": [a_deploy("go", parameters={"x": "${parameters.y}"})]},
             "spec.actions[0].deploy.parameters.x",

@@ -12,6 +12,7 @@ from wayside.rules import ClientSubject, Fields, PairSubject, RuleError, compile
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
 PAIRS = {"pairs": {"position": POSITION, "within": 250}}
+FLEET = {"fleet": {"members": "true"}}
 
 
 def problems(fields: dict[str, Fields] | None = None, **spec: Any) -> dict[str, str]:
@@ -37,10 +38,31 @@ def problems(fields: dict[str, Fields] | None = None, **spec: Any) -> dict[str, 
             "spec.signals[1].over",
             ["11s is longer than the 10 s", "stream speed", "shorten it, or raise the stream's buffer.duration"],
         ),
-        ({"signals": [SPEED | {"name": "client"}]}, "spec.signals[0].name", ["client is a name", "choose another"]),
-        ({"signals": [SPEED | {"name": "distance"}]}, "spec.signals[0].name", ["distance is a name"]),
-        ({"signals": [SPEED | {"name": "for"}]}, "spec.signals[0].name", ["for is a word of CEL", "choose another"]),
-        ({"signals": [SPEED | {"name": "list"}]}, "spec.signals[0].name", ["list is a word of CEL"]),
+        (
+            {"signals": [SPEED | {"name": "client"}]},
+            "spec.signals[0].name",
+            ["the scope client gives this name", "the client's name", "choose another name, such as clientValue"],
+        ),
+        (
+            {"signals": [SPEED | {"name": "distance"}], "scope": PAIRS},
+            "spec.signals[0].name",
+            ["the scope pairs gives this name", "the metres between the two", "such as distanceValue"],
+        ),
+        (
+            {"signals": [SPEED | {"name": "members"}, SPEED | {"name": "membersValue"}], "scope": FLEET},
+            "spec.signals[0].name",
+            ["the scope fleet gives this name", "such as membersValue2"],
+        ),
+        (
+            {"signals": [SPEED | {"name": "for"}]},
+            "spec.signals[0].name",
+            ["for is a word of CEL", "reserves", "such as forValue"],
+        ),
+        (
+            {"signals": [SPEED | {"name": "list"}]},
+            "spec.signals[0].name",
+            ["list is a word of CEL", "names a type", "such as listValue"],
+        ),
         ({"signals": [SPEED | {"name": "in"}], "scope": PAIRS}, "spec.signals[0].name", ["in is a word of CEL"]),
         ({"signals": [SPEED | {"value": "mgs.v"}]}, "spec.signals[0].value", ["column 1", "did you mean `msg`?"]),
         (
@@ -206,3 +228,19 @@ def test_a_streams_stamp_is_checked_like_a_rules_expressions() -> None:
 def test_what_the_types_cannot_tell_is_left_to_the_evaluation() -> None:
     rule = a_rule(signals=[SPEED], when="v > 3 && v.deep[0] == 'x'")
     assert compile_rule(rule, a_detector()).when.evaluate({"v": 1.0}) is False
+
+
+@pytest.mark.parametrize(
+    ("name", "scope"),
+    [
+        ("distance", {"client": {}}),
+        ("a", {"client": {}}),
+        ("position", FLEET),
+        ("members", PAIRS),
+        ("msg", {"client": {}}),
+        ("key", PAIRS),
+    ],
+)
+def test_a_name_that_only_another_scope_gives_is_free(name: str, scope: dict[str, Any]) -> None:
+    rule = a_rule(scope=scope, signals=[SPEED | {"name": name}], when="true")
+    assert [signal.name for signal in compile_rule(rule, a_detector()).signals] == [name]

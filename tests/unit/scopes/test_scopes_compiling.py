@@ -53,10 +53,11 @@ def in_pairs(**fields: Any) -> dict[str, Any]:
             "spec.scope.pairs.position.x",
             "site",
         ),
-        ({"each": {**EACH, "as": "labels"}, "when": "true"}, "spec.each.as", "labels is a name that"),
+        ({"each": {**EACH, "as": "labels"}, "when": "true"}, "spec.each.as", "the scope client gives this name"),
         ({"each": {**EACH, "as": "for"}, "when": "true"}, "spec.each.as", "for is a word of CEL"),
         ({"each": {**EACH, "as": "speed"}, "signals": [SPEED], "when": "true"}, "spec.each.as", "a signal's name"),
-        ({"signals": [{**SPEED, "name": "closingSpeed"}], "when": "true"}, "spec.signals[0].name", "closingSpeed"),
+        ({"each": {**EACH, "as": "msg"}, "when": "true"}, "spec.each.as", "a sample gives this name"),
+        ({**in_pairs(), "signals": [{**SPEED, "name": "closingSpeed"}]}, "spec.signals[0].name", "closingSpeed"),
     ],
 )
 def test_a_problem_names_its_field(spec: dict[str, Any], field: str, part: str) -> None:

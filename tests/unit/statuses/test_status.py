@@ -214,7 +214,11 @@ def test_an_evaluation_tells_what_it_saw_and_why_a_signal_is_unknown() -> None:
 def test_what_expressions_missed_or_failed_on_is_told() -> None:
     drive = Drive(a_detector(), a_rule("r", signals=[SPEED], when="v.x > 10"))
     explanation = explained(drive, "r", until=1, sent=[arrival(0.1, "a", {"v": 20}), arrival(0.2, "b", {})])
-    assert explanation.notes == ['no key "v" in the map', "Applying SELECT to non-message type", "no value for `v`"]
+    assert explanation.notes == [
+        'no key "v" in the map',
+        "`v` is 20.0, which has no field `x`: correct the path",
+        "no value for `v`",
+    ]
     assert len(explanation.subjects) == 2
 
 

@@ -1,0 +1,151 @@
+"""Which files are meant by what a command is given, and which of them are one recording.
+
+Folders stand for the recordings in them, patterns such as `drives/*.mcap` for what they match. Files are one recording
+where the metadata.yaml of their rosbag2 folder names them, and where a recorder split it: their names differ by a
+number that counts on, and each begins where the one before ends.
+"""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from detector.actions.record.description import DESCRIPTION
+from detector.replay.errors import RecordingError
+from detector.replay.recordings import check_kind, span_of
+
+Recording = tuple[Path, ...]
+"""The files that are one recording; or one rosbag2 folder."""
+
+_SPLIT = 10 * 10**9
+"""Nanoseconds: a recorder opens its next file sooner."""
+
+_OVERLAP = 10**9
+"""Nanoseconds: messages that were under way when a file was closed may stand in the next."""
+
+_DATE = re.compile(r"\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d|\d{14}")
+_NUMBERED = re.compile(r"(.*?)(\d+)([_.-]*)")
+_TEXT = (".jsonl", ".ndjson")
+_BINARY = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
+
+
+def recordings_of(given: Sequence[Path], *, as_one: bool = False) -> list[Recording]:
+    """The recordings that are given, in that order; as_one: all of them as a single one.
+
+    Raises RecordingError for what is missing or no recording, and for folders and patterns without any.
+    """
+    paths = paths_of(given)
+    for path in paths:
+        check_kind(path)
+    return [tuple(paths)] if as_one else list(_joined(paths))
+
+
+def paths_of(given: Iterable[Path]) -> list[Path]:
+    """Files, and rosbag2 folders: folders and patterns are replaced by what they hold. Each path once."""
+    found = [path for each in given for path in _expanded(each)]
+    return list({path.resolve(): path for path in found}.values())
+
+
+def _expanded(path: Path) -> Iterator[Path]:
+    if not path.exists() and glob.has_magic(str(path)):
+        matching = sorted((Path(each) for each in glob.glob(str(path), recursive=True)), key=_natural)
+        if not matching:
+            raise RecordingError(f"{path}: nothing matches: correct the pattern")
+        for each in matching:
+            yield from _expanded(each) if not each.is_dir() or _is_bag(each) or list(_inside(each)) else ()
+    elif path.is_dir() and not _is_bag(path):
+        inside = list(_inside(path))
+        if not inside:
+            kinds = ", ".join((*_BINARY, *_TEXT))
+            raise RecordingError(f"{path}: the folder holds no recording: give one with {kinds} or rosbag2 folders")
+        yield from inside
+    else:
+        yield path
+
+
+def _inside(folder: Path) -> Iterator[Path]:
+    """The recordings in a folder and its folders, by name; what is hidden or no recording is passed over."""
+    for path in sorted(folder.iterdir(), key=_natural):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            yield from (path,) if _is_bag(path) else _inside(path)
+        elif path.suffix in (*_BINARY, *_TEXT):
+            yield path
+
+
+def _is_bag(folder: Path) -> bool:
+    return (folder / "metadata.yaml").is_file() or (folder / DESCRIPTION).is_file()
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """By name, numbers by their value."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(path))]
+
+
+def _joined(paths: Sequence[Path]) -> Iterator[Recording]:
+    """The recordings, in the order of their first files."""
+    left = list(paths)
+    while left:
+        recording = _of_one_bag(left) or _split(left)
+        left = [path for path in left if path not in recording]
+        yield recording
+
+
+def _of_one_bag(paths: Sequence[Path]) -> Recording | None:
+    """The files of the rosbag2 folder that the first of the paths belongs to; the folder where they are all there."""
+    first = paths[0]
+    named = [] if first.is_dir() else _named_files(first.parent)
+    if first.name not in named:
+        return None
+    return tuple(sorted((path for path in paths if path.parent == first.parent and path.name in named), key=_natural))
+
+
+def _named_files(folder: Path) -> list[str]:
+    """The files that a folder's metadata.yaml names."""
+    try:
+        told = yaml.safe_load((folder / "metadata.yaml").read_text(encoding="utf-8"))
+        return [Path(each).name for each in told["rosbag2_bagfile_information"]["relative_file_paths"]]
+    except (OSError, ValueError, TypeError, LookupError, yaml.YAMLError):
+        return []
+
+
+def _split(paths: Sequence[Path]) -> Recording:
+    """The first of the paths, and the files that its recorder went on in."""
+    recording = [paths[0]]
+    numbered = {place: path for path in paths if (place := _place(path)) is not None}
+    place = _place(paths[0])
+    while place is not None:
+        place = place._replace(number=place.number + 1)
+        following = numbered.get(place)
+        if following is None or not _goes_on(recording[-1], following):
+            break
+        recording.append(following)
+    return tuple(recording)
+
+
+class _Place(NamedTuple):
+    """A file's place in a series of files."""
+
+    folder: Path
+    before: str
+    """What stands before the number in the name."""
+    behind: str
+    number: int
+
+
+def _place(path: Path) -> _Place | None:
+    """The series that a file's name belongs to, and its number there; None without a number. Dates do not count."""
+    found = None if path.is_dir() else _NUMBERED.fullmatch(_DATE.sub("", path.stem))
+    return None if found is None else _Place(path.parent, found[1], found[3] + path.suffix, int(found[2]))
+
+
+def _goes_on(one: Path, other: Path) -> bool:
+    """Whether the second begins where the first ends."""
+    first, second = span_of(one), span_of(other)
+    return first is not None and second is not None and -_OVERLAP <= second[0] - first[1] <= _SPLIT

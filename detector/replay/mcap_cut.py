@@ -1,0 +1,133 @@
+"""MCAP files without an index: their recorder was killed, or wrote none. They are gone through record by record.
+
+What lies before the cut is read, also the messages at the beginning of a chunk that was not written to its end, as far
+as its compression allows.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import BinaryIO, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Message, Schema
+
+MAGIC = b"\x89MCAP0\r\n"
+
+_RECORD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQII")
+"""The first and the last time, size and checksum of what is inside, and how long the name of its compression is."""
+_MESSAGE = struct.Struct("<HIQ")
+
+
+class Place(NamedTuple):
+    """Where a chunk lies, or a message outside of chunks."""
+
+    start: int
+    """Its first log time; nanoseconds."""
+    offset: int
+    length: int
+    """How many bytes of it there are."""
+    is_chunk: bool
+
+
+@dataclass
+class Contents:
+    """What a file without an index holds."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    places: list[Place] = field(default_factory=list)
+    cut: str | None = None
+    """Where the file ends, if not where it should."""
+
+
+def contents_of(file: BinaryIO) -> Contents:
+    """Goes through the file. Raises struct.error, ValueError, McapError where its records are damaged."""
+    found = Contents()
+    size = os.fstat(file.fileno()).st_size
+    at = len(MAGIC)
+    while True:
+        file.seek(at)
+        head = file.read(_RECORD.size)
+        if len(head) < _RECORD.size:
+            found.cut = "it ends without a footer"
+            return found
+        opcode, length = _RECORD.unpack(head)
+        if not opcode:
+            found.cut = f"nothing was written from byte {at} on"
+            return found
+        at += _RECORD.size
+        there = min(length, size - at)
+        if opcode == Opcode.CHUNK and there >= _CHUNK.size:
+            found.places.append(Place(_CHUNK.unpack(file.read(_CHUNK.size))[0], at, there, is_chunk=True))
+        elif opcode == Opcode.MESSAGE and there == length:
+            found.places.append(Place(_MESSAGE.unpack(file.read(_MESSAGE.size))[2], at, there, is_chunk=False))
+        if there < length:
+            found.cut = f"a record of {length} bytes at byte {at} reaches beyond the end"
+            return found
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            _define(opcode, file.read(length), found)
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            return found
+        at += length
+
+
+def messages_at(file: BinaryIO, place: Place, contents: Contents) -> Iterator[Message]:
+    """The messages of a chunk, or the one that lies there; schemas and channels on the way are added to the contents.
+
+    Raises ValueError, McapError where the chunk is damaged.
+    """
+    file.seek(place.offset)
+    data = file.read(place.length)
+    if not place.is_chunk:
+        yield Message.read(_stream(data), place.length)
+        return
+    name = _CHUNK.unpack_from(data)[-1]
+    start = _CHUNK.size + name
+    compression = data[_CHUNK.size : start].decode()
+    inside = _unpacked(compression, data[start + 8 :])
+    at = 0
+    while at + _RECORD.size <= len(inside):
+        opcode, length = _RECORD.unpack_from(inside, at)
+        at += _RECORD.size
+        record = inside[at : at + length]
+        if len(record) < length:
+            return
+        if opcode == Opcode.MESSAGE:
+            yield Message.read(_stream(record), length)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            _define(opcode, record, contents)
+        at += length
+
+
+def _define(opcode: int, data: bytes, contents: Contents) -> None:
+    if opcode == Opcode.SCHEMA:
+        schema = Schema.read(_stream(data))
+        contents.schemas[schema.id] = schema
+    else:
+        channel = Channel.read(_stream(data))
+        contents.channels[channel.id] = channel
+
+
+def _unpacked(compression: str, data: bytes) -> bytes:
+    """As much as there is, of data that may end too early."""
+    unpack: dict[str, Callable[[bytes], bytes]] = {
+        "": bytes,
+        "lz4": lambda packed: bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed)),
+        "zstd": lambda packed: zstandard.ZstdDecompressor().decompressobj().decompress(packed),
+    }
+    if compression not in unpack:
+        raise ValueError(f"no compression of MCAP is called {compression!r}")
+    return unpack[compression](data)
+
+
+def _stream(data: bytes) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(data))

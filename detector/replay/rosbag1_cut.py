@@ -1,0 +1,162 @@
+"""ROS 1 bags that were not closed: they have no index, so they are gone through record by record.
+
+A bag (format 2.0) is a row of records, each a header of named fields and data. Chunks are records whose data are
+records again, perhaps compressed: connections and messages.
+"""
+
+from __future__ import annotations
+
+import bz2
+import os
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import lz4.frame
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
+from rosbags.typesys.msg import normalize_msgtype
+
+_MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
+_LENGTH = struct.Struct("<I")
+_TIME = struct.Struct("<II")
+
+_UNPACK: dict[str, Callable[[bytes], bytes]] = {
+    "none": bytes,
+    "bz2": lambda data: bz2.BZ2Decompressor().decompress(data),
+    "lz4": lambda data: bytes(lz4.frame.LZ4FrameDecompressor().decompress(data)),
+}
+"""As much as there is, of data that may end too early."""
+
+
+class Recorded(NamedTuple):
+    """One message."""
+
+    time: int
+    """Nanoseconds since the epoch."""
+    connection: int
+    payload: bytes
+
+
+class Chunk(NamedTuple):
+    """Where a chunk's data lie, how they are compressed, and the time of the first of its messages (nanoseconds)."""
+
+    start: int
+    offset: int
+    length: int
+    compression: str
+
+
+@dataclass
+class Contents:
+    """What a bag without an index holds."""
+
+    connections: dict[int, Connection] = field(default_factory=dict)
+    chunks: list[Chunk] = field(default_factory=list)
+    cut: str | None = None
+    """Where the bag ends, if not where it should."""
+
+
+def contents_of(path: Path, magic: bytes) -> Contents:
+    """Goes through the bag. Raises OSError, ValueError, LookupError, struct.error where its records are damaged."""
+    found = Contents()
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        at = len(magic)
+        while at < size:
+            file.seek(at)
+            header = _header(file)
+            length = _length(file)
+            if header is None or length is None:
+                found.cut = f"it ends inside a record's header at byte {at}"
+                return found
+            at = file.tell()
+            there = min(length, size - at)
+            if header["op"][0] == _CHUNK:
+                data = file.read(there)
+                compression = header["compression"].decode()
+                times = [each.time for each in _messages(data, compression, found)]
+                if times:
+                    found.chunks.append(Chunk(min(times), at, there, compression))
+            if there < length:
+                found.cut = f"a record of {length} bytes at byte {at} reaches beyond the end"
+                return found
+            at += length
+    found.cut = "it was not closed"
+    return found
+
+
+def messages_of(path: Path, chunk: Chunk, contents: Contents) -> Iterator[Recorded]:
+    """The messages of a chunk, as they lie there."""
+    with path.open("rb") as file:
+        file.seek(chunk.offset)
+        return _messages(file.read(chunk.length), chunk.compression, contents)
+
+
+def _messages(data: bytes, compression: str, contents: Contents) -> Iterator[Recorded]:
+    if compression not in _UNPACK:
+        raise ValueError(f"no compression of bags is called {compression!r}")
+    inside = _UNPACK[compression](data)
+    at = 0
+    while (found := _record(inside, at)) is not None:
+        header, body, at = found
+        match header["op"][0]:
+            case op if op == _CONNECTION:
+                connection = _connection(header, body)
+                contents.connections[connection.id] = connection
+            case op if op == _MESSAGE:
+                seconds, nanoseconds = _TIME.unpack(header["time"])
+                number = _LENGTH.unpack(header["conn"])[0]
+                yield Recorded(seconds * 10**9 + nanoseconds, number, body)
+
+
+def _connection(header: dict[str, bytes], body: bytes) -> Connection:
+    described = _fields(body)
+    return Connection(
+        _LENGTH.unpack(header["conn"])[0],
+        header["topic"].decode(),
+        normalize_msgtype(described["type"].decode()),
+        MessageDefinition(MessageDefinitionFormat.MSG, described["message_definition"].decode(errors="replace")),
+        described["md5sum"].decode(),
+        0,
+        ConnectionExtRosbag1(None, None),
+        None,
+    )
+
+
+def _record(data: bytes, at: int) -> tuple[dict[str, bytes], bytes, int] | None:
+    """Header and data of a record, and where it ends; None where not all of it is there."""
+    parts = []
+    for _ in range(2):
+        if at + _LENGTH.size > len(data):
+            return None
+        (length,) = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size
+        if at + length > len(data):
+            return None
+        parts.append(data[at : at + length])
+        at += length
+    return _fields(parts[0]), parts[1], at
+
+
+def _header(file: BinaryIO) -> dict[str, bytes] | None:
+    length = _length(file)
+    data = b"" if length is None else file.read(length)
+    return None if length is None or len(data) < length else _fields(data)
+
+
+def _length(file: BinaryIO) -> int | None:
+    data = file.read(_LENGTH.size)
+    return int(_LENGTH.unpack(data)[0]) if len(data) == _LENGTH.size else None
+
+
+def _fields(data: bytes) -> dict[str, bytes]:
+    fields: dict[str, bytes] = {}
+    at = 0
+    while at < len(data):
+        (length,) = _LENGTH.unpack_from(data, at)
+        name, _, value = data[at + _LENGTH.size : at + _LENGTH.size + length].partition(b"=")
+        fields[name.decode()] = value
+        at += _LENGTH.size + length
+    return fields
