@@ -128,7 +128,10 @@ def _pairs(
 
 
 def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) -> float | None:
-    return None if one is None or other is None else math.dist(one, other)
+    if one is None or other is None:
+        return None
+    dx, dy, dz = (p - q for p, q in zip(one, other, strict=True))
+    return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 def _place(position: dict[str, str], client: str, world: World, then: int, now: int) -> tuple[float, ...] | None:

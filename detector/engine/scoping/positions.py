@@ -97,10 +97,17 @@ def described(position: CompiledPosition, place: Place) -> dict[str, float]:
 
 
 def distance(position: CompiledPosition, one: Place, other: Place) -> float:
-    """Metres, straight in a flat frame, along the surface on the Earth."""
+    """Metres, straight in a flat frame, along the surface on the Earth.
+
+    The same number whichever of the two comes first. In a flat frame √(dx² + dy² + dz²), rounded after each operation,
+    so that whoever computes it in this order gets the same number.
+    """
     if position.geographic:
         return geodesy.distance(*one, *other)
-    return math.dist(one, other)
+    squares = 0.0
+    for p, q in zip(one, other, strict=True):
+        squares += (p - q) * (p - q)
+    return math.sqrt(squares)
 
 
 def point(position: CompiledPosition, place: Place) -> Point:

@@ -229,8 +229,8 @@ def _member(
 
 
 def _closing_speed(views: Views, subject: PairSubject, a: str, b: str, variables: dict[str, Any]) -> None:
-    """Minus the change of distance over the last second, in m/s; unknown where one's place a second ago is."""
+    """By how much the distance has shrunk over the last second, in m/s; unknown where one's place a second ago is."""
     a_place, b_place = views.earlier_place(subject, a), views.earlier_place(subject, b)
     if a_place is not None and b_place is not None:
-        change = variables["distance"] - distance(subject.position, a_place, b_place)
-        variables["closingSpeed"] = -change / (CLOSING_NS / 1e9)
+        before = distance(subject.position, a_place, b_place)
+        variables["closingSpeed"] = (before - variables["distance"]) / (CLOSING_NS / 1e9)
