@@ -24,6 +24,7 @@ from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.evaluation import Answer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
+from detector.engine.timing.timeline import ORDER
 from detector.losses import Losses
 from detector.memory import Sweeper
 from detector.overload import LONG, Overload
@@ -126,6 +127,7 @@ class Evaluator:
             start,
             {
                 "kind": "start",
+                "order": ORDER,
                 "holder": self._engine.identity.holder,
                 "detector": rule_set.detector.to_json(),
                 "rules": [rule.to_json() for rule in rule_set.rules],
@@ -198,7 +200,7 @@ class Evaluator:
                 self.status.looked()
                 self.losses.say()
                 self._sweeper.look()
-            self._record(self._engine.now, {"kind": "end"})
+            self._finish()
             self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
         except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
             self._on_failure(error)
@@ -207,6 +209,12 @@ class Evaluator:
                 self._ended = True
                 for future, _ in self._calls:
                     future.cancel()
+
+    def _finish(self) -> None:
+        """Nothing more comes: evaluate what is still to be evaluated, as the replay of the recording will."""
+        self._record(self._engine.now, {"kind": "end", "finished": True})
+        for events in self._engine.finish():
+            self._hand_over(events)
 
     def pause(self) -> float:
         """Seconds until there is something to do. With clock Data only the samples say when a tick is due."""

@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import strategies as st
 
 HALF = 500_000_000
-"""Nanoseconds; most times are whole multiples, so that samples meet ticks, window edges and timeouts exactly."""
+"""Nanoseconds; all times are whole multiples, so that samples meet each other, ticks, window edges and timeouts."""
 
 CLIENTS = ("a", "b", "c")
 
@@ -19,6 +19,7 @@ _BIG = 2**53 + 1
 _values = st.sampled_from(
     [
         0.0,
+        -0.0,
         1.0,
         1.5,
         2.0,
@@ -57,7 +58,7 @@ _places = st.fixed_dictionaries(
 
 @dataclass(frozen=True)
 class Message:
-    """One message on its way: when it was sent, and how much later it arrives than it should; half seconds."""
+    """One message: when it was sent, and with clock Data how much later than that it arrives; half seconds."""
 
     time: int
     delay: int
@@ -74,6 +75,8 @@ class Scene:
     messages: tuple[Message, ...]
     data: bool
     """Whether with clock Data."""
+    lateness: int
+    """With clock Data; half seconds."""
     gap: tuple[int, int] | None
     """With clock Wall, from when to when there are no ticks; half seconds."""
 
@@ -227,4 +230,4 @@ def scenes(draw: st.DrawFn) -> Scene:
         messages += [Message(time, 0, client, "pose", draw(_places)) for time in range(1, 20, 2) for client in "ab"]
     data = draw(st.booleans())
     gap = None if data or draw(st.integers(0, 3)) else draw(st.tuples(st.integers(5, 15), st.integers(16, 25)))
-    return Scene(rules, tuple(messages), data, gap)
+    return Scene(rules, tuple(messages), data, draw(st.sampled_from((0, 1, 2, 2))), gap)

@@ -53,15 +53,11 @@ class LatchedLane(Lane):
         super().__init__(client, stream, duration, maximum_bytes, maximum_count)
         self._topic = topic
         self._topics: dict[Sample, Hashable] = {}
+        """What samples speak of, as far as it was asked; equal samples speak of the same."""
 
     def _decide(self) -> None:
         """Every sample comes through `insert`."""
         self.capped = True
-
-    def insert(self, sample: Sample) -> int:
-        """See Lane."""
-        self._topics[sample] = self._topic(sample.key, sample.payload)
-        return super().insert(sample)
 
     def drop_oldest(self) -> int:
         """See Lane."""
@@ -73,21 +69,25 @@ class LatchedLane(Lane):
         horizon = now - self.duration
         if not self.samples or self.samples[0].time > horizon:
             return 0
-        newest = {self._topics[sample]: sample for sample in self.samples}
-        return self._keep([s for s in self.samples if s.time > horizon or newest[self._topics[s]] is s])
+        newest = {self._about(sample): sample for sample in self.samples}
+        return self._keep([s for s in self.samples if s.time > horizon or newest[self._about(s)] is s])
 
     def step_back(self, to: int) -> None:
         """Time goes on from `to`: what was said still holds, and was not said after that."""
-        topics = {_not_after(sample, to): self._topics[sample] for sample in self.samples}
-        self._topics = topics
-        self._keep(list(topics))
+        self._keep([_not_after(sample, to) for sample in self.samples])
         self.latest = self.samples[-1].time if self.samples else NEVER
+
+    def _about(self, sample: Sample) -> Hashable:
+        """What the sample speaks of."""
+        if sample not in self._topics:
+            self._topics[sample] = self._topic(sample.key, sample.payload)
+        return self._topics[sample]
 
     def _keep(self, samples: list[Sample]) -> int:
         """Hold these and no others; returns the bytes freed."""
         before = self.bytes
         self.samples = deque(samples)
-        self._topics = {sample: self._topics[sample] for sample in samples}
+        self._topics = {sample: self._about(sample) for sample in samples}
         self.bytes = sum(len(sample.payload) + SAMPLE_OVERHEAD for sample in samples)
         return before - self.bytes
 
