@@ -27,7 +27,7 @@ from detector.engine.signals.starts import Starts
 from detector.engine.timing.data import DataTimeline
 from detector.engine.timing.schedule import Only, Schedule
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
-from detector.engine.timing.ticks import Ticks
+from detector.engine.timing.ticks import HOUSEKEEPING, Ticks
 from detector.engine.timing.timeline import ORDER, Timeline
 from detector.engine.timing.wall import WallTimeline
 from wayside.api import Detector
@@ -339,7 +339,8 @@ class Engine:
     def _keep_house(self, time: int) -> None:
         """Forget old samples and lost clients."""
         lost = self._known.age(time)
-        self._starts.buffer.expire(time)
+        if time % HOUSEKEEPING == 0:
+            self._starts.buffer.expire(time)
         if lost:
             self._starts.lose(lost)
             self._plugins.lose(lost)

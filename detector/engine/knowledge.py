@@ -22,6 +22,7 @@ from detector.engine.scoping.positions import Positions
 from detector.engine.scoping.scopes import Views
 from detector.engine.signals.signals import Signals
 from detector.engine.signals.starts import Starts
+from detector.engine.timing.ticks import HOUSEKEEPING
 from wayside.api import Detector
 from wayside.api.stream import Encoding, Stream
 from wayside.rules import compile_stream
@@ -100,8 +101,9 @@ class Knowledge:
         self._positions = Positions(self.buffer, self.messages, self._stale_after, self._floor)
 
     def age(self, time: int) -> list[str]:
-        """Forget old samples and lost clients; returns who is lost."""
-        self.buffer.expire(time)
+        """Forget old samples, at whole seconds, and lost clients; returns who is lost."""
+        if time % HOUSEKEEPING == 0:  # not with the ticks of a rule: what the caps push out would depend on rules
+            self.buffer.expire(time)
         for client, latest in self.buffer.latest():
             self.clients.still_heard(client, latest)
         lost = self.clients.lose(time)

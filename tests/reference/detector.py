@@ -159,6 +159,8 @@ class Reference:
     def _tick(self, sampled: set[tuple[str, str]]) -> None:
         """`sampled` has the streams and clients of the samples of this very time."""
         regular = any(self.now % period == 0 for period in self._periods())
+        if self.now % SECOND == 0:
+            self.world.sweep(self.now)
         if regular:
             lost = self.world.lose(self.now)
             self.starts = [_without(each, lost) for each in self.starts]

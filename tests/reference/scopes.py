@@ -142,6 +142,8 @@ def _place(position: dict[str, str], client: str, world: World, then: int, now: 
     limit = world.stale_after[position["stream"]]
     if not mine or (limit is not None and then - mine[-1].time > limit):
         return None
+    if mine[-1].message is None:
+        return None
     axes = [mine[-1].message.get(position[axis].removeprefix("msg.")) for axis in ("x", "y")]
     if not all(isinstance(axis, float) and abs(axis) <= 1e12 for axis in axes):
         return None

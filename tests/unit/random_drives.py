@@ -16,6 +16,9 @@ DURATIONS = ("0s", "500ms", "1s", "2s", "3s")
 
 _BIG = 2**53 + 1
 
+BROKEN = None
+"""A message that cannot be read."""
+
 _values = st.sampled_from(
     [
         0.0,
@@ -44,7 +47,7 @@ _messages = st.one_of(
     st.sampled_from([{"v": 3.0, "w": 1.0}, {"v": 1.0, "w": 1.0}]),
     st.fixed_dictionaries({"v": st.sampled_from([0.0, 1.0, 1.5, 2.0, 3.0])}),
     st.fixed_dictionaries({"v": _values, "w": st.sampled_from([0.0, 1.0, 2.0])}),
-    st.sampled_from([{}, {"w": 1.0}]),
+    st.sampled_from([{}, {"w": 1.0}, BROKEN]),
 )
 
 _places = st.fixed_dictionaries(
@@ -53,7 +56,7 @@ _places = st.fixed_dictionaries(
         "y": st.sampled_from([0.0, 0.0, 0.0, 4.0, float("nan")]),
         "v": st.sampled_from([0.0, 1.0, 2.0]),
     }
-)
+) | st.just(BROKEN)
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,12 @@ class Scene:
     """With clock Data; half seconds."""
     gap: tuple[int, int] | None
     """With clock Wall, from when to when there are no ticks; half seconds."""
+    count: int | None
+    """How many samples of a client's speed are kept."""
+    pose_bytes: int | None
+    """How many bytes of a client's poses are kept."""
+    all_bytes: int | None
+    """With clock Wall, how many bytes are kept over all."""
 
 
 _message = st.builds(
@@ -230,4 +239,13 @@ def scenes(draw: st.DrawFn) -> Scene:
         messages += [Message(time, 0, client, "pose", draw(_places)) for time in range(1, 20, 2) for client in "ab"]
     data = draw(st.booleans())
     gap = None if data or draw(st.integers(0, 3)) else draw(st.tuples(st.integers(5, 15), st.integers(16, 25)))
-    return Scene(rules, tuple(messages), data, draw(st.sampled_from((0, 1, 2, 2))), gap)
+    return Scene(
+        rules,
+        tuple(messages),
+        data,
+        draw(st.sampled_from((0, 1, 2, 2))),
+        gap,
+        draw(st.sampled_from((None, None, 1, 2, 4))),
+        draw(st.sampled_from((None, None, 1, 500, 900))),
+        None if data else draw(st.sampled_from((None, None, 1000, 3000))),
+    )

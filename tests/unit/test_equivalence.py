@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from detector.assembly import inlets
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
-from detector.engine.samples.sample import Arrival
+from detector.engine.samples.sample import Arrival, DecodeError
 from tests.reference.detector import Reference, Told
 from tests.reference.world import SECOND, Sample, World
 from tests.unit.driving import START, a_detector, a_rule, a_stream, compiled
-from tests.unit.random_drives import HALF, Message, Scene, scenes
+from tests.unit.random_drives import BROKEN, HALF, Message, Scene, scenes
 from wayside.rules import dependency_problems
 
 TIMEOUT, KEPT = 4 * SECOND, 6 * SECOND
@@ -34,10 +34,16 @@ class Plain:
     """Reads payloads as Python does, since JSON proper has no NaN."""
 
     def decode(self, payload: bytes) -> Any:
-        return json.loads(payload)["m"]
+        return self._read(payload)["m"]
 
     def stamp(self, payload: bytes) -> int | None:
-        return int(json.loads(payload)["t"])
+        return int(self._read(payload)["t"])
+
+    def _read(self, payload: bytes) -> Any:
+        try:
+            return json.loads(payload)
+        except ValueError as error:
+            raise DecodeError(str(error)) from None
 
 
 def ordered(scene: Scene) -> list[tuple[int, Message]]:
@@ -49,11 +55,15 @@ def ordered(scene: Scene) -> list[tuple[int, Message]]:
 def by_the_engine(scene: Scene) -> list[Event]:
     lateness = f"{scene.lateness * 500}ms"
     clock = {"clock": "Data", "lateness": lateness, "maxAhead": "1h"} if scene.data else {}
+    caps = {"speed": {"count": scene.count}, "pose": {"bytes": scene.pose_bytes}}
     streams = [
-        a_stream(name, staleAfter="Never" if stale is None else f"{stale // SECOND}s")
+        a_stream(
+            name, staleAfter="Never" if stale is None else f"{stale // SECOND}s", buffer=_given(caps.get(name, {}))
+        )
         for name, stale in STREAMS.items()
     ]
-    detector = a_detector(*streams, clientTimeout="4s", buffer={"duration": "6s"}, **clock)
+    buffer = _given({"duration": "6s", "bytes": scene.all_bytes})
+    detector = a_detector(*streams, clientTimeout="4s", buffer=buffer, **clock)
     entries = inlets(detector)
     decoders = dict.fromkeys(STREAMS, Plain())
     engine = Engine(detector, holder="h", decoders=decoders, read_key=entries.read_key, start=START)
@@ -79,12 +89,19 @@ def by_the_engine(scene: Scene) -> list[Event]:
     return events + [event for step in engine.finish() for event in step]
 
 
+def _given(fields: dict[str, Any]) -> dict[str, Any]:
+    """Those that are given; numbers of bytes as the kind wants them."""
+    return {name: str(value) if name == "bytes" else value for name, value in fields.items() if value is not None}
+
+
 def payload_of(time: int, message: Message) -> bytes:
-    return json.dumps({"t": time, "m": message.message}).encode()
+    whole = json.dumps({"t": time, "m": message.message}).encode()
+    return whole[:-1] if message.message is BROKEN else whole
 
 
 def by_the_reference(scene: Scene) -> list[Told]:
-    world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS)
+    counts, sizes = _given({"speed": scene.count}), _given({"pose": scene.pose_bytes})
+    world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes)
     lateness = scene.lateness * HALF if scene.data else None
     reference = Reference(scene.rules, world, lateness=lateness, start=START, keep_starts=KEPT)
     gap = scene.gap
@@ -93,6 +110,8 @@ def by_the_reference(scene: Scene) -> list[Told]:
             reference.advance(START + gap[0] * HALF)
             reference.gap(START + gap[1] * HALF)
             gap = None
+        if scene.data and each.message is BROKEN:
+            continue  # it has no stamp, so nobody knows when it was sent
         reference.arrive(Sample(time, number, each.client, each.stream, each.message, payload_of(time, each), time))
     if not scene.data:
         reference.advance(END)

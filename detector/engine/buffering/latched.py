@@ -7,7 +7,7 @@ The newest sample about each is kept beyond the duration; caps push it out last 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 
 from detector.engine.buffering.buffer import NEVER, Lane
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample, Stamped
@@ -71,6 +71,18 @@ class LatchedLane(Lane):
             return 0
         newest = {self._about(sample): sample for sample in self.samples}
         return self._keep([s for s in self.samples if s.time > horizon or newest[self._about(s)] is s])
+
+    def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
+        """See Lane; what is older than the duration is left out where the same was said anew since."""
+        horizon = (until if now is None else now) - self.duration
+        said: set[Hashable] = set()
+        for sample in reversed(self.samples):
+            if after is not None and sample.time <= after:
+                return
+            about = self._about(sample)
+            if sample.time <= until and (sample.time > horizon or about not in said):
+                yield sample
+            said.add(about)
 
     def step_back(self, to: int) -> None:
         """Time goes on from `to`: what was said still holds, and was not said after that."""

@@ -52,10 +52,12 @@ class Positions:
             return None
         return self._place(position, client, sample, counters)
 
-    def then(self, position: CompiledPosition, client: str, then: int, counters: RuleCounters) -> Place | None:
+    def then(
+        self, position: CompiledPosition, client: str, then: int, now: int, counters: RuleCounters
+    ) -> Place | None:
         """Where the client was at a past time, by the newest sample up to then; None like `now`."""
         lane, limit = self._buffer.lane(client, position.stream), self._limit(position)
-        sample = None if lane is None else next(lane.newest_first(self._floor, then), None)
+        sample = None if lane is None else next(lane.newest_first(self._floor, then, now), None)
         if sample is None or (limit is not None and then - sample.time > limit):
             counters.unknowns += 1
             return None

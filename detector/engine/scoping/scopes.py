@@ -106,7 +106,7 @@ class Views:
         """Where the client was a second ago, if that is known; looked up once a tick."""
         if client not in self._earlier:
             then = self._now - CLOSING_NS
-            self._earlier[client] = self._positions.then(subject.position, client, then, self._counters)
+            self._earlier[client] = self._positions.then(subject.position, client, then, self._now, self._counters)
         return self._earlier[client]
 
     def truth(self, expression: Expression | None, variables: Mapping[str, Any]) -> Truth:
