@@ -212,9 +212,11 @@ class Evaluator:
 
     def _finish(self) -> None:
         """Nothing more comes: evaluate what is still to be evaluated, as the replay of the recording will."""
-        self._record(self._engine.now, {"kind": "end", "finished": True})
+        end = self._engine.now
         for events in self._engine.finish():
             self._hand_over(events)
+        self._record_outages()
+        self._record(end, {"kind": "end", "finished": True})
 
     def pause(self) -> float:
         """Seconds until there is something to do. With clock Data only the samples say when a tick is due."""
@@ -267,10 +269,13 @@ class Evaluator:
         self.status.arrived(arrivals)
         begin = self._engine.stopwatch()
         events = self._engine.advance(arrivals, now)
-        for document in self._outages.news():
-            self._record(self._engine.now, document)
+        self._record_outages()
         self._adapt(self._engine.stopwatch() - begin)
         return events
+
+    def _record_outages(self) -> None:
+        for document in self._outages.news():
+            self._record(self._engine.now, document)
 
     def _gap(self, now: int, why: str) -> list[Event]:
         _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)

@@ -177,7 +177,7 @@ class DetectorSpec(Model):
     )
     lateness: Duration = Field(
         default=Duration("200ms"),
-        description="With clock Data: the tick t runs once a stamp of at least t + lateness was seen.",
+        description="With clock Data: tick t runs once a stamp of at least t + lateness, and later than t, was seen.",
     )
     max_ahead: Duration = Field(
         default=Duration("1s"),
