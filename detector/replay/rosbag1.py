@@ -37,6 +37,7 @@ def read_rosbag1(path: Path, wanted: Wanted) -> Iterator[Message]:
                 return
             types = _types(connections)
             _compare(path, types, connections)
+            _order(reader, connections)
             for connection, time, payload in reader.messages(connections):
                 try:
                     cdr = bytes(types.ros1_to_cdr(payload, connection.msgtype))
@@ -66,6 +67,13 @@ def _as_ros2(connection: Connection) -> str:
         return _types([connection]).generate_msgdef(connection.msgtype, ros_version=2)[0]
     except TypesysError:
         return connection.msgdef.data
+
+
+def _order(reader: Reader, connections: Sequence[Connection]) -> None:
+    """Of equal times, let the place in the bag decide: rosbags would give one connection after the other."""
+    entries = sorted((entry for each in connections for entry in reader.indexes[each.id]), key=tuple)
+    reader.indexes.update((each.id, []) for each in connections)
+    reader.indexes[connections[0].id] = entries
 
 
 def _damaged(path: Path, error: Exception) -> RecordingError:
