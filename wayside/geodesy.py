@@ -34,14 +34,10 @@ def cartesian(latitude: float, longitude: float) -> tuple[float, float, float]:
 def distance(latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float) -> float:
     """The way along the surface between two places, in metres; of the heights nothing is known.
 
-    The same number in both directions: it is computed from the place with the smaller latitude, then longitude.
-
     Vincenty's inverse formula ("Direct and inverse solutions of geodesics on the ellipsoid", Survey Review 176, 1975),
     to less than a millimetre. Between places that lie almost opposite to each other on the globe it does not converge:
     there, half the globe away, the distance on a sphere of the mean radius is given, which is up to 0.6 % off.
     """
-    if (latitude_1, longitude_1) > (latitude_2, longitude_2):
-        latitude_1, longitude_1, latitude_2, longitude_2 = latitude_2, longitude_2, latitude_1, longitude_1
     reduced_1, reduced_2 = _reduced(latitude_1), _reduced(latitude_2)
     sin_1, cos_1, sin_2, cos_2 = math.sin(reduced_1), math.cos(reduced_1), math.sin(reduced_2), math.cos(reduced_2)
     # The shorter way around, and without the rounding of a difference of 360 degrees.

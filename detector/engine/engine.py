@@ -70,7 +70,7 @@ class Engine:
         self._ticks = Ticks()
         self.schedule = Schedule(self._ticks)
         self._starts = Starts()
-        self._known = Knowledge(detector, decoders, read_key, start, self.counters, self._starts)
+        self._known = Knowledge(detector, decoders, read_key, start, self.counters, self._starts, exact=self._exact)
         self.buffer, self.clients = self._known.buffer, self._known.clients
         self.stopwatch: Callable[[], int] = int
         """Gives nanoseconds of any clock; the shell sets one that runs. What it says is counted and decides nothing."""

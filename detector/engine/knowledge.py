@@ -44,8 +44,10 @@ class Knowledge:
         start: int,
         counters: Counters,
         starts: Starts,
+        *,
+        exact: bool = True,
     ) -> None:
-        """`starts` are the episode starts that signals over rules look at.
+        """`starts` are the episode starts that signals over rules look at. `exact`: see `timeline.ORDER`.
 
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
@@ -55,6 +57,7 @@ class Knowledge:
         self.inflow = Inflow(self.buffer, self.clients, counters)
         self._counters = counters
         self._starts = starts
+        self._exact = exact
         self._floor: int | None = None
         """Windows do not reach back further than the last gap; nanoseconds."""
         self._configure(detector, decoders, read_key, start)
@@ -156,6 +159,7 @@ class Knowledge:
             self._positions,
             self._stale_after,
             run.counters,
+            exact=self._exact,
         )
 
     def queries(self, now: int) -> BufferQueries:

@@ -60,8 +60,3 @@ def test_a_distance_is_the_same_both_ways_and_never_shorter_than_the_straight_li
     if chord < 1_000:
         assert length == pytest.approx(chord, abs=1e-5)
     assert distance(a, b, a, b) == 0
-
-
-@given(latitudes, longitudes, latitudes, longitudes)
-def test_the_distance_is_the_same_number_in_both_directions(a: float, b: float, c: float, d: float) -> None:
-    assert distance(a, b, c, d) == distance(c, d, a, b)

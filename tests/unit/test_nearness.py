@@ -118,6 +118,13 @@ def test_a_pair_whose_distance_is_exactly_within_is_found_on_the_earth_however_m
     assert sorted(near_pairs(asked, within, 10_000).pairs) == sorted(obvious(asked, within, 10_000).pairs)
 
 
+@given(degrees, degrees)
+def test_the_distance_on_the_earth_is_the_same_number_in_both_directions(
+    one: tuple[float, float], other: tuple[float, float]
+) -> None:
+    assert distance(EARTH, one, other) == distance(EARTH, other, one)
+
+
 @given(points, points)
 def test_the_distance_in_a_flat_frame_is_the_number_that_columns_come_to(one: Point, other: Point) -> None:
     apart = np.array([one]) - np.array([other])

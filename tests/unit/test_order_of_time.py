@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -257,7 +258,7 @@ def test_at_the_end_all_that_waits_is_in_the_buffer() -> None:
 # Intake files of detectors that kept another order
 
 
-def recorded_before(detector: Detector, rules: Sequence[Any], *records: Arrival | Control) -> list[str]:
+def replayed_before(detector: Detector, rules: Sequence[Any], *records: Arrival | Control) -> list[Event]:
     """The replay of an intake file that says nothing of an order of time, nor of its end."""
     start = {
         "kind": "start",
@@ -266,7 +267,11 @@ def recorded_before(detector: Detector, rules: Sequence[Any], *records: Arrival 
         "rules": [rule.to_json() for rule in rules],
     }
     end = Control(at(9), {"kind": "end"})
-    return told(replay_intake([Control(START, start), *records, end], None, None).events)
+    return replay_intake([Control(START, start), *records, end], None, None).events
+
+
+def recorded_before(detector: Detector, rules: Sequence[Any], *records: Arrival | Control) -> list[str]:
+    return told(replayed_before(detector, rules, *records))
 
 
 def stamped(step: int, value: float) -> Arrival:
@@ -287,3 +292,17 @@ def test_an_intake_file_that_does_not_say_its_order_replays_as_it_was() -> None:
     sample = a_rule("sample", signals=[V], when="v > 10", evaluation={"onSample": "speed"})
     gap = Control(at(7.5), {"kind": "gap", "until": at(0.9)})
     assert recorded_before(detector_of({}), [sample], stamped(5, 1), gap, stamped(30, 20)) == ["sample car started 3"]
+
+
+def test_an_intake_file_that_does_not_say_its_order_has_the_distances_of_then_to_the_last_digit() -> None:
+    rule = a_rule(scope=APART["scope"], when="closingSpeed == 0.0", evaluation={"every": "500ms"})
+    a, b = (8.1, 0.6183689966753316), (4.3, 0.9170189691149498)
+    arrivals = [
+        arrival(t, client, {"x": x, "y": y}, "pose") for t in (0.5, 1, 1.5) for client, (x, y) in (("a", a), ("b", b))
+    ]
+    (event,) = replayed_before(a_detector(), [rule], *arrivals)
+    assert (event.values["distance"], str(event.values["closingSpeed"])) == (math.dist(a, b), "-0.0")
+    (event,) = replay_arrivals(arrivals, a_detector(), [rule]).events
+    dx, dy = a[0] - b[0], a[1] - b[1]
+    assert event.values["distance"] == math.sqrt(dx * dx + dy * dy) != math.dist(a, b)
+    assert str(event.values["closingSpeed"]) == "0.0"

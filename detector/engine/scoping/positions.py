@@ -105,11 +105,16 @@ def distance(position: CompiledPosition, one: Place, other: Place) -> float:
     so that whoever computes it in this order gets the same number.
     """
     if position.geographic:
-        return geodesy.distance(*one, *other)
+        return geodesy.distance(*min(one, other), *max(one, other))
     squares = 0.0
     for p, q in zip(one, other, strict=True):
         squares += (p - q) * (p - q)
     return math.sqrt(squares)
+
+
+def distance_of_order_1(position: CompiledPosition, one: Place, other: Place) -> float:
+    """What it was for detectors of order 1 (see `timeline.ORDER`): it differs in the last digits."""
+    return geodesy.distance(*one, *other) if position.geographic else math.dist(one, other)
 
 
 def point(position: CompiledPosition, place: Place) -> Point:

@@ -11,5 +11,6 @@ ORDER = 2
 """The order of time that an engine keeps; an intake file names the one of its detector, so that it replays as it was.
 
 A file that names none has order 1. There, with clock Data and a lateness of zero, a tick runs with the first stamp of
-its time; with clock Wall, what came during a stall is evaluated at its own time, after the gap.
+its time; with clock Wall, what came during a stall is evaluated at its own time, after the gap. And `distance` and
+`closingSpeed` are those of then, to the last digit.
 """
