@@ -237,6 +237,14 @@ def scenes(draw: st.DrawFn) -> Scene:
     messages = draw(st.lists(_message, min_size=10, max_size=40))
     if draw(st.integers(0, 2)) == 0:  # else there is hardly ever a place of now and of a second ago
         messages += [Message(time, 0, client, "pose", draw(_places)) for time in range(1, 20, 2) for client in "ab"]
+    if draw(st.booleans()):  # on a common grid: a and b move together, what they say changes, some of it twice
+        speeds = draw(st.lists(st.sampled_from([0.0, 1.0, 1.5, 2.0, 3.0]), min_size=3, max_size=6))
+        grid = [(time, client, stream) for time in range(1, 24) for client in "ab" for stream in ("pose", "speed")]
+        twice = [each for each in grid if each[0] % len(speeds) == 0]
+        messages += [
+            Message(time, 0, client, stream, {"x": float(time), "y": 0.0, "v": speeds[number % len(speeds)]})
+            for number, (time, client, stream) in enumerate(draw(st.sampled_from([grid, grid[::-1]])) + twice)
+        ]
     data = draw(st.booleans())
     gap = None if data or draw(st.integers(0, 3)) else draw(st.tuples(st.integers(5, 15), st.integers(16, 25)))
     return Scene(
