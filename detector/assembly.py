@@ -11,6 +11,7 @@ from detector.engine.engine import Engine, KeyReader
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.engine.samples.sample import Decoder
 from detector.engine.scoping.plugins import PluginHost
+from detector.engine.timing.timeline import ORDER
 from detector.models.binding import bind_models
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import plugin_problems
@@ -199,9 +200,18 @@ def _compiled(rule: EventRule, detector: Detector, fields: Mapping[str, Fields])
 
 
 def make_engine(
-    detector: Detector, entries: Inlets, *, holder: str, start: int, plugins: PluginHost | None = None
+    detector: Detector,
+    entries: Inlets,
+    *,
+    holder: str,
+    start: int,
+    plugins: PluginHost | None = None,
+    order: int = ORDER,
 ) -> Engine:
-    """An engine without rules; `start` is nanoseconds since the epoch. Without a host, plugins run in this process."""
+    """An engine without rules; `start` is nanoseconds since the epoch. Without a host, plugins run in this process.
+
+    `order`: see `timeline.ORDER`.
+    """
     return Engine(
         detector,
         holder=holder,
@@ -209,4 +219,5 @@ def make_engine(
         read_key=entries.read_key,
         start=start,
         plugins=plugins or LocalHost(),
+        order=order,
     )

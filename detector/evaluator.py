@@ -24,6 +24,7 @@ from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.evaluation import Answer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
+from detector.engine.timing.timeline import ORDER
 from detector.losses import Losses
 from detector.memory import Sweeper
 from detector.overload import LONG, Overload
@@ -33,7 +34,6 @@ from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from detector.streams.codecs.ros import RosTypes
 from wayside.api import EventRule
-from wayside.api.detector import DEFAULTS
 from wayside.api.stream import Stream
 
 _log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ class Evaluator:
             start,
             {
                 "kind": "start",
-                "version": DEFAULTS,
+                "version": ORDER,
                 "holder": self._engine.identity.holder,
                 "detector": rule_set.detector.to_json(),
                 "rules": [rule.to_json() for rule in rule_set.rules],
@@ -200,7 +200,7 @@ class Evaluator:
                 self.status.looked()
                 self.losses.say()
                 self._sweeper.look()
-            self._record(self._engine.now, {"kind": "end"})
+            self._finish()
             self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
         except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
             self._on_failure(error)
@@ -209,6 +209,14 @@ class Evaluator:
                 self._ended = True
                 for future, _ in self._calls:
                     future.cancel()
+
+    def _finish(self) -> None:
+        """Nothing more comes: evaluate what is still to be evaluated, as the replay of the recording will."""
+        end = self._engine.now
+        for events in self._engine.finish():
+            self._hand_over(events)
+        self._record_outages()
+        self._record(end, {"kind": "end", "finished": True})
 
     def pause(self) -> float:
         """Seconds until there is something to do. With clock Data only the samples say when a tick is due."""
@@ -261,10 +269,13 @@ class Evaluator:
         self.status.arrived(arrivals)
         begin = self._engine.stopwatch()
         events = self._engine.advance(arrivals, now)
-        for document in self._outages.news():
-            self._record(self._engine.now, document)
+        self._record_outages()
         self._adapt(self._engine.stopwatch() - begin)
         return events
+
+    def _record_outages(self) -> None:
+        for document in self._outages.news():
+            self._record(self._engine.now, document)
 
     def _gap(self, now: int, why: str) -> list[Event]:
         _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)

@@ -97,6 +97,10 @@ class Drive:
         """Advance; returns what happened in a few words (see `told`)."""
         return self.note(self.engine.advance(arrivals, at(until)))
 
+    def finish(self) -> list[str]:
+        """Nothing more comes; returns what happened."""
+        return self.note([event for events in self.engine.finish() for event in events])
+
     def note(self, events: Sequence[Event]) -> list[str]:
         self.events += events
         return told(events)

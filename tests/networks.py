@@ -28,10 +28,10 @@ class Arrivals:
         self.seen: list[tuple[str, str, bytes]] = []
         self._changed = threading.Condition()
 
-    def putter(self, stream: str) -> Put:
+    def putter(self, *streams: str) -> Put:
         def put(messages: Sequence[tuple[str, bytes]]) -> None:
             with self._changed:
-                self.seen += [(stream, key, payload) for key, payload in messages]
+                self.seen += [(stream, key, payload) for key, payload in messages for stream in streams]
                 self._changed.notify_all()
 
         return put

@@ -1,12 +1,13 @@
 """The engine: arrivals and the time go in, events come out, and the demands of what is open can be asked for.
 
-It reads no clock and does no I/O. Live operation, the replay of a recording and the tests call the same four methods
-(`advance`, `gap`, `set_rules`, `restore`), always from one thread; the same calls give the same events, ids included.
+It reads no clock and does no I/O. Live operation, the replay of a recording and the tests call the same methods
+(`advance`, `gap`, `set_rules`, `restore`, `finish`), always from one thread; the same calls give the same events, ids
+included.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 from detector.engine.buffering.messages import KeyReader
 from detector.engine.consequences.consequences import Consequences
@@ -26,8 +27,8 @@ from detector.engine.signals.starts import Starts
 from detector.engine.timing.data import DataTimeline
 from detector.engine.timing.schedule import Only, Schedule
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
-from detector.engine.timing.ticks import Ticks
-from detector.engine.timing.timeline import Timeline
+from detector.engine.timing.ticks import HOUSEKEEPING, Ticks
+from detector.engine.timing.timeline import ORDER, Timeline
 from detector.engine.timing.wall import WallTimeline
 from wayside.api import Detector
 from wayside.api.detector import Clock
@@ -52,10 +53,11 @@ class Engine:
         read_key: KeyReader,
         start: int,
         plugins: PluginHost | None = None,
+        order: int = ORDER,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `decoders` has one for each stream.
 
-        `plugins` runs them; without it, their signals are unknown.
+        `plugins` runs them; without it, their signals are unknown. `order`: see `timeline.ORDER`.
 
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
@@ -64,10 +66,11 @@ class Engine:
         self.counters = Counters()
         self._runs: dict[str, RuleRun] = {}
         self._rules_version = 0
+        self._exact = order >= ORDER
         self._ticks = Ticks()
         self.schedule = Schedule(self._ticks)
         self._starts = Starts()
-        self._known = Knowledge(detector, decoders, read_key, start, self.counters, self._starts)
+        self._known = Knowledge(detector, decoders, read_key, start, self.counters, self._starts, exact=self._exact)
         self.buffer, self.clients = self._known.buffer, self._known.clients
         self.stopwatch: Callable[[], int] = int
         """Gives nanoseconds of any clock; the shell sets one that runs. What it says is counted and decides nothing."""
@@ -105,8 +108,19 @@ class Engine:
         return self._known.detector
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
-        """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later."""
+        """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later.
+
+        Arrivals of equal time come in one call: what comes in a later one is later than all of these and than `until`.
+        """
         return self._run(self._timeline.steps(arrivals, until))
+
+    def finish(self) -> Iterator[list[Event]]:
+        """Nothing more comes: what still has to be evaluated, step by step. With clock Wall nothing has.
+
+        The demands that are open between two steps can be asked for there.
+        """
+        for step in self._timeline.finish():
+            yield self._run((step,))
 
     def gap(self, time: int) -> list[Event]:
         """The wall clock stood still or jumped: go on from `time`; windows begin anew, open episodes hold."""
@@ -325,7 +339,8 @@ class Engine:
     def _keep_house(self, time: int) -> None:
         """Forget old samples and lost clients."""
         lost = self._known.age(time)
-        self._starts.buffer.expire(time)
+        if time % HOUSEKEEPING == 0:
+            self._starts.buffer.expire(time)
         if lost:
             self._starts.lose(lost)
             self._plugins.lose(lost)
@@ -353,7 +368,7 @@ class Engine:
         spec = self.detector.spec
         self.consequences.watch_late = spec.clock is Clock.DATA
         if spec.clock is Clock.WALL:
-            return WallTimeline(self._ticks, start)
+            return WallTimeline(self._ticks, start, exact=self._exact)
         return DataTimeline(
             self._ticks,
             start=start,
@@ -365,6 +380,7 @@ class Engine:
             stamp_of=self._known.stamp_of,
             client_of=self._known.inflow.client_of,
             latched=_latched(self.detector),
+            exact=self._exact,
         )
 
 

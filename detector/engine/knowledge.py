@@ -23,6 +23,7 @@ from detector.engine.scoping.positions import Positions
 from detector.engine.scoping.scopes import Views
 from detector.engine.signals.signals import Signals
 from detector.engine.signals.starts import Starts
+from detector.engine.timing.ticks import HOUSEKEEPING
 from wayside.api import Detector
 from wayside.api.stream import Encoding, Stream
 from wayside.rules import compile_stream
@@ -44,8 +45,10 @@ class Knowledge:
         start: int,
         counters: Counters,
         starts: Starts,
+        *,
+        exact: bool = True,
     ) -> None:
-        """`starts` are the episode starts that signals over rules look at.
+        """`starts` are the episode starts that signals over rules look at. `exact`: see `timeline.ORDER`.
 
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
@@ -55,6 +58,7 @@ class Knowledge:
         self.inflow = Inflow(self.buffer, self.clients, counters)
         self._counters = counters
         self._starts = starts
+        self._exact = exact
         self._floor: int | None = None
         """Windows do not reach back further than the last gap; nanoseconds."""
         self._configure(detector, decoders, read_key, start)
@@ -104,8 +108,9 @@ class Knowledge:
         self._positions = Positions(self.buffer, self.messages, self._stale_after, possible, self._floor)
 
     def age(self, time: int) -> list[str]:
-        """Forget old samples and lost clients; returns who is lost."""
-        self.buffer.expire(time)
+        """Forget old samples, at whole seconds, and lost clients; returns who is lost."""
+        if time % HOUSEKEEPING == 0:  # not with the ticks of a rule: what the caps push out would depend on rules
+            self.buffer.expire(time)
         for client, latest in self.buffer.latest():
             self.clients.still_heard(client, latest)
         lost = self.clients.lose(time)
@@ -158,6 +163,7 @@ class Knowledge:
             self._positions,
             self._stale_after,
             run.counters,
+            exact=self._exact,
         )
 
     def queries(self, now: int) -> BufferQueries:

@@ -53,13 +53,13 @@ class BagSource(Source[BagParameters]):
         recordings = open_recordings(paths, router.wanted, lambda cut: _log.warning("%s", cut))
         first: int | None = None
         began = time.monotonic()
-        for arrival in router.arrivals(recordings):
+        for message, _ in router.routed(recordings):
             if first is None:
-                first, began = arrival.received, time.monotonic()
-            due = began + (arrival.received - first) / 1e9 / self.parameters.rate
+                first, began = message.time, time.monotonic()
+            due = began + (message.time - first) / 1e9 / self.parameters.rate
             while (ahead := due - time.monotonic()) > 0:
                 if feed.wait(min(ahead, _LONGEST_WAIT)):
                     return
             if feed.stopping:
                 return
-            feed.deliver(arrival.stream, arrival.key, arrival.payload)
+            feed.put(message.key, message.payload)

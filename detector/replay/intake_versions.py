@@ -1,7 +1,7 @@
-"""Versions of intake files: defaults are those of the time at which a file was recorded, so it replays the same.
+"""Versions of intake files: a file replays with the defaults and the order of time that its detector had.
 
 Version 1: a stream goes stale after `clientTimeout`, and a position is known while its stream is not stale.
-Version 2: `staleAfter` is 5 s and `maxAge` of a position 1 s by default.
+Version 2: `staleAfter` is 5 s and `maxAge` of a position 1 s by default; for the order, see `engine.timing.timeline`.
 """
 
 from __future__ import annotations

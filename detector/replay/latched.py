@@ -41,7 +41,7 @@ def recorded_arrivals(
 def latched_first(
     recorded: Iterable[Arrival], latched: Iterable[Arrival], topics: dict[str, Topic]
 ) -> Iterator[Arrival]:
-    """The arrivals of a recording, those first that what was latched came with.
+    """The arrivals of a recording. What was latched comes first, at the time of the recording's first sample.
 
     Args:
         recorded: all arrivals in order.
@@ -56,9 +56,8 @@ def latched_first(
     start = next(rest, None)
     if start is None:
         return
-    before = start.received - len(first)
-    for number, arrival in enumerate(first.values()):
-        yield arrival._replace(received=before + number)
+    for arrival in first.values():
+        yield arrival._replace(received=start.received)
     taken: set[tuple[str, Hashable]] = set()
     for arrival in chain((start,), rest):
         if arrival.stream in topics and (about := _about(arrival, topics)) not in taken:

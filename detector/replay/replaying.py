@@ -21,12 +21,12 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
+from detector.engine.timing.timeline import ORDER
 from detector.losses import Losses
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control
 from detector.replay.intake_versions import detector_as_of, rule_as_of
 from wayside.api import ApplicationTask, Detector, EventRule
-from wayside.api.detector import DEFAULTS
 from wayside.times import format_time
 
 _BATCH = 4096
@@ -69,11 +69,12 @@ class Replay:
         start: int,
         outcome: Outcome,
         plugins: PluginHost | None = None,
-        version: int = DEFAULTS,
+        version: int = ORDER,
+        order: int = ORDER,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
 
-        `version` is that of the intake file that the rules stand in.
+        `version` is that of the intake file that the rules stand in; `order`: see `timeline.ORDER`.
 
         Raises:
             DetectorError: the Detector cannot run.
@@ -83,7 +84,9 @@ class Replay:
         self._entries: Inlets = inlets(detector)
         self._detector = detector
         self._rule_book = RuleBook()
-        self._engine: Engine = make_engine(detector, self._entries, holder=holder, start=start, plugins=plugins)
+        self._engine: Engine = make_engine(
+            detector, self._entries, holder=holder, start=start, plugins=plugins, order=order
+        )
         self._engine.counters.watch_ages = True
         self._demands: dict[str, Demand] = {}
         self._demands_version: tuple[int, int] | None = None
@@ -109,6 +112,11 @@ class Replay:
         """Somebody asked a rule; with other rules than were recorded, it may not be there to answer."""
         with contextlib.suppress(NoAnswerError):
             self._note(self._engine.ask(rule)[0])
+
+    def finish(self) -> None:
+        """Nothing more comes: what still has to be evaluated."""
+        for events in self._engine.finish():
+            self._note(events)
 
     def gap(self, time: int) -> None:
         """Time went on without ticks."""
@@ -196,11 +204,10 @@ def replay_intake(
     batch: list[Arrival] = []
     for record in records:
         if isinstance(record, Arrival):
-            batch.append(record)
-            if len(batch) >= _BATCH and replay is not None:
-                # A tick at the very time of the last sample must wait for what else was received before its end.
-                replay.take(batch, batch[-1].received - 1)
+            if len(batch) >= _BATCH and replay is not None and record.received > batch[-1].received:
+                replay.take(batch, batch[-1].received)
                 batch = []
+            batch.append(record)
             continue
         if replay is None:
             replay = _begin(record, detector, rules, outcome, plugins)
@@ -240,7 +247,8 @@ def _begin(
         start=record.time,
         outcome=outcome,
         plugins=plugins,
-        version=version if rules is None else DEFAULTS,
+        version=version if rules is None else ORDER,
+        order=version,
     )
 
 
@@ -270,8 +278,11 @@ def _control(
             outcome.cut = True
         case "lost":
             outcome.lost += int(document["arrivals"])
+        case "end":
+            if document.get("finished"):  # files of detectors that did not evaluate the last `lateness` say nothing
+                replay.finish()
         case _:
-            pass  # end: what came before has been taken in; plugin: their host knows it already
+            pass  # plugin: their host knows it already
 
 
 def _rules(document: Mapping[str, Any]) -> list[EventRule]:
@@ -302,13 +313,14 @@ def replay_arrivals(
                 f"the recording pauses after {format_time(last)} for {(arrival.received - last) / 1e9:.0f} s: "
                 "nothing is evaluated in between, windows begin anew, open episodes hold"
             )
+        elif len(batch) >= _BATCH and arrival.received > last:  # what has one time is taken in together
+            replay.take(batch, last)
+            batch = []
         batch.append(arrival)
         last = arrival.received
-        if len(batch) >= _BATCH:
-            replay.take(batch, last - 1)
-            batch = []
     if replay is None:
         replay = Replay(detector, rules, holder=detector.name, start=0, outcome=outcome, plugins=plugins)
     replay.take(batch, last)
+    replay.finish()
     outcome.notes += replay.report()
     return outcome

@@ -42,6 +42,7 @@ def read_rosbag1(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]
             if not connections:  # rosbags would read none as all
                 return
             convert = _converter(path, connections)
+            _order(reader, connections)
             for connection, time, payload in reader.messages(connections):
                 yield convert(connection, time, payload)
     except RecordingError:
@@ -127,6 +128,13 @@ def _as_ros2(connection: Connection) -> str:
         return _types([connection]).generate_msgdef(connection.msgtype, ros_version=2)[0]
     except TypesysError:
         return connection.msgdef.data
+
+
+def _order(reader: Reader, connections: Sequence[Connection]) -> None:
+    """Of equal times, let the place in the bag decide: rosbags would give one connection after the other."""
+    entries = sorted((entry for each in connections for entry in reader.indexes[each.id]), key=tuple)
+    reader.indexes.update((each.id, []) for each in connections)
+    reader.indexes[connections[0].id] = entries
 
 
 def _damaged(path: Path, error: Exception) -> RecordingError:

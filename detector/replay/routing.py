@@ -60,19 +60,30 @@ class Router:
         """Keys that were looked at and belong to no stream, at most twenty, sorted."""
         return sorted(key for key, streams in self._routes.items() if not streams)[:_SHOWN]
 
+    def routed(self, messages: Iterable[Message]) -> Iterator[tuple[Message, tuple[Stream, ...]]]:
+        """Each message that belongs to any stream, with all its streams in the Detector's order.
+
+        Raises RecordingError where a message is recorded in another encoding or type than its stream's.
+        """
+        for message in messages:
+            streams = self._route(message.key)
+            for stream in streams:
+                self._check(message, stream)
+            if streams:
+                yield message, streams
+
     def arrivals(self, messages: Iterable[Message]) -> Iterator[Arrival]:
         """The messages as the live intake would have queued them, each once for every stream of its key.
 
-        The receive time is the recorded one, or a nanosecond after the last if that is not later. Raises
-        RecordingError where a message is recorded in another encoding or type than its stream's.
+        The receive time is the recorded one: equal times stay equal, in the order of the messages and then of the
+        streams. A time that goes back becomes the last one before it. Raises RecordingError like `routed`.
         """
-        last = 0
-        for message in messages:
-            for stream in self._route(message.key):
-                self._check(message, stream)
-                last = max(last + 1, message.time)
+        time = 0
+        for message, streams in self.routed(messages):
+            time = max(time, message.time)
+            for stream in streams:
                 payload = message.payload if message.decode is None else _written(message, stream)
-                yield Arrival(last, stream.name, message.key, payload)
+                yield Arrival(time, stream.name, message.key, payload)
 
     def _route(self, key: str) -> tuple[Stream, ...]:
         streams = self._routes.get(key)

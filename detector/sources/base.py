@@ -6,7 +6,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 from pydantic import BaseModel
 
@@ -18,6 +18,14 @@ P = TypeVar("P", bound=BaseModel)
 
 Put = Callable[[Sequence[tuple[str, bytes]]], None]
 """Takes messages that came together: the key and the payload of each. Thread-safe, and never waits."""
+
+
+class Putter(Protocol):
+    """Gives what takes the messages of some streams: each message goes to all of them, at one time."""
+
+    def __call__(self, *streams: str) -> Put:
+        """`streams` are their names."""
+
 
 _MAXIMUM_KEYS = 100_000
 """So many keys' streams are remembered; beyond, they are looked up anew."""
@@ -39,34 +47,31 @@ class FedStream:
 class Feed:
     """One run's way to the detector: the streams to deliver, where to put messages, and whether to stop."""
 
-    def __init__(
-        self, streams: Sequence[Stream], putter: Callable[[str], Put], on_unrouted: Callable[[str], None]
-    ) -> None:
-        """`putter` gives what takes a stream's messages; `on_unrouted` is told keys that belong to no stream."""
+    def __init__(self, streams: Sequence[Stream], putter: Putter, on_unrouted: Callable[[str], None]) -> None:
+        """`putter` gives what takes the messages of the streams of these names; `on_unrouted` gets each key that
+        belongs to no stream."""
         self.streams = tuple(FedStream(stream, KeyPattern.parse(stream.key)) for stream in streams)
         """The streams that name this source, in the Detector's order."""
         self._puts = {stream.name: putter(stream.name) for stream in streams}
-        self._routes: dict[str, tuple[Put, ...]] = {}
+        self._putter = putter
+        self._routes: dict[str, Put] = {}
         self._on_unrouted = on_unrouted
         self._stop = threading.Event()
         self.messages = 0
         """How many messages were delivered."""
 
     def put(self, key: str, payload: bytes) -> None:
-        """Deliver a message to every stream that its key belongs to; never waits, thread-safe.
+        """Deliver a message to every stream that its key belongs to, at one time; never waits, thread-safe.
 
         One that belongs to none is dropped and counted. After the stop nothing is taken any more.
         """
         if self._stop.is_set():
             return
-        routes = self._routes.get(key)
-        if routes is None:
-            routes = self._route(key)
-        if not routes:
+        put = self._routes.get(key) or self._route(key)
+        if put is None:
             self._on_unrouted(key)
             return
-        for put in routes:
-            put([(key, payload)])
+        put([(key, payload)])
         self.messages += 1
 
     def deliver(self, stream: str, key: str, payload: bytes) -> None:
@@ -89,12 +94,15 @@ class Feed:
         """For the detector: `run` is to return."""
         self._stop.set()
 
-    def _route(self, key: str) -> tuple[Put, ...]:
+    def _route(self, key: str) -> Put | None:
+        """What takes the messages of the key; None where it belongs to no stream."""
+        streams = [each.spec.name for each in self.streams if each.pattern.match(key) is not None]
+        if not streams:
+            return None
         if len(self._routes) >= _MAXIMUM_KEYS:
             self._routes.clear()
-        routes = tuple(self._puts[each.spec.name] for each in self.streams if each.pattern.match(key) is not None)
-        self._routes[key] = routes
-        return routes
+        put = self._routes[key] = self._putter(*streams)
+        return put
 
 
 class Source(ABC, Generic[P]):

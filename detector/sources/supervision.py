@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Any
 
-from detector.sources.base import Feed, Put
+from detector.sources.base import Feed, Putter
 from detector.sources.registry import Make, prepare
 from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
@@ -44,7 +44,7 @@ class SourceThread:
         self,
         source: DataSource,
         streams: tuple[Stream, ...],
-        putter: Callable[[str], Put],
+        putter: Putter,
         tally: Tally,
         *,
         first_pause: float = _FIRST_PAUSE,
@@ -119,8 +119,8 @@ class SourceThread:
 class Sources:
     """The sources of a Detector, which may change."""
 
-    def __init__(self, putter: Callable[[str], Put], tally: Tally, *, timeout: float = 2.0) -> None:
-        """`putter` gives what takes a stream's messages; `timeout`: seconds that sources have to stop."""
+    def __init__(self, putter: Putter, tally: Tally, *, timeout: float = 2.0) -> None:
+        """`putter` gives what takes the messages of streams; `timeout`: seconds that sources have to stop."""
         self._putter = putter
         self._tally = tally
         self._timeout = timeout

@@ -79,7 +79,9 @@ class StatusKeeper:
         self._last: dict[str, Arrival] = {}
         """With clock Data, the last arrival of each stream: the buffer knows only stamps."""
         self._looked: dict[str, int] = {}
-        """When a rule's latency was last looked at."""
+        """The tick at which a rule's latency was last looked at: samples up to there are counted."""
+        self._ticks: dict[str, int] = {}
+        """By rule, how many ticks it had had at the last look. Kept like the engine's counters where a rule goes."""
         self._counts: deque[tuple[int, dict[str, int]]] = deque(maxlen=_RATES_OVER + 1)
         self._stream_latencies: dict[str, _Latencies] = {}
         self._rule_latencies: dict[str, _Latencies] = {}
@@ -117,10 +119,8 @@ class StatusKeeper:
         self._watching = [watching for watching in self._watching if not watching.is_over()]
         now = self._now()
         if self._engine.on_wall_clock:
-            for name, run in self._engine.rules.items():
-                if run.counters.last_tick + _EVERY > now >= self._looked.get(name, 0) + _EVERY:
-                    self._looked[name] = now
-                    self._look_at_rule(run, now)
+            for run in self._engine.rules.values():
+                self._look_at_rule(run, now)
         if not self._taken <= now < self._taken + _EVERY:
             self.latest = self._take(now)
 
@@ -234,23 +234,32 @@ class StatusKeeper:
                 latencies.add(latency)
 
     def _look_at_rule(self, run: RuleRun, now: int) -> None:
-        """Note how long ago the data was received of which the rule has just been evaluated."""
-        latencies = self._rule_latencies.setdefault(run.rule.name, _Latencies())
-        streams, tick = run.rule.streams, run.counters.last_tick
-        lanes = (lane for lane in self._engine.buffer if lane.stream in streams)
-        for lane in islice(lanes, _LOOKED_AT):
-            sample = next(lane.newest_first(None, tick), None)
-            if sample is not None:
-                latencies.add((now - sample.received) / 1e9)
+        """If the rule has just been evaluated, note how long ago the new samples were received that it saw.
+
+        Once a second, of a few clients the newest; no sample is counted twice.
+        """
+        name, tick, ticks = run.rule.name, run.counters.last_tick, run.counters.ticks
+        evaluated = ticks != self._ticks.get(name, 0)
+        self._ticks[name] = ticks
+        since = self._looked.get(name, NEVER)
+        if not evaluated or since <= tick < since + _EVERY:
+            return
+        self._looked[name] = tick
+        if tick < since:  # the wall clock stepped back: what is older was counted
+            return
+        latencies = self._rule_latencies.setdefault(name, _Latencies())
+        lanes = (lane for lane in self._engine.buffer if lane.latest > since and lane.stream in run.rule.streams)
+        seen = (next(lane.newest_first(since, tick), None) for lane in lanes)
+        for sample in islice((sample for sample in seen if sample is not None), _LOOKED_AT):
+            latencies.add((now - sample.received) / 1e9)
 
     def _forget(self, streams: Iterable[str]) -> None:
         """What is kept of streams and rules that are gone."""
         for of_streams in (self._stream_latencies, self._last):
             for name in of_streams.keys() - {*streams}:
                 of_streams.pop(name)
-        for of_rules in (self._rule_latencies, self._looked):
-            for name in of_rules.keys() - self._engine.rules.keys():
-                of_rules.pop(name)
+        for name in self._rule_latencies.keys() - self._engine.rules.keys():
+            self._rule_latencies.pop(name)
 
 
 def _state(run: RuleRun, schedule: Schedule) -> tuple[RuleState, str]:

@@ -8,4 +8,4 @@ Put = Callable[[Sequence[tuple[str, bytes]]], None]
 """Takes messages that came together: the key and the payload of each. Thread-safe, and never waits."""
 
 LONGEST = 256
-"""At most so many messages get one receive time: taking that many takes a fraction of a millisecond."""
+"""At most so many messages are queued at once: taking that many takes a fraction of a millisecond."""

@@ -104,3 +104,27 @@ def test_rules_and_streams_change_without_losing_buffer_or_episodes(process: Pro
     assert [rule.open for rule in still.rules] == [1, 1]
     told = [f"{event['data']['rule']} {event['type'].rsplit('.', 1)[-1]}" for event in process.events_when(2)]
     assert told == ["fast started", "slow started"]
+
+
+def test_a_detector_that_is_stopped_evaluates_the_last_lateness_and_so_does_the_replay_of_its_intake(
+    tmp_path: Path,
+) -> None:
+    process = Process(tmp_path)
+    streams = (a_stream("speed", stamp="msg.t"),)
+    sampled = a_rule(
+        "sampled", signals=FAST.to_json()["spec"]["signals"], when="v > 10", evaluation={"onSample": "speed"}
+    )
+    process.write(FAST, sampled, streams=streams, clock="Data", lateness="5m", maxAhead="1h")
+    process.start("--output", "out", "--record-intake", "intake.mcap")
+    for number in (1, 2):  # a status says of one sample each second when it was received
+        process.send("car1", {"t": 1_000 + number / 2, "v": 20})
+        process.status_when(lambda s, number=number: s.streams[0].latency.count == number)  # type: ignore[misc]
+    assert process.written() == []
+    assert process.stop() == 0
+    live = (tmp_path / "out" / "events.jsonl").read_bytes()
+    programs.run("detector", "replay", "intake.mcap", "--output", "replayed", folder=tmp_path, check=True)
+    assert (tmp_path / "replayed" / "events.jsonl").read_bytes() == live
+    assert [f"{event['data']['rule']} {event['time']}" for event in map(json.loads, live.splitlines())] == [
+        "fast 1970-01-01T00:16:40.500000000Z",
+        "sampled 1970-01-01T00:16:40.500000000Z",
+    ]

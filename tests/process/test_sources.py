@@ -1,6 +1,7 @@
 """Sources run supervised: started again when they fail, left behind when they hang, changed while running."""
 
 import asyncio
+import itertools
 import threading
 from collections.abc import AsyncIterator
 from importlib.metadata import EntryPoint
@@ -14,6 +15,7 @@ from detector import entrypoints
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
+from detector.engine.samples.intake import Intake
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
@@ -108,6 +110,26 @@ def a_detector_of(*sources: dict[str, Any], **stream: Any) -> Detector:
         for index, each in enumerate(sources)
     )
     return a_detector(*streams, sources=list(sources))
+
+
+def test_a_message_that_belongs_to_several_streams_reaches_them_at_one_time() -> None:
+    times = itertools.count(100)
+    intake = Intake(lambda: next(times))
+    streams = (
+        stream(source="s"),
+        stream("rest", "vehicles/**/${client:*}/other"),
+        stream("all", "**/${client:*}/pose"),
+    )
+    feed = Feed(streams, intake.putter, lambda key: None)
+    feed.put("vehicles/car1/pose", b"1")
+    feed.put("vehicles/car1/pose", b"2")
+    assert [(each.received, each.stream, each.payload) for each in intake.drain(0)] == [
+        (100, "pose", b"1"),
+        (100, "all", b"1"),
+        (101, "pose", b"2"),
+        (101, "all", b"2"),
+    ]
+    assert feed.messages == 2
 
 
 def test_messages_reach_their_streams_and_others_are_counted(arrivals: Arrivals) -> None:

@@ -40,7 +40,8 @@ def _calculated(name: str, numbers: list[tuple[int, Any]]) -> Any:
     plain = [number for _, number in numbers]
     infinite = any(math.isinf(number) for number in plain)
     if name in ("Min", "Max"):
-        return (min if name == "Min" else max)(plain)
+        extreme = (min if name == "Min" else max)(plain)
+        return 0.0 if extreme == 0 else extreme
     if name in ("Sum", "Mean"):
         if infinite:
             return sum(number for number in plain if math.isinf(number))

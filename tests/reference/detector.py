@@ -95,7 +95,7 @@ class Reference:
         }
 
     def arrive(self, sample: Sample) -> None:
-        """A sample comes; with clock Wall the ticks before it have run by then."""
+        """A sample comes; with clock Wall the ticks before it have run by then, and that at its time has not."""
         if self.lateness is None:
             self.advance(sample.time - 1)
         elif self._begins(sample.time):
@@ -104,9 +104,12 @@ class Reference:
         self._enter(self.now)
         if self.lateness is not None:
             self.newest = max(self.newest, sample.time)
-            self.advance(self.newest - self.lateness)
-        elif sample.stream in self._triggers():
-            self.advance(sample.time)
+            self.advance(self.newest - max(self.lateness, 1))
+
+    def finish(self) -> None:
+        """Nothing more comes: with clock Data, what has waited for `lateness` is evaluated."""
+        if self.lateness is not None:
+            self.advance(self.newest)
 
     def _begins(self, stamp: int) -> bool:
         """Time begins with the first stamp; until a tick has run, with an earlier one that `lateness` covers."""
@@ -156,6 +159,8 @@ class Reference:
     def _tick(self, sampled: set[tuple[str, str]]) -> None:
         """`sampled` has the streams and clients of the samples of this very time."""
         regular = any(self.now % period == 0 for period in self._periods())
+        if self.now % SECOND == 0:
+            self.world.sweep(self.now)
         if regular:
             lost = self.world.lose(self.now)
             self.starts = [_without(each, lost) for each in self.starts]

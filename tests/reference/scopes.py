@@ -128,7 +128,10 @@ def _pairs(
 
 
 def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) -> float | None:
-    return None if one is None or other is None else math.dist(one, other)
+    if one is None or other is None:
+        return None
+    dx, dy, dz = (p - q for p, q in zip(one, other, strict=True))
+    return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 def _place(position: dict[str, str], client: str, world: World, then: int, now: int) -> tuple[float, ...] | None:
@@ -139,6 +142,8 @@ def _place(position: dict[str, str], client: str, world: World, then: int, now: 
     stale = world.stale_after[position["stream"]]
     oldest = nanoseconds(position["maxAge"]) if "maxAge" in position else None if stale is None else SECOND
     if not mine or any(limit is not None and then - mine[-1].time > limit for limit in (stale, oldest)):
+        return None
+    if mine[-1].message is None:
         return None
     axes = [mine[-1].message.get(position[axis].removeprefix("msg.")) for axis in ("x", "y")]
     if not all(isinstance(axis, float) and abs(axis) <= 1e12 for axis in axes):

@@ -46,6 +46,7 @@ class Item:
 
     time: int
     message: Any
+    """None where it cannot be read."""
     sample: dict[str, float]
 
 
@@ -114,7 +115,8 @@ def _value(signal: dict[str, Any], item: Item) -> Any:
 
 
 def _variables(item: Item) -> dict[str, Any]:
-    return {"msg": item.message, "key": {}, "sample": item.sample}
+    known = {"key": {}, "sample": item.sample}
+    return known if item.message is None else {"msg": item.message, **known}
 
 
 def nanoseconds(text: str) -> int:

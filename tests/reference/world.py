@@ -7,10 +7,13 @@ from typing import Any
 
 SECOND = 10**9
 
+OVERHEAD = 160
+"""What a sample counts for beside its payload, in bytes."""
+
 
 @dataclass(frozen=True)
 class Sample:
-    """One message. `number` is the order of arrival."""
+    """One message, None where it cannot be read. `number` is the order of arrival."""
 
     time: int
     number: int
@@ -37,16 +40,48 @@ class World:
     durations: dict[str, int]
     """How long each stream is kept."""
     stale_after: dict[str, int | None]
+    counts: dict[str, int] = field(default_factory=dict)
+    """Of some streams, how many samples of a client are kept at most."""
+    sizes: dict[str, int] = field(default_factory=dict)
+    """Of some streams, how many bytes of a client are kept at most."""
+    size: int | None = None
+    """How many bytes are kept at most over all."""
     samples: list[Sample] = field(default_factory=list)
     known: dict[str, Known] = field(default_factory=dict)
     floor: int | None = None
     """Windows reach back to the last gap at most."""
+    gone: set[int] = field(default_factory=set)
+    """The numbers of the samples that the buffer has no more."""
 
     def take(self, sample: Sample) -> None:
         """A sample arrives."""
         self.samples.append(sample)
         known = self.known.setdefault(sample.client, Known(sample.time, sample.time))
         known.last = max(known.last, sample.time)
+        held = self._held(sample.client, sample.stream)
+        while len(held) > self.counts.get(sample.stream, len(held)):
+            self.gone.add(held.pop(0).number)
+        while len(held) > 1 and _size(held) > self.sizes.get(sample.stream, _size(held)):
+            self.gone.add(held.pop(0).number)
+        everything = [each for each in self.samples if each.number not in self.gone]
+        if self.size is not None and _size(everything) > self.size:
+            everything.sort(key=lambda each: (each.time, each.client, each.stream, each.number))
+            while _size(everything) > self.size - self.size // 64:
+                self.gone.add(everything.pop(0).number)
+
+    def sweep(self, now: int) -> None:
+        """A whole second: what is older than its duration leaves the buffer, but for the newest."""
+        for client, stream in {(each.client, each.stream) for each in self.samples}:
+            for each in self._held(client, stream)[:-1]:
+                if each.time <= now - self.durations[stream]:
+                    self.gone.add(each.number)
+
+    def _held(self, client: str, stream: str) -> list[Sample]:
+        """What the buffer has of a client's stream, in order."""
+        mine = [each for each in self.samples if (each.client, each.stream) == (client, stream)]
+        return sorted(
+            (each for each in mine if each.number not in self.gone), key=lambda each: (each.time, each.number)
+        )
 
     def gap(self, time: int) -> None:
         """Nobody could be heard up to here."""
@@ -67,11 +102,15 @@ class World:
         return sorted(mine, key=lambda each: (each.time, each.number))
 
     def kept(self, client: str, stream: str, now: int) -> list[Sample]:
-        """Those that the buffer still has: of the last seconds, and the newest in any case."""
-        mine = self.of(client, stream, now)
+        """Those that the buffer still shows: of the last seconds, and the newest in any case."""
+        mine = [each for each in self._held(client, stream) if each.time <= now]
         return [each for each in mine if each.time > now - self.durations[stream]] or mine[-1:]
 
     def fresh(self, client: str, stream: str, now: int) -> bool:
         """Whether the stream is not stale."""
         mine, limit = self.of(client, stream, now), self.stale_after[stream]
         return bool(mine) and (limit is None or now - mine[-1].time <= limit)
+
+
+def _size(samples: list[Sample]) -> int:
+    return sum(len(each.payload) + OVERHEAD for each in samples)

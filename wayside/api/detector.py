@@ -31,9 +31,6 @@ from wayside.api.stream import (
 )
 from wayside.api.zenoh import Zenoh
 
-DEFAULTS = 2
-"""The version of the kinds' defaults. A recording of the intake names it, and replays with the defaults of its time."""
-
 STALE_AFTER = PositiveDuration("5s")
 """The default of a stream's `staleAfter`: what is sent once a second, as the slowest CAMs are, may fail a few times."""
 
@@ -183,7 +180,7 @@ class DetectorSpec(Model):
     )
     lateness: Duration = Field(
         default=Duration("200ms"),
-        description="With clock Data: the tick t runs once a stamp of at least t + lateness was seen.",
+        description="With clock Data: tick t runs once a stamp of at least t + lateness, and later than t, was seen.",
     )
     max_ahead: Duration = Field(
         default=Duration("1s"),

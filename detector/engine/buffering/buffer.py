@@ -2,6 +2,11 @@
 
 Inserting costs the same however much is held: a sample is appended, and one that comes late moves only past those that
 are newer than it.
+
+A sample is not seen any more when it is older than its duration, and its memory is freed at the next whole second. Caps
+act on what is held, on each sample as it enters: so neither the batches in which samples come nor the rules that look
+at them decide what is there. The oldest sample goes first. Of equal times, that which entered first; over all lanes, by
+client and then stream.
 """
 
 from __future__ import annotations
@@ -117,10 +122,14 @@ class Lane:
         self.bytes = 0
         self.latest = NEVER
 
-    def newest_first(self, after: int | None, until: int) -> Iterator[Sample]:
-        """The samples of (after, until] from the newest on; all up to `until` where `after` is None."""
-        for sample in reversed(self.samples):
-            if after is not None and sample.time <= after:
+    def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
+        """The samples of (after, until] from the newest on; all up to `until` where `after` is None.
+
+        Without what is older than the duration `now` (None: at `until`), but for the newest of all.
+        """
+        horizon = (until if now is None else now) - self.duration
+        for newer, sample in enumerate(reversed(self.samples)):
+            if (after is not None and sample.time <= after) or (newer and sample.time <= horizon):
                 return
             if sample.time <= until:
                 yield sample
@@ -213,16 +222,16 @@ class Buffer:
     def _shrink(self, *, latched: bool) -> None:
         target = self.maximum_bytes - self.maximum_bytes // _SLACK
         heads = [
-            (lane.samples[0].time, index, lane)
-            for index, lane in enumerate(self)
+            (lane.samples[0].time, lane.client, lane.stream, lane)
+            for lane in self
             if lane.samples and lane.latched is latched
         ]
         heapq.heapify(heads)
         while self.bytes > target and heads:
-            _, index, lane = heads[0]
+            lane = heads[0][-1]
             self.bytes -= lane.drop_oldest()
             lane.evicted += 1
             if lane.samples:
-                heapq.heapreplace(heads, (lane.samples[0].time, index, lane))
+                heapq.heapreplace(heads, (lane.samples[0].time, lane.client, lane.stream, lane))
             else:
                 heapq.heappop(heads)

@@ -7,7 +7,7 @@ The newest sample about each is kept beyond the duration; caps push it out last 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 
 from detector.engine.buffering.buffer import NEVER, Lane
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample, Stamped
@@ -53,15 +53,11 @@ class LatchedLane(Lane):
         super().__init__(client, stream, duration, maximum_bytes, maximum_count)
         self._topic = topic
         self._topics: dict[Sample, Hashable] = {}
+        """What samples speak of, as far as it was asked; equal samples speak of the same."""
 
     def _decide(self) -> None:
         """Every sample comes through `insert`."""
         self.capped = True
-
-    def insert(self, sample: Sample) -> int:
-        """See Lane."""
-        self._topics[sample] = self._topic(sample.key, sample.payload)
-        return super().insert(sample)
 
     def drop_oldest(self) -> int:
         """See Lane."""
@@ -73,21 +69,37 @@ class LatchedLane(Lane):
         horizon = now - self.duration
         if not self.samples or self.samples[0].time > horizon:
             return 0
-        newest = {self._topics[sample]: sample for sample in self.samples}
-        return self._keep([s for s in self.samples if s.time > horizon or newest[self._topics[s]] is s])
+        newest = {self._about(sample): sample for sample in self.samples}
+        return self._keep([s for s in self.samples if s.time > horizon or newest[self._about(s)] is s])
+
+    def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
+        """See Lane; what is older than the duration is left out where the same was said anew since."""
+        horizon = (until if now is None else now) - self.duration
+        said: set[Hashable] = set()
+        for sample in reversed(self.samples):
+            if after is not None and sample.time <= after:
+                return
+            about = self._about(sample)
+            if sample.time <= until and (sample.time > horizon or about not in said):
+                yield sample
+            said.add(about)
 
     def step_back(self, to: int) -> None:
         """Time goes on from `to`: what was said still holds, and was not said after that."""
-        topics = {_not_after(sample, to): self._topics[sample] for sample in self.samples}
-        self._topics = topics
-        self._keep(list(topics))
+        self._keep([_not_after(sample, to) for sample in self.samples])
         self.latest = self.samples[-1].time if self.samples else NEVER
+
+    def _about(self, sample: Sample) -> Hashable:
+        """What the sample speaks of."""
+        if sample not in self._topics:
+            self._topics[sample] = self._topic(sample.key, sample.payload)
+        return self._topics[sample]
 
     def _keep(self, samples: list[Sample]) -> int:
         """Hold these and no others; returns the bytes freed."""
         before = self.bytes
         self.samples = deque(samples)
-        self._topics = {sample: self._topics[sample] for sample in samples}
+        self._topics = {sample: self._about(sample) for sample in samples}
         self.bytes = sum(len(sample.payload) + SAMPLE_OVERHEAD for sample in samples)
         return before - self.bytes
 

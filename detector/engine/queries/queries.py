@@ -221,7 +221,7 @@ class BufferQueries:
         yield from heapq.merge(*streams, key=lambda sample: (sample.time, sample.client), reverse=True)
 
     def _of_lane(self, lane: Lane, after: int | None, until: int, frame: str | None) -> Iterator[DecodedSample]:
-        for sample in lane.newest_first(after, until):
+        for sample in lane.newest_first(after, until, self._now):
             stamp = self._messages.time(lane.stream, sample.key, sample.received, sample.payload)
             decoded = None if stamp is None else self._decoded(lane.client, lane.stream, (stamp, 0, sample))
             if decoded is not None and (frame is None or frame_of(decoded.message) == frame):

@@ -1,9 +1,10 @@
 """The one place where samples get their receive time.
 
-A message is stamped and queued by the thread that receives it, without a lock: taking one would cost more than all the
-rest. What several threads do at the same moment may therefore be queued out of order by a few microseconds, and a
-thread may be held up between stamping and queueing. So the times are settled when the queue is emptied: each is later
-than the one before and later than the last `until`. Nothing that is drained later can belong before a tick that ran.
+The thread that receives a message stamps and queues it without a lock: a lock would cost more than all the rest. So
+two threads may queue out of order by a few microseconds, and a thread may pause between stamping and queueing. `drain`
+therefore settles the times: they never go back, and all are later than what was drained before and than the last
+`until`. So no sample ever belongs to a time whose tick has run, and samples of equal time are drained together, in
+their order.
 """
 
 from __future__ import annotations
@@ -40,22 +41,30 @@ class Intake:
         self._last = 0
         self.dropped = 0
 
-    def putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
-        """A function that takes messages of the stream that came together: the key and the payload of each.
+    def putter(self, *streams: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
+        """A function that takes messages: the key and the payload of each. Thread-safe; never waits.
 
-        Thread-safe; never waits. What comes together has the time of being queued, in its order.
+        Each message gets the time at which it is queued. With several streams, each of them gets the message, at that
+        one time and in the order of `streams`.
         """
         now, extend, new = self._now, self._queue.extend, tuple.__new__
 
         def put(messages: Sequence[tuple[str, bytes]]) -> None:
             # This runs for every message, on the thread that receives it: each step costs the vehicle's data rate.
             if self._room <= 0:
-                self._drop(len(messages))
+                self._drop(len(messages) * len(streams))
                 return
-            self._room -= sum([len(payload) for _, payload in messages]) + len(messages) * SAMPLE_OVERHEAD
-            time = now()
+            size = sum([len(payload) for _, payload in messages]) + len(messages) * SAMPLE_OVERHEAD
+            self._room -= size * len(streams)
             # Makes an Arrival from a plain tuple, at a third of the cost of calling the class.
-            extend([new(Arrival, (t, stream, key, payload)) for t, (key, payload) in enumerate(messages, time)])
+            extend(
+                [
+                    new(Arrival, (time, stream, key, payload))
+                    for key, payload in messages
+                    for time in (now(),)
+                    for stream in streams
+                ]
+            )
 
         return put
 
@@ -74,7 +83,7 @@ class Intake:
         return patient
 
     def drain(self, until: int) -> list[Arrival]:
-        """What was queued, in order. Everything that is drained later is received after `until`."""
+        """What was queued, in order. What is drained later is later than all of it, and than `until`."""
         arrivals = self._queue[:]
         del self._queue[: len(arrivals)]
         self._room = self._maximum_bytes
@@ -100,15 +109,16 @@ class Intake:
 
 
 def _in_order(arrivals: list[Arrival], last: int) -> bool:
-    """Whether the times are later than `last` and strictly increasing, as they nearly always are."""
+    """Whether the times are later than `last` and never go back, as is nearly always so."""
     times = list(map(_RECEIVED, arrivals))
-    return times[0] > last and all(map(operator.lt, times, islice(times, 1, None)))
+    return times[0] > last and all(map(operator.le, times, islice(times, 1, None)))
 
 
 def _settled(arrivals: list[Arrival], last: int) -> list[Arrival]:
-    """The same with times that are later than `last` and strictly increasing."""
+    """The same with times that are later than `last` and never go back."""
     settled = []
+    time = last + 1
     for arrival in arrivals:
-        last = max(arrival.received, last + 1)
-        settled.append(arrival._replace(received=last))
+        time = max(arrival.received, time)
+        settled.append(arrival._replace(received=time))
     return settled

@@ -12,7 +12,7 @@ class Arrival(NamedTuple):
     """One message as the intake queued it, before the engine has looked at it."""
 
     received: int
-    """When the intake took it, in nanoseconds since the epoch; strictly increasing within a detector."""
+    """When the intake took it, in nanoseconds since the epoch. It never goes back; of equal times, the order counts."""
     stream: str
     """The Detector's stream that it came in on."""
     key: str

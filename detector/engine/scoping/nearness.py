@@ -26,7 +26,9 @@ _FEW = 1024
 """Up to so many pairs to compare, doing so is faster than building trees."""
 
 _ROUNDING = 1 + 1e-9
-"""The trees are asked for a little more than wanted, lest they round a pair away that is just within reach."""
+_SLACK = 1e-6
+"""The trees search a little farther than asked, by a factor and in metres, so that rounding hides no pair: what decides
+is `distance`. Points on the Earth are 6,400 km from the origin, so they are exact to a nanometre only."""
 
 _ROOM = 4
 """Up to so many times the wanted number of pairs is made, to be sorted exactly."""
@@ -40,7 +42,7 @@ class Near(NamedTuple):
     pairs: list[Pair]
     left_out: int
     """How many pairs within reach were left out: the number asked for was too small. With many clients it may count
-    a pair that is beyond reach by a billionth."""
+    a pair that is beyond reach by a micrometre or a billionth."""
 
 
 class Search(NamedTuple):
@@ -84,7 +86,7 @@ def _by_trees(search: Search, first: list[str], second: list[str], within: float
 
     one = cKDTree(np.array([search.points[name] for name in first]))
     other = one if first == second else cKDTree(np.array([search.points[name] for name in second]))
-    reach = within * _ROUNDING
+    reach = within * _ROUNDING + _SLACK
     # Each client is near itself; without roles, each pair is found from both sides.
     themselves = len(set(first) & set(second))
     sides = 2 if search.first is None else 1

@@ -64,10 +64,12 @@ class Positions:
             counters.ages.used(lane, now)
         return self._place(position, client, sample, counters)
 
-    def then(self, position: CompiledPosition, client: str, then: int, counters: RuleCounters) -> Place | None:
+    def then(
+        self, position: CompiledPosition, client: str, then: int, now: int, counters: RuleCounters
+    ) -> Place | None:
         """Where the client was at a past time, by the newest sample up to then; None like `now`."""
         lane, limit = self._buffer.lane(client, position.stream), self._limit(position)
-        sample = None if lane is None else next(lane.newest_first(self._floor, then), None)
+        sample = None if lane is None else next(lane.newest_first(self._floor, then, now), None)
         if sample is None or (limit is not None and then - sample.time > limit):
             counters.unknowns += 1
             return None
@@ -117,10 +119,22 @@ def described(position: CompiledPosition, place: Place) -> dict[str, float]:
 
 
 def distance(position: CompiledPosition, one: Place, other: Place) -> float:
-    """Metres, straight in a flat frame, along the surface on the Earth."""
+    """Metres, straight in a flat frame, along the surface on the Earth.
+
+    The same number whichever of the two comes first. In a flat frame √(dx² + dy² + dz²), rounded after each operation,
+    so that whoever computes it in this order gets the same number.
+    """
     if position.geographic:
-        return geodesy.distance(*one, *other)
-    return math.dist(one, other)
+        return geodesy.distance(*min(one, other), *max(one, other))
+    squares = 0.0
+    for p, q in zip(one, other, strict=True):
+        squares += (p - q) * (p - q)
+    return math.sqrt(squares)
+
+
+def distance_of_order_1(position: CompiledPosition, one: Place, other: Place) -> float:
+    """What it was for detectors of order 1 (see `timeline.ORDER`): it differs in the last digits."""
+    return geodesy.distance(*one, *other) if position.geographic else math.dist(one, other)
 
 
 def point(position: CompiledPosition, place: Place) -> Point:

@@ -12,7 +12,7 @@ from detector.engine.counters import RuleCounters
 from detector.engine.episodes.episodes import Truth, both
 from detector.engine.episodes.subjects import Subject
 from detector.engine.scoping.nearness import Search, near_pairs
-from detector.engine.scoping.positions import Place, Positions, described, distance, point
+from detector.engine.scoping.positions import Place, Positions, described, distance, distance_of_order_1, point
 from detector.engine.signals.models import add_models
 from detector.engine.signals.signals import Signals
 from detector.engine.timing.schedule import Only
@@ -53,7 +53,11 @@ class Views:
         positions: Positions,
         stale_after: Mapping[str, int | None],
         counters: RuleCounters,
+        *,
+        exact: bool = True,
     ) -> None:
+        """`exact`: see `timeline.ORDER`; False is order 1."""
+        self._exact = exact
         self._rule = rule
         self._now = now
         self._clients = clients
@@ -110,8 +114,17 @@ class Views:
         """Where the client was a second ago, if that is known; looked up once a tick."""
         if client not in self._earlier:
             then = self._now - CLOSING_NS
-            self._earlier[client] = self._positions.then(subject.position, client, then, self._counters)
+            self._earlier[client] = self._positions.then(subject.position, client, then, self._now, self._counters)
         return self._earlier[client]
+
+    def distance(self, subject: PairSubject, one: Place, other: Place) -> float:
+        """Metres between two places: the one number for conditions, reach and events."""
+        return (distance if self._exact else distance_of_order_1)(subject.position, one, other)
+
+    def closing_speed(self, now: float, before: float) -> float:
+        """From the distances of now and of a second ago, in m/s; without the sign of a zero."""
+        speed = (before - now) / (CLOSING_NS / 1e9)
+        return speed if self._exact or speed else -0.0
 
     def truth(self, expression: Expression | None, variables: Mapping[str, Any], place: str) -> Truth:
         """What a condition says; one that is absent holds. `place` names field and subject, for errors."""
@@ -207,7 +220,7 @@ def _pairs(
     points = {client: point(subject.position, place) for client, place in places.items()}
 
     def between(a: str, b: str) -> float:
-        return distance(subject.position, places[a], places[b])
+        return views.distance(subject, places[a], places[b])
 
     in_progress = {each for each in pending if all(client in clients for client in each.clients)}
     for element in rule.elements:
@@ -265,8 +278,8 @@ def _member(
 
 
 def _closing_speed(views: Views, subject: PairSubject, a: str, b: str, variables: dict[str, Any]) -> None:
-    """Minus the change of distance over the last second, in m/s; unknown where one's place a second ago is."""
+    """By how much the distance has shrunk over the last second, in m/s; unknown where one's place a second ago is."""
     a_place, b_place = views.earlier_place(subject, a), views.earlier_place(subject, b)
     if a_place is not None and b_place is not None:
-        change = variables["distance"] - distance(subject.position, a_place, b_place)
-        variables["closingSpeed"] = -change / (CLOSING_NS / 1e9)
+        before = views.distance(subject, a_place, b_place)
+        variables["closingSpeed"] = views.closing_speed(variables["distance"], before)

@@ -52,11 +52,13 @@ def distinct(values: Sequence[Value]) -> list[Value] | Unknown:
 
 
 def _minimum(window: Sequence[Timed]) -> Number:
-    return min(number for _, number in window)
+    """A zero without a sign: 0.0 and -0.0 are equal, so which of them were the least would depend on their order."""
+    return min(number for _, number in window) or 0.0
 
 
 def _maximum(window: Sequence[Timed]) -> Number:
-    return max(number for _, number in window)
+    """A zero without a sign, as of the minimum."""
+    return max(number for _, number in window) or 0.0
 
 
 def _sum(window: Sequence[Timed]) -> Number:

@@ -1,6 +1,7 @@
 """Clock Data: a sample's time is the sender's stamp, and the samples themselves say how far time has come.
 
-Tick t is due once a stamp of at least t + lateness was seen. What it sees are the samples up to its time, none later.
+Tick t runs once a stamp of at least t + lateness, and later than t, was seen. So samples of equal stamps that come in
+order are all there by then, also with a lateness of zero. At the end, the ticks up to the newest stamp run.
 """
 
 from __future__ import annotations
@@ -56,15 +57,18 @@ class DataTimeline:
         stamp_of: Callable[[Arrival], int | None],
         client_of: Callable[[Arrival], str | None],
         latched: frozenset[str] = frozenset(),
+        exact: bool = True,
     ) -> None:
         """Times are in nanoseconds; `start` stands for now until the first stamp is seen.
 
         `maximum_bytes` bounds the payloads that wait; what comes when they are full is dropped and counted. `stamp_of`
         and `client_of` give None where they cannot tell; the sample is then left out, and they count it. `latched` are
-        the names of the latched streams.
+        the names of the latched streams. `exact`: see `timeline.ORDER`; False is order 1.
         """
         self._ticks = ticks
         self._lateness = lateness
+        self._behind = max(lateness, 1) if exact else lateness
+        """Up to so far behind the newest stamp, ticks run."""
         self._max_ahead = max_ahead
         self.alone_after = alone_after
         self.maximum_bytes = maximum_bytes
@@ -131,7 +135,14 @@ class DataTimeline:
                 yield Insert((arrival,), (stamp,))
             else:
                 self._wait(arrival, stamp)
-            yield from self._run_up_to(newest - self._lateness)
+            yield from self._run_up_to(newest - self._behind)
+
+    def finish(self) -> Iterator[Step]:
+        """Nothing more comes: the ticks up to the newest stamp, and all that waits."""
+        if self._newest is not None:
+            yield from self._run_up_to(self._newest)
+            yield from self.rest()
+            self.now = max(self.now, self._newest)
 
     def _run_up_to(self, limit: int) -> Iterator[Step]:
         """The ticks up to there, those for samples included."""

@@ -1,10 +1,11 @@
 """Clock Wall: a sample's time is its receive time, and the shell says how far time has come.
 
-What a tick sees are the samples up to its time and none later.
+A tick sees the samples up to its time, those of exactly its time included, and none later.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
 
@@ -18,33 +19,33 @@ _RECEIVED = itemgetter(0)
 class WallTimeline:
     """Clock Wall: time is when samples were received."""
 
-    def __init__(self, ticks: Ticks, start: int) -> None:
+    def __init__(self, ticks: Ticks, start: int, *, exact: bool = True) -> None:
+        """`exact`: see `timeline.ORDER`; False is order 1."""
         self._ticks = ticks
+        self._exact = exact
         self.now = start
         """Up to here all ticks have run."""
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
-        """All that happens up to `until`, or up to the last arrival if that is later; they are in order.
+        """All that happens up to `until`, or up to the last arrival if that is later.
 
-        The intake stamps what it queues while it is being emptied later than `until`. Whatever comes after that is
-        later still, so the ticks up to there can run, and a sample never enters before a tick that it comes after.
-        What was received exactly at a tick counts at it.
+        The arrivals are in order of time, and whatever comes in a later call is later than these and than `until`: so
+        the ticks up to there can run, and each sees all samples up to its time.
         """
         first, count = 0, len(arrivals)
         if count:
             until = max(until, arrivals[-1].received)
-        trigger = self._next_trigger(arrivals, 0)
+        due = self._due(arrivals)
         while True:
             tick = self._ticks.after(self.now)
-            sampled = arrivals[trigger : trigger + 1] if trigger < count and arrivals[trigger].received <= tick else ()
-            if sampled:
-                tick = arrivals[trigger].received
-                last = trigger + 1
-                trigger = self._next_trigger(arrivals, last)
-            elif tick <= until:
-                last = _first_after(arrivals, tick, first)
-            else:
+            if due:
+                tick = min(tick, due[0].received)
+            if tick > until:
                 break
+            sampled = []
+            while due and due[0].received == tick:
+                sampled.append(due.popleft())
+            last = _first_after(arrivals, tick, first)
             if last > first:
                 yield Insert(arrivals[first:last], None)
                 first = last
@@ -54,12 +55,12 @@ class WallTimeline:
             yield Insert(arrivals[first:], None)
         self.now = max(self.now, until)
 
-    def _next_trigger(self, arrivals: Sequence[Arrival], first: int) -> int:
-        """The index of the next arrival, from `first` on, that is evaluated at its own time; else their number."""
-        triggers = self._ticks.triggers
+    def _due(self, arrivals: Sequence[Arrival]) -> deque[Arrival]:
+        """The arrivals that are evaluated at their own times; not those of a stall, before which time does not go."""
+        triggers, past = self._ticks.triggers, self.now if self._exact else 0
         if not triggers:
-            return len(arrivals)
-        return next((at for at in range(first, len(arrivals)) if arrivals[at].stream in triggers), len(arrivals))
+            return deque()
+        return deque(each for each in arrivals if each.stream in triggers and each.received > past)
 
     def gap(self, time: int) -> Iterator[Step]:
         """The shell found that time stood still or jumped: go on from `time` without the ticks between."""
@@ -68,6 +69,10 @@ class WallTimeline:
 
     def rest(self) -> Iterator[Step]:
         """Nothing waits here."""
+        yield from ()
+
+    def finish(self) -> Iterator[Step]:
+        """All ticks up to now have run."""
         yield from ()
 
 

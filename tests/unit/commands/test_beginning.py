@@ -5,13 +5,13 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from tests.guides import ROOT
 from wayside.beginning import importing
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
+EXAMPLE = ROOT / "examples" / "cooperative-recording"
 FILES = [str(EXAMPLE / name) for name in ("detector.yaml", "rules.yaml", "templates.yaml")]
 RENDERED = [f"--templates={EXAMPLE}/templates.yaml", f"--tasks={EXAMPLE}/templates.yaml"]
 

@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import strategies as st
 
 HALF = 500_000_000
-"""Nanoseconds; most times are whole multiples, so that samples meet ticks, window edges and timeouts exactly."""
+"""Nanoseconds; all times are whole multiples, so that samples meet each other, ticks, window edges and timeouts."""
 
 CLIENTS = ("a", "b", "c")
 
@@ -16,9 +16,13 @@ DURATIONS = ("0s", "500ms", "1s", "2s", "3s")
 
 _BIG = 2**53 + 1
 
+BROKEN = None
+"""A message that cannot be read."""
+
 _values = st.sampled_from(
     [
         0.0,
+        -0.0,
         1.0,
         1.5,
         2.0,
@@ -43,7 +47,7 @@ _messages = st.one_of(
     st.sampled_from([{"v": 3.0, "w": 1.0}, {"v": 1.0, "w": 1.0}]),
     st.fixed_dictionaries({"v": st.sampled_from([0.0, 1.0, 1.5, 2.0, 3.0])}),
     st.fixed_dictionaries({"v": _values, "w": st.sampled_from([0.0, 1.0, 2.0])}),
-    st.sampled_from([{}, {"w": 1.0}]),
+    st.sampled_from([{}, {"w": 1.0}, BROKEN]),
 )
 
 _places = st.fixed_dictionaries(
@@ -52,12 +56,12 @@ _places = st.fixed_dictionaries(
         "y": st.sampled_from([0.0, 0.0, 0.0, 4.0, float("nan")]),
         "v": st.sampled_from([0.0, 1.0, 2.0]),
     }
-)
+) | st.just(BROKEN)
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message on its way: when it was sent, and how much later it arrives than it should; half seconds."""
+    """One message: when it was sent, and with clock Data how much later than that it arrives; half seconds."""
 
     time: int
     delay: int
@@ -74,8 +78,16 @@ class Scene:
     messages: tuple[Message, ...]
     data: bool
     """Whether with clock Data."""
+    lateness: int
+    """With clock Data; half seconds."""
     gap: tuple[int, int] | None
     """With clock Wall, from when to when there are no ticks; half seconds."""
+    count: int | None
+    """How many samples of a client's speed are kept."""
+    pose_bytes: int | None
+    """How many bytes of a client's poses are kept."""
+    all_bytes: int | None
+    """With clock Wall, how many bytes are kept over all."""
 
 
 _message = st.builds(
@@ -228,6 +240,23 @@ def scenes(draw: st.DrawFn) -> Scene:
     messages = draw(st.lists(_message, min_size=10, max_size=40))
     if draw(st.integers(0, 2)) == 0:  # else there is hardly ever a place of now and of a second ago
         messages += [Message(time, 0, client, "pose", draw(_places)) for time in range(1, 20, 2) for client in "ab"]
+    if draw(st.booleans()):  # on a common grid: a and b move together, what they say changes, some of it twice
+        speeds = draw(st.lists(st.sampled_from([0.0, 1.0, 1.5, 2.0, 3.0]), min_size=3, max_size=6))
+        grid = [(time, client, stream) for time in range(1, 24) for client in "ab" for stream in ("pose", "speed")]
+        twice = [each for each in grid if each[0] % len(speeds) == 0]
+        messages += [
+            Message(time, 0, client, stream, {"x": float(time), "y": 0.0, "v": speeds[number % len(speeds)]})
+            for number, (time, client, stream) in enumerate(draw(st.sampled_from([grid, grid[::-1]])) + twice)
+        ]
     data = draw(st.booleans())
     gap = None if data or draw(st.integers(0, 3)) else draw(st.tuples(st.integers(5, 15), st.integers(16, 25)))
-    return Scene(rules, tuple(messages), data, gap)
+    return Scene(
+        rules,
+        tuple(messages),
+        data,
+        draw(st.sampled_from((0, 1, 2, 2))),
+        gap,
+        draw(st.sampled_from((None, None, 1, 2, 4))),
+        draw(st.sampled_from((None, None, 1, 500, 900))),
+        None if data else draw(st.sampled_from((None, None, 1000, 3000))),
+    )

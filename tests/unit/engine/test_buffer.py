@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
+from tests.driving import Drive, a_detector, a_rule, a_stream, arrival
+from wayside.api import EventRule
 
 
 def a_lane(client: str = "car", stream: str = "s", duration: int = 10**9, maximum_bytes: int | None = None) -> Lane:
@@ -81,6 +84,46 @@ def test_the_cap_over_all_pushes_out_the_oldest_wherever_it_is() -> None:
     assert buffer.evicted == 2
     buffer.forget("b")  # whose lane had held the oldest
     assert buffer.evicted == 2
+
+
+def test_of_equal_times_the_cap_over_all_takes_by_client_and_stream_whichever_came_first() -> None:
+    buffer = Buffer(6 * SAMPLE_OVERHEAD)
+    lanes = [buffer.add(a_lane(*place)) for place in (("c", "s"), ("a", "t"), ("a", "s"), ("b", "s"))]
+    for number in range(7):
+        buffer.grew(lanes[number % 4].insert(a_sample(5, number)))
+    # There is room for five: the two samples of a on s go first.
+    assert {(lane.client, lane.stream): len(lane.samples) for lane in lanes} == {
+        ("c", "s"): 2,
+        ("a", "t"): 2,
+        ("a", "s"): 0,
+        ("b", "s"): 1,
+    }
+
+
+V = {"stream": "speed", "value": "msg.v"}
+OFTEN = a_rule("often", signals=[{"name": "v", **V}], when="v > 99", evaluation={"every": "100ms"})
+
+
+@pytest.mark.parametrize("others", [(), (OFTEN,)])
+def test_what_is_older_than_the_duration_is_not_seen_at_any_tick_whatever_other_rules_there_are(
+    others: tuple[EventRule, ...],
+) -> None:
+    first = {"name": "first", "aggregate": "First", **V}
+    rule = a_rule(signals=[first], when="first == 1", evaluation={"onSample": "speed"})
+    drive = Drive(a_detector(buffer={"duration": "6s"}), rule, *others)
+    sent = [arrival(0.5, "car", {"v": 1}), arrival(3, "car", {"v": 2}), arrival(6.75, "car", {"v": 2})]
+    assert drive.take(*sent, until=6.9) == ["r car started 0.5", "r car Until 6.75"]
+
+
+@pytest.mark.parametrize("others", [(), (OFTEN,)])
+def test_a_rule_does_not_change_what_the_cap_over_all_leaves_to_another(others: tuple[EventRule, ...]) -> None:
+    first = {"name": "first", "stream": "pose", "value": "msg.x", "aggregate": "First"}
+    brief = a_stream("speed", buffer={"duration": "200ms"})
+    rule = a_rule(signals=[first], when="first == 1", until="false", evaluation={"every": "2s"})
+    drive = Drive(a_detector(a_stream("pose"), brief, buffer={"bytes": "2k"}), rule, *others)
+    kept = [arrival(0.1, "car", {"x": 1}, "pose"), arrival(0.2, "car", {"x": 2}, "pose")]
+    many = [arrival(1 + n / 20, "car", {"v": 1}) for n in range(1, 19)]
+    assert drive.take(*kept, *many, until=2) == []  # 18 samples of 169 bytes are held: the place at 0.1 gave way
 
 
 def test_the_newest_of_all_stays_when_the_cap_leaves_room_for_one() -> None:

@@ -232,3 +232,25 @@ def test_the_states_of_subjects_that_are_gone_are_forgotten() -> None:
     signals: Any = drive.engine._known.signals
     assert len(signals._extracted) < 5
     assert len(drive.events) > 50
+
+
+FAST = a_rule(signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 10")
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [b'"\xff"', b'"\\ud800"', b"1e999", b"01", b"[1,]", b"NaN", b"tru", b"[" * 70 + b"]" * 70, b'1}, {"v": 1'],
+)
+def test_json_that_is_broken_where_no_rule_reads_it_is_no_message_at_all(rest: bytes) -> None:
+    drive = Drive(a_detector(), FAST)
+    whole, broken = b'{"v": 20, "w": 1}', b'{"v": 20, "w": ' + rest + b"}"
+    told = drive.take(arrival(0.5, "car", whole), arrival(0.5, "bus", broken), until=1)
+    assert told == ["r car started 1"]
+    assert drive.engine.counters.undecodable == {"speed": 1}
+
+
+def test_a_message_that_no_rule_reads_is_not_looked_at() -> None:
+    drive = Drive(a_detector(), FAST)
+    broken = [arrival(0.4, "car", b"{"), arrival(0.6, "car", b"{", "pose")]
+    assert drive.take(*broken, arrival(0.9, "car", {"v": 20}), until=1) == ["r car started 1"]
+    assert drive.engine.counters.undecodable == {}

@@ -59,6 +59,13 @@ RULES = (
         until="distance > 6",
         evaluation={"every": "300ms"},
     ),
+    a_rule(
+        "together",
+        scope={"fleet": {"members": "v > 0"}},
+        signals=[{"name": "v", "stream": "speed", "value": "msg.v"}],
+        when="size(members) > 1",
+        evaluation={"onSample": "speed"},
+    ),
 )
 
 
@@ -78,10 +85,10 @@ def drives(draw: st.DrawFn) -> list[tuple[float, str, str, dict[str, float]]]:
 
 
 def arrivals_of(drive: list[tuple[float, str, str, dict[str, float]]]) -> list[Arrival]:
-    """In order of time, with receive times that do not repeat."""
+    """In order of time; many are received at one."""
     return [
-        Arrival(at(time) + number, stream, f"vehicles/{client}/{stream}", json.dumps(message).encode())
-        for number, (time, client, stream, message) in enumerate(drive)
+        Arrival(at(time), stream, f"vehicles/{client}/{stream}", json.dumps(message).encode())
+        for time, client, stream, message in drive
     ]
 
 
@@ -115,8 +122,9 @@ def test_samples_stamped_while_the_intake_is_emptied_enter_after_the_ticks_befor
     arrivals = arrivals_of(drive)
     engine = an_engine(WALL, *RULES)
     events: list[Event] = []
-    for begin in range(0, len(arrivals), size):
-        batch = arrivals[begin : begin + size]
+    times = sorted({each.received for each in arrivals})
+    for begin in range(0, len(times), size):
+        batch = [each for each in arrivals if each.received in times[begin : begin + size]]
         events += engine.advance(batch, batch[0].received)
     events += engine.advance([], at(12))
     assert lines(events) == in_one_go(WALL, arrivals, 12)

@@ -67,6 +67,18 @@ def test_messages_of_a_ros_1_bag_read_as_those_of_ros_2(bag: Path) -> None:
     assert decoder.stamp(messages[3].payload) == 3 * SECOND + 5
 
 
+def test_messages_of_equal_times_come_in_the_order_in_which_the_bag_has_them(tmp_path: Path, noetic: Typestore) -> None:
+    path = tmp_path / "grid.bag"
+    cars = [1, 2, 2, 1, 2, 1, 1, 2]
+    with Writer(path) as writer:
+        connections = {n: writer.add_connection(f"/vehicles/car{n}/pose", POSE, typestore=noetic) for n in (1, 2)}
+        for number, car in enumerate(cars):
+            writer.write(connections[car], number // 4 * SECOND, pose(noetic, float(number), number))
+    messages = list(open_recordings([path]))
+    assert [int(CdrDecoder(POSE).decode(each.payload)["pose"]["position"]["x"]) for each in messages] == [*range(8)]
+    assert [each.key for each in messages] == [f"vehicles/car{car}/pose" for car in cars]
+
+
 def test_a_type_of_ones_own_comes_with_the_bag(tmp_path: Path, noetic: Typestore) -> None:
     own = get_types_from_msg("string name\nfloat32[] values\nduration left", "own_msgs/msg/Thing")
     noetic.register(own)

@@ -15,7 +15,7 @@ from detector.cli import main
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
 from tests.driving import START, a_detector, a_rule, a_stream, at
-from tests.unit.test_recordings import MESSAGES, write_bag, write_lines, write_mcap
+from tests.unit.recordings.test_recordings import MESSAGES, write_bag, write_lines, write_mcap
 
 
 class Ran(NamedTuple):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import permutations
+from random import Random
 
+import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -100,3 +102,32 @@ def test_thousands_at_one_spot_do_not_make_millions_of_pairs() -> None:
     assert found.left_out == 3_000 * 2_999 // 2 - 1_000
     assert found.pairs[0] == ("car0000", "car0001")
     assert measured < 10_000
+
+
+@settings(max_examples=50)
+@given(st.randoms(use_true_random=False), st.floats(1e-7, 1e-4), st.floats(-80, 80), st.floats(-180, 180))
+def test_a_pair_whose_distance_is_exactly_within_is_found_on_the_earth_however_many_there_are(
+    random: Random, spread: float, latitude: float, longitude: float
+) -> None:
+    places = {
+        f"car{index}": (latitude + spread * random.random(), longitude + spread * random.random())
+        for index in range(40)
+    }
+    asked = search(EARTH, places)  # type: ignore[arg-type]
+    within = asked.distance("car3", "car7")
+    assert sorted(near_pairs(asked, within, 10_000).pairs) == sorted(obvious(asked, within, 10_000).pairs)
+
+
+@given(degrees, degrees)
+def test_the_distance_on_the_earth_is_the_same_number_in_both_directions(
+    one: tuple[float, float], other: tuple[float, float]
+) -> None:
+    assert distance(EARTH, one, other) == distance(EARTH, other, one)
+
+
+@given(points, points)
+def test_the_distance_in_a_flat_frame_is_the_number_that_columns_come_to(one: Point, other: Point) -> None:
+    apart = np.array([one]) - np.array([other])
+    squares = apart * apart
+    assert distance(FLAT, one, other) == np.sqrt((squares[:, 0] + squares[:, 1]) + squares[:, 2])[0]
+    assert distance(FLAT, one, other) == distance(FLAT, other, one)

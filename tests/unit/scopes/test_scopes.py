@@ -80,6 +80,12 @@ def test_the_closing_speed_is_how_much_nearer_the_two_came_over_the_last_second(
     assert drive.events[0].values["closingSpeed"] == pytest.approx(15)
 
 
+def test_the_closing_speed_of_two_that_keep_their_distance_is_a_zero_without_sign() -> None:
+    drive = Drive(a_detector(), pairs(when="closingSpeed == 0.0", evaluation={"every": "500ms"}))
+    drive.take(*(place(t, c, 0) for t in (0.5, 1, 1.5) for c in "ab"), until=1.5)
+    assert str(drive.events[0].values["closingSpeed"]) == "0.0"
+
+
 def test_the_closing_speed_is_unknown_while_a_place_a_second_ago_is_not_known() -> None:
     detector = a_detector(a_stream("pose", staleAfter="500ms"))
     rule = pairs(when="closingSpeed > -1000.0", until="false", evaluation={"every": "500ms"})

@@ -118,3 +118,11 @@ def test_all_aggregates_but_those_of_one_sample_and_age_need_a_window() -> None:
             assert aggregate in OF_A_SAMPLE | {Aggregate.AGE}
             a_rule(signals=[signal], when="true")
         a_rule(signals=[{**signal, "over": "5s"}], when="true")
+
+
+@pytest.mark.parametrize("aggregate", [Aggregate.MIN, Aggregate.MAX])
+@pytest.mark.parametrize("values", [[-0.0], [0.0, -0.0], [-0.0, 0.0], [-0.0, 0.0, -0.0]])
+def test_a_zero_of_min_and_max_has_no_sign_in_whatever_order_the_values_came(
+    aggregate: Aggregate, values: list[float]
+) -> None:
+    assert str(calculated(aggregate, timed(values))) == "0.0"

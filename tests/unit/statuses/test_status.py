@@ -77,6 +77,36 @@ def test_rules_are_told_with_what_was_unknown_failed_and_is_open() -> None:
     assert rule.latency.sum == pytest.approx(0.5 + 0.4)
 
 
+def test_the_latency_of_a_rule_counts_a_sample_once_however_long_nothing_follows() -> None:
+    kept = Kept(Drive(a_detector(), FAST))
+    kept.take(arrival(0.5, "car", {"v": 20}), until=1)
+    for second in range(2, 20):
+        status = kept.take(until=second)
+    status = kept.take(arrival(19.5, "bus", {"v": 20}), arrival(19.75, "car", {"v": 20}), until=20)
+    (rule,) = status.rules
+    assert rule.latency is not None
+    assert rule.latency.count == 3
+    assert rule.latency.sum == pytest.approx(0.5 + 0.5 + 0.25)
+
+
+def test_silent_clients_leave_room_for_the_latencies_of_others() -> None:
+    kept = Kept(Drive(a_detector(), FAST))
+    kept.take(*(arrival(0.5, f"a{n}", {"v": 20}) for n in range(20)), until=1)
+    status = kept.take(arrival(1.5, "z", {"v": 20}), until=2)
+    assert status.rules[0].latency is not None
+    assert status.rules[0].latency.count == 16 + 1
+
+
+def test_the_latency_of_a_rule_ends_with_its_evaluation_and_not_with_a_later_look() -> None:
+    kept = Kept(Drive(a_detector(), FAST))
+    for tick in range(1, 11):  # after each tick, a second look in which nothing is evaluated
+        kept.take(arrival(tick - 0.5, "car", {"v": 20}), until=tick + 0.01 / tick)
+        status = kept.take(until=tick + 0.4)
+    assert status.rules[0].latency is not None
+    assert status.rules[0].latency.count == 10
+    assert status.rules[0].latency.sum == pytest.approx(10 * 0.5, abs=0.05)
+
+
 def test_with_clock_data_latencies_are_from_the_stamp_to_the_receipt() -> None:
     kept = Kept(Drive(a_detector(a_stream("speed", stamp="msg.t"), clock="Data"), FAST))
     kept.take(arrival(100.0, "car", {"v": 1, "t": 1_767_225_600.0}), until=100)

@@ -34,6 +34,7 @@ def test_the_messages_of_one_key_belong_to_the_clients_that_they_name(clock: str
         sent(0.5, '{"id": 1, "v": 5}'), sent(0.6, '{"id": 2, "v": 15}'), sent(0.7, '{"id": 3, "v": 16}'), until=1
     )
     events += drive.take(sent(1.1, '{"id": 2, "v": 5}'), sent(1.2, '{"id": 1, "v": 17}'), sent(2, '{"id": 3}'), until=2)
+    events += drive.finish()
     assert events == ["r its-2 started 1", "r its-3 started 1", "r its-1 started 2", "r its-2 Until 2"]
     assert drive.engine.counters.samples["speed"] == 6
 
@@ -134,9 +135,9 @@ def test_an_emergency_vehicle_is_detected_by_its_cams(clock: str) -> None:
         cam(0.2, 4294967295, lightbar=True),
         cam(0.3, 17, lightbar=False),
         cam(0.4, 18, lightbar=True, latitude=49.0),
-        cam(1.0, 19),
+        cam(1.001, 19),
         until=1,
     )
     assert events == ["emergency its-4294967295 started 1"]
-    events = drive.take(cam(1.5, 4294967295), cam(4.0, 17, lightbar=True), until=4)
+    events = drive.take(cam(1.5, 4294967295), cam(4.0, 17, lightbar=True), until=4) + drive.finish()
     assert events == ["emergency its-17 started 4", "emergency its-4294967295 Until 4"]
