@@ -99,7 +99,6 @@ def _pairs(
 ) -> Iterator[Look]:
     ordered = "a" in scope or "b" in scope
     places = {client: _place(scope["position"], client, world, now, now) for client in views}
-    earlier = {client: _place(scope["position"], client, world, now - SECOND, now) for client in views}
     placed = {
         client: view if places[client] is None else {**view, "position": dict(zip("xyz", places[client], strict=True))}
         for client, view in views.items()
@@ -110,12 +109,13 @@ def _pairs(
             continue
         variables: dict[str, Any] = {"a": placed[a], "b": placed[b], **extra}
         near: Truth = None
-        distance, before = _distance(places[a], places[b]), _distance(earlier[a], earlier[b])
+        distance = _distance(places[a], places[b])
         if distance is not None:
             variables["distance"] = distance
             near = distance <= scope["within"]
-            if before is not None and scope["closing"]:
-                variables["closingSpeed"] = before - distance
+            closing = _closing_speed(scope["position"], a, b, world, now) if scope["closing"] else None
+            if closing is not None:
+                variables["closingSpeed"] = closing
         roles = [
             truth(scope[role]["where"], {**views[client], **extra}, (*MEMBER, *extra))
             for role, client in (("a", a), ("b", b))
@@ -134,14 +134,30 @@ def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) ->
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
+def _closing_speed(position: dict[str, str], a: str, b: str, world: World, now: int) -> float | None:
+    """By how much the distance shrank in the last second for which both have said where they are."""
+    end = now
+    if _limits(position, world) != []:
+        end = min(world.kept(client, position["stream"], now)[-1].time for client in (a, b))
+    before, after = (
+        _distance(*(_place(position, client, world, time, now) for client in (a, b))) for time in (end - SECOND, end)
+    )
+    return None if before is None or after is None else before - after
+
+
+def _limits(position: dict[str, str], world: World) -> list[int]:
+    """How old a place may be; none of these where it has no age."""
+    stale = world.stale_after[position["stream"]]
+    oldest = nanoseconds(position["maxAge"]) if "maxAge" in position else None if stale is None else SECOND
+    return [limit for limit in (stale, oldest) if limit is not None]
+
+
 def _place(position: dict[str, str], client: str, world: World, then: int, now: int) -> tuple[float, ...] | None:
     """Where the client was; of the past, no more than the buffer has and not from before a gap."""
     mine = [each for each in world.kept(client, position["stream"], now) if each.time <= then]
     if then < now:
         mine = [each for each in mine if world.floor is None or each.time > world.floor]
-    stale = world.stale_after[position["stream"]]
-    oldest = nanoseconds(position["maxAge"]) if "maxAge" in position else None if stale is None else SECOND
-    if not mine or any(limit is not None and then - mine[-1].time > limit for limit in (stale, oldest)):
+    if not mine or any(then - mine[-1].time > limit for limit in _limits(position, world)):
         return None
     if mine[-1].message is None:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.buffering.clients import is_fresh
@@ -64,13 +64,27 @@ class Positions:
             counters.ages.used(lane, now)
         return self._place(position, client, sample, counters)
 
-    def then(
-        self, position: CompiledPosition, client: str, then: int, now: int, counters: RuleCounters
-    ) -> Place | None:
-        """Where the client was at a past time, by the newest sample up to then; None like `now`."""
+    def common_time(self, position: CompiledPosition, clients: Iterable[str], now: int) -> int:
+        """The newest time for which all of these clients have said where they are, in nanoseconds.
+
+        That is `now` where positions have no age: what was said last holds. All have a place now.
+        """
+        if self._limit(position) is None:
+            return now
+        lanes = (self._buffer.lane(client, position.stream) for client in clients)
+        return min(lane.newest.time for lane in lanes if lane is not None and lane.newest is not None)
+
+    def sample(self, position: CompiledPosition, client: str, then: int, now: int) -> Sample | None:
+        """The newest sample up to a past time; None where there is none, or it was too old then."""
         lane, limit = self._buffer.lane(client, position.stream), self._limit(position)
         sample = None if lane is None else next(lane.newest_first(self._floor, then, now), None)
-        if sample is None or (limit is not None and then - sample.time > limit):
+        return None if sample is None or (limit is not None and then - sample.time > limit) else sample
+
+    def of(
+        self, position: CompiledPosition, client: str, sample: Sample | None, counters: RuleCounters
+    ) -> Place | None:
+        """Where the client was by a sample; None like `now`."""
+        if sample is None:
             counters.unknowns += 1
             return None
         return self._place(position, client, sample, counters)

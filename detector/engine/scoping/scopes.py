@@ -11,6 +11,7 @@ from detector.engine.buffering.clients import Clients, fresh_streams
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.episodes import Truth, both
 from detector.engine.episodes.subjects import Subject
+from detector.engine.samples.sample import Sample
 from detector.engine.scoping.nearness import Search, near_pairs
 from detector.engine.scoping.positions import Place, Positions, described, distance, distance_of_order_1, point
 from detector.engine.signals.models import add_models
@@ -69,7 +70,8 @@ class Views:
         self._common = rule.common_signals
         self._views: dict[str, dict[str, Any]] = {}
         self._of_elements: dict[tuple[str, str | None], dict[str, Any]] = {}
-        self._earlier: dict[str, Place | None] = {}
+        self._earlier: dict[tuple[str, int], Place | None] = {}
+        self._by_sample: dict[tuple[str, Sample | None], Place | None] = {}
 
     def of(self, client: str, element: CompiledElement) -> dict[str, Any]:
         """client, labels, streams and the known signals, those that read the element among them."""
@@ -110,21 +112,42 @@ class Views:
         """Where the client is, if that is known."""
         return self._positions.now(subject.position, client, self._now, self._counters)
 
-    def earlier_place(self, subject: PairSubject, client: str) -> Place | None:
-        """Where the client was a second ago, if that is known; looked up once a tick."""
-        if client not in self._earlier:
-            then = self._now - CLOSING_NS
-            self._earlier[client] = self._positions.then(subject.position, client, then, self._now, self._counters)
-        return self._earlier[client]
-
     def distance(self, subject: PairSubject, one: Place, other: Place) -> float:
         """Metres between two places: the one number for conditions, reach and events."""
         return (distance if self._exact else distance_of_order_1)(subject.position, one, other)
 
-    def closing_speed(self, now: float, before: float) -> float:
-        """From the distances of now and of a second ago, in m/s; without the sign of a zero."""
-        speed = (before - now) / (CLOSING_NS / 1e9)
+    def closing_speed(self, subject: PairSubject, a: str, b: str, distance: float) -> float | None:
+        """By how much the distance shrank in the last second for which both have sent places, in m/s.
+
+        `distance` is that of now. None while one of the places is unknown. A zero has no sign.
+        """
+        end = self._closing_end(subject, a, b)
+        after = distance if end == self._now else self._distance_at(subject, a, b, end)
+        before = self._distance_at(subject, a, b, end - CLOSING_NS)
+        if after is None or before is None:
+            return None
+        speed = (before - after) / (CLOSING_NS / 1e9)
         return speed if self._exact or speed else -0.0
+
+    def _closing_end(self, subject: PairSubject, a: str, b: str) -> int:
+        """When the second ends over which the closing speed is measured."""
+        order_1 = not self._exact
+        return self._now if order_1 else self._positions.common_time(subject.position, (a, b), self._now)
+
+    def _distance_at(self, subject: PairSubject, a: str, b: str, then: int) -> float | None:
+        one, other = self._place_at(subject, a, then), self._place_at(subject, b, then)
+        return None if one is None or other is None else self.distance(subject, one, other)
+
+    def _place_at(self, subject: PairSubject, client: str, then: int) -> Place | None:
+        """Where the client was, if that is known; looked up once a tick for each time, and each sample read once."""
+        at = (client, then)
+        if at not in self._earlier:
+            sample = self._positions.sample(subject.position, client, then, self._now)
+            by = (client, sample)
+            if by not in self._by_sample:
+                self._by_sample[by] = self._positions.of(subject.position, client, sample, self._counters)
+            self._earlier[at] = self._by_sample[by]
+        return self._earlier[at]
 
     def truth(self, expression: Expression | None, variables: Mapping[str, Any], place: str) -> Truth:
         """What a condition says; one that is absent holds. `place` names field and subject, for errors."""
@@ -246,7 +269,8 @@ def _pairs(
             if placed:
                 variables["distance"] = between(a, b)
                 if subject.closing_speed:
-                    _closing_speed(views, subject, a, b, variables)
+                    speed = views.closing_speed(subject, a, b, variables["distance"])
+                    variables |= {} if speed is None else {"closingSpeed": speed}
             in_scope = both(
                 both(a_truth[a], b_truth[b]), views.truth(subject.where, variables, f"where of {each.text}")
             )
@@ -275,11 +299,3 @@ def _member(
     if client in places and "position" not in view:
         view["position"] = described(subject.position, places[client])
     return view
-
-
-def _closing_speed(views: Views, subject: PairSubject, a: str, b: str, variables: dict[str, Any]) -> None:
-    """By how much the distance has shrunk over the last second, in m/s; unknown where one's place a second ago is."""
-    a_place, b_place = views.earlier_place(subject, a), views.earlier_place(subject, b)
-    if a_place is not None and b_place is not None:
-        before = views.distance(subject, a_place, b_place)
-        variables["closingSpeed"] = views.closing_speed(variables["distance"], before)

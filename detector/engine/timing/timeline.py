@@ -12,5 +12,5 @@ ORDER = 2
 
 A file that names no version has order 1. There, with clock Data and a lateness of zero, a tick runs with the first
 stamp of its time; with clock Wall, what came during a stall is evaluated at its own time, after the gap. And `distance`
-and `closingSpeed` are those of then, to the last digit.
+and `closingSpeed` are those of then, to the last digit; the second of `closingSpeed` ends now, however old places are.
 """

@@ -167,6 +167,7 @@ _scopes = st.sampled_from(
         {"pairs": {"position": {**_POSITION, "maxAge": "500ms"}, "within": 10}},
         {"pairs": {"position": {**_POSITION, "maxAge": "2s"}, "within": 10}},
         {"pairs": {"position": {**_POSITION, "maxAge": "10s"}, "within": 10}},
+        {"pairs": {"position": {"stream": "rare", "x": "msg.w", "y": "msg.w"}, "within": 10}},
         {"pairs": {"position": _POSITION, "within": 10, "where": '"speed" in a.streams || distance < 5'}},
         {"pairs": {"position": _POSITION, "within": 10, "a": {"where": '"speed" in streams'}}},
         {

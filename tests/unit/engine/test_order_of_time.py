@@ -294,6 +294,19 @@ def test_an_intake_file_that_does_not_say_its_order_replays_as_it_was() -> None:
     assert recorded_before(detector_of({}), [sample], stamped(5, 1), gap, stamped(30, 20)) == ["sample car started 3"]
 
 
+def test_an_intake_file_that_does_not_say_its_order_has_closing_speeds_that_end_now() -> None:
+    """The one in front falls silent; once, that counted as closing in."""
+    rule = a_rule(scope=APART["scope"], when="closingSpeed > 3.0", until="false", evaluation={"every": "500ms"})
+    arrivals = [
+        arrival(n / 2, client, {"x": x + 2.0 * n, "y": 0}, "pose")
+        for n in range(1, 8)
+        for client, x in (("a", 0), ("b", 9))
+        if client == "a" or n <= 4
+    ]
+    assert recorded_before(a_detector(), [rule], *arrivals) == ["r a+b started 3"]
+    assert replay_arrivals(arrivals, a_detector(), [rule]).events == []
+
+
 def test_an_intake_file_that_does_not_say_its_order_has_the_distances_of_then_to_the_last_digit() -> None:
     rule = a_rule(scope=APART["scope"], when="closingSpeed == 0.0", evaluation={"every": "500ms"})
     a, b = (8.1, 0.6183689966753316), (4.3, 0.9170189691149498)

@@ -92,11 +92,32 @@ def test_the_closing_speed_is_unknown_while_a_place_a_second_ago_is_not_known() 
     drive = Drive(detector, rule)
     both = [place(t, c, 0) for t in (0.1, 0.9, 1.4) for c in "ab"]
     assert drive.take(*both, until=1) == []  # the sample that was the newest at 0 is none
-    assert drive.take(place(1.45, "a", 0), until=1.5) == ["p a+b started 1.5"]  # at 0.5 there was one of 0.1
+    assert drive.take(place(1.45, "a", 0), until=1.5) == [
+        "p a+b started 1.5"
+    ]  # at 0.4, a second before the newest of b, there was one of 0.1
     drive = Drive(detector, rule)
     drive.take(*both, until=1)
     drive.engine.gap(at(1.2))
     assert drive.take(place(1.45, "a", 0), until=1.5) == []
+
+
+def test_the_closing_speed_ends_with_the_newest_place_of_the_one_who_fell_silent() -> None:
+    """Two drive one behind the other at 10 m/s, and the one in front leaves."""
+    behind = [place(n / 10, "a", n) for n in range(1, 60)]
+    ahead = [place(n / 10, "b", 9 + n) for n in range(1, 31)]
+    conditions = {"met": "distance < 1.0 && closingSpeed == 0.0", "closed": "closingSpeed > 0.0"}
+    rules = [pairs(name, when=when, evaluation={"every": "100ms"}) for name, when in conditions.items()]
+    drive = Drive(a_detector(), *rules)
+    assert drive.take(*sorted(behind + ahead), until=4) == ["met a+b started 3.9", "met a+b Until 4"]
+
+
+def test_the_closing_speed_to_one_whose_place_has_no_age_is_that_of_now() -> None:
+    """A station says once where it stands."""
+    rule = pairs(scope={"position": EARTH}, when="closingSpeed > 10.0", evaluation={"every": "500ms"})
+    drive = Drive(a_detector(a_stream("pose", staleAfter="Never")), rule)
+    car = [north(20 + n / 2, "car", 0.001 - 0.0001 * n, 0) for n in range(8)]
+    assert drive.take(north(0.5, "station", 0, 0), *car, until=23) == ["p car+station started 21"]
+    assert drive.events[0].values["closingSpeed"] == pytest.approx(22.11, abs=0.01)
 
 
 # On the Earth

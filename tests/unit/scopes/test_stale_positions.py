@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Iterator
+from itertools import combinations
 from math import dist
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +28,13 @@ NEAR_MISS: dict[str, Any] = {
     "evaluation": {"every": "100ms"},
     "when": "timeToCollision(b.position.x - a.position.x, b.position.y - a.position.y, b.vx - a.vx, b.vy - a.vy, 2)"
     " < 1.5",
+}
+
+
+CLOSING: dict[str, Any] = {
+    "scope": NEAR_MISS["scope"],
+    "evaluation": NEAR_MISS["evaluation"],
+    "when": "timeToCollision(distance, closingSpeed) < 1.5",
 }
 
 
@@ -84,6 +92,24 @@ def near_misses(users: list[User], seconds: float) -> set[str]:
     return found
 
 
+def closing_in(users: list[User], seconds: float) -> set[str]:
+    """The pairs that would meet soon at the rate of the last second, by their true ways, while both are in the picture.
+
+    Somebody is in the picture without a break, so who is there now and was a second ago was there in between.
+    """
+    found = set()
+    ticks = [
+        {user.name: (here["x"], here["y"]) for user in users if (here := user.sample(number * PERIOD)) is not None}
+        for number in range(round(seconds / PERIOD))
+    ]
+    for before, now in zip(ticks, ticks[10:], strict=False):
+        for one, other in combinations(sorted(before.keys() & now.keys()), 2):
+            gap, wider = dist(now[one], now[other]), dist(before[one], before[other])
+            if gap <= 50 and gap < 1.5 * (wider - gap):
+                found.add(f"{one}+{other}")
+    return found
+
+
 def recorded(users: list[User], seconds: float) -> Iterator[Arrival]:
     for number in range(round(seconds / PERIOD)):
         for user in users:
@@ -102,6 +128,15 @@ def test_a_near_miss_rule_finds_no_ghosts_of_road_users_that_left(seed: int) -> 
     users = traffic(seed)
     started = {event.subject for event in replayed(users, NEAR_MISS).events if event.started}
     expected = near_misses(users, 60)
+    assert expected
+    assert started == expected
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_rule_on_the_closing_speed_finds_no_ghosts_of_road_users_that_left(seed: int) -> None:
+    users = traffic(seed)
+    started = {event.subject for event in replayed(users, CLOSING).events if event.started}
+    expected = closing_in(users, 60)
     assert expected
     assert started == expected
 
