@@ -136,7 +136,8 @@ class ControlPlane:
         """
         began = time.monotonic()
         child = self._api_server = self._child("kube-apiserver", commands.kube_apiserver(self._setup))
-        self._wait(child, self._setup.serving_certificate.exists, "kube-apiserver has its certificate")
+        # It writes the key after the certificate: once the one is there, the other one is whole.
+        self._wait(child, self._setup.serving_key.exists, "kube-apiserver has its certificate and key")
         write_kubeconfig(self.kubeconfig, self.url, self._setup.serving_certificate.read_bytes(), self._token)
         api = self.api()
         self._wait(child, lambda: api.raw("/readyz") == "ok", "kube-apiserver answers ok on /readyz")
