@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -177,14 +178,17 @@ def check(
     for warning in warnings:
         typer.echo(warning.as_warning(), err=True)
     doubted: list[str] = []
+    unread: Sequence[Exception] = ()
     if recordings and not problems:
         with importing():
             from detector.commands.replay import doubts_of
 
-        doubted = doubts_of(documents, recordings)
+        doubted, unread = doubts_of(documents, recordings)
     for doubt in doubted:
         typer.echo(f"warning: {doubt}", err=True)
-    if problems or (strict and (warnings or doubted)):
+    for each in unread:
+        typer.echo(f"error: {each}", err=True)
+    if problems or unread or (strict and (warnings or doubted)):
         raise typer.Exit(1)
     count = len(warnings) + len(doubted)
     doubts = f", {count} warning{'s' if count > 1 else ''}" if count else ""

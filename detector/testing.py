@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from detector.engine.episodes.events import Event
-from detector.replay.gathering import recordings_of
-from detector.replay.intake_file import is_intake_file, read_intake
+from detector.replay.gathering import intake_file_of, recordings_of
+from detector.replay.intake_file import read_intake
 from detector.replay.playing import play
 from detector.replay.replaying import replay_intake
 from detector.rules.files import load_rules
@@ -46,11 +46,15 @@ def run(rules: Paths, detector: str | Path, recording: Paths, *, as_one: bool = 
     if loaded.warnings:
         raise RefusedError("; ".join(loaded.warnings))
     recordings = _paths(recording)
-    if recordings[0].exists() and is_intake_file(recordings[0]):
-        outcomes = [replay_intake(read_intake(recordings[0]), loaded.rule_set.detector, loaded.rule_set.rules)]
+    intake = intake_file_of(recordings)
+    if intake is not None:
+        outcomes = [replay_intake(read_intake(intake), loaded.rule_set.detector, loaded.rule_set.rules)]
     else:
         gathered = recordings_of(recordings, as_one=as_one)
-        outcomes = play(gathered, loaded.rule_set.detector, loaded.rule_set.rules)
+        played = play(gathered, loaded.rule_set.detector, loaded.rule_set.rules)
+        if played.errors:
+            raise played.errors[0]
+        outcomes = list(played.outcomes.values())
     refusals = dict.fromkeys(str(refusal) for outcome in outcomes for refusal in outcome.refusals)
     if refusals:
         raise RefusedError("; ".join(refusals))

@@ -16,9 +16,10 @@ from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
-from detector.replay.gathering import recordings_of
-from detector.replay.intake_file import is_intake_file, read_intake, recorded_outages
-from detector.replay.playing import name_of, play
+from detector.replay.errors import RecordingError
+from detector.replay.gathering import intake_file_of, name_of, recordings_of
+from detector.replay.intake_file import read_intake, recorded_outages
+from detector.replay.playing import Played, play
 from detector.replay.progress import Progress
 from detector.replay.replaying import Outcome, replay_intake
 from detector.rules.files import load_rules
@@ -38,7 +39,9 @@ def replay_files(
     *,
     as_one: bool,
 ) -> None:
-    """Replay, write the results into the folder, and print a summary; exits with 1 where a rule is refused.
+    """Replay, write the results into the folder, and print a summary.
+
+    Exits with 1 where a rule is refused, or one of several recordings cannot be replayed.
 
     Args:
         recordings: at least one file, folder or pattern.
@@ -53,7 +56,7 @@ def replay_files(
     """
     with Progress(Console(stderr=True)) as progress:
         played = _replayed(recordings, detector, rules, as_one, progress)
-    outcomes = [outcome for _, outcome in played]
+    outcomes = list(played.outcomes.values())
     output.mkdir(parents=True, exist_ok=True)
     traced = [_traced(outcome) for outcome in outcomes]
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
@@ -64,18 +67,22 @@ def replay_files(
     refusals = dict.fromkeys(str(refusal) for outcome in outcomes for refusal in outcome.refusals)
     for refusal in refusals:
         typer.echo(refusal, err=True)
-    for name, outcome in played:
-        for line in _lines(outcome):
-            typer.echo(line if len(played) == 1 else f"{name}: {line}", err=True)
+    several = len(played.outcomes) + len(played.errors) > 1
+    for name, outcome in played.outcomes.items():
+        for line in _lines(outcome, f"{name}: " if several else ""):
+            typer.echo(line, err=True)
+    for error in played.errors:
+        typer.echo(f"error: {error}", err=True)
     typer.echo(f"{_counted(outcomes)}: {output}", err=True)
-    if refusals:
+    if refusals or played.errors:
         raise typer.Exit(1)
 
 
-def _lines(outcome: Outcome) -> Iterator[str]:
+def _lines(outcome: Outcome, where: str) -> Iterator[str]:
     """What a person should know of a recording."""
-    yield from (f"warning: {doubt}" for doubt in outcome.doubts)
-    yield from outcome.notes
+    yield from (f"warning: {cut}" for cut in outcome.cuts)  # which name their files
+    yield from (f"warning: {where}{doubt}" for doubt in outcome.doubts)
+    yield from (f"{where}{note}" for note in outcome.notes)
     if outcome.cut:
         yield "the intake file ends in the middle: its detector was killed"
     if outcome.lost:
@@ -86,22 +93,33 @@ def _counted(outcomes: Sequence[Outcome]) -> str:
     events = [event for outcome in outcomes for event in outcome.events]
     started = sum(event.started for event in events)
     several = f"{len(outcomes)} recordings, " if len(outcomes) > 1 else ""
-    return (
-        f"{several}{sum(outcome.samples for outcome in outcomes)} samples, {started} episodes started, "
-        f"{len(events) - started} ended, {sum(len(outcome.tasks) for outcome in outcomes)} tasks"
-    )
+    samples = _number(sum(outcome.samples for outcome in outcomes), "sample")
+    tasks = _number(sum(len(outcome.tasks) for outcome in outcomes), "task")
+    return f"{several}{samples}, {_number(started, 'episode')} started, {len(events) - started} ended, {tasks}"
 
 
-def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> list[str]:
-    """What the recordings show of the Detectors and their rules."""
-    gathered = recordings_of(recordings)
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> tuple[list[str], list[RecordingError]]:
+    """What the recordings show of the Detectors and their rules; and why some of several recordings cannot be read."""
+    intake = intake_file_of(recordings)
+    gathered = [] if intake is not None else recordings_of(recordings)
     rules = [document.object for document in documents if isinstance(document.object, EventRule)]
     found: list[str] = []
+    errors: dict[str, RecordingError] = {}
     for detector in (document.object for document in documents if isinstance(document.object, Detector)):
         selected = select(detector, rules).rules
-        for outcome in play(gathered, detector, selected, lambda: _plugins(Outages(lambda: ()))):
-            found += outcome.doubts
-    return list(dict.fromkeys(found))
+        if intake is not None:
+            with _plugins(Outages(lambda: ())) as plugins:
+                found += replay_intake(read_intake(intake), detector, selected, plugins).doubts
+            continue
+        played = play(gathered, detector, selected, lambda: _plugins(Outages(lambda: ())))
+        for outcome in played.outcomes.values():
+            found += [*map(str, outcome.cuts), *outcome.doubts]
+        errors.update((str(error), error) for error in played.errors)
+    return list(dict.fromkeys(found)), list(errors.values())
 
 
 def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:
@@ -111,26 +129,23 @@ def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:
 
 def _replayed(
     recordings: Sequence[Path], detector: Path | None, rules: Sequence[Path], as_one: bool, progress: Progress
-) -> list[tuple[str, Outcome]]:
-    """What each recording came to, by its name."""
-    if recordings[0].exists() and is_intake_file(recordings[0]):
-        if len(recordings) > 1:
-            refuse("an intake file is replayed alone: give one recording")
-        return [(str(recordings[0]), _intake_replayed(recordings[0], detector, rules, progress))]
+) -> Played:
+    intake = intake_file_of(recordings)
+    if intake is not None:
+        return Played({name_of((intake,)): _intake_replayed(intake, detector, rules, progress)}, [])
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
     loaded = load_rules(detector, rules)
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
     gathered = recordings_of(recordings, as_one=as_one)
-    outcomes = play(
+    return play(
         gathered,
         loaded.rule_set.detector,
         loaded.rule_set.rules,
         lambda: _plugins(Outages(lambda: ())),
         progress.watch,
     )
-    return list(zip(map(name_of, gathered), outcomes, strict=True))
 
 
 def _intake_replayed(recording: Path, detector: Path | None, rules: Sequence[Path], progress: Progress) -> Outcome:

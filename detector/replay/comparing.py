@@ -25,15 +25,22 @@ class Span:
     subject: str
     open: bool = False
     """It had not ended when the recording did."""
+    recording: str | None = None
+    """The recording that it is from, where there are several."""
 
     def shared(self, other: Span) -> int:
         """How long both last, in nanoseconds; negative where they are apart."""
         return min(self.end, other.end) - max(self.start, other.start)
 
     def to_json(self) -> dict[str, Any]:
-        """Subject, start and end as text."""
+        """Subject, start and end as text, and the recording where there are several."""
         times = {"startTime": format_time(self.start), "endTime": None if self.open else format_time(self.end)}
-        return {"subject": self.subject, **times}
+        return {"subject": self.subject, **times, **self.origin}
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """The recording, for JSON."""
+        return {} if self.recording is None else {"recording": self.recording}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +78,7 @@ class Comparison:
             "both": [
                 {
                     "subject": first.subject,
+                    **first.origin,
                     "first": first.to_json(),
                     "second": second.to_json(),
                     "startDifference": (second.start - first.start) / 1e9,
@@ -85,8 +93,9 @@ class Comparison:
 
     def lines(self) -> Iterator[str]:
         """The same in a few lines for people."""
+        episodes = "episode" if len(self.both) == 1 else "episodes"
         yield (
-            f"{self.first} and {self.second}: {len(self.both)} episodes in both, "
+            f"{self.first} and {self.second}: {len(self.both)} {episodes} in both, "
             f"{len(self.only_first)} only in {self.first}, {len(self.only_second)} only in {self.second}"
         )
         for what, differences in (("start", self.start_differences), ("end", self.end_differences)):
@@ -99,7 +108,8 @@ class Comparison:
             yield f"both have an episode in {self.agreement:.1%} of the time in which either has"
         for rule, spans in ((self.first, self.only_first), (self.second, self.only_second)):
             for span in spans[:_SHOWN]:
-                yield f"only {rule}: {span.subject} from {format_time(span.start)}"
+                where = "" if span.recording is None else f" in {span.recording}"
+                yield f"only {rule}: {span.subject} from {format_time(span.start)}{where}"
 
 
 _SHOWN = 10
@@ -116,9 +126,11 @@ def compare(events: Iterable[Event], first: str, second: str, end: int) -> Compa
             open_spans[event.episode] = (event.rule, event)
         else:
             open_spans.pop(event.episode, None)
-            of_rule[event.rule].append(Span(event.start_time, event.end_time, event.subject))
+            span = Span(event.start_time, event.end_time, event.subject, recording=event.recording)
+            of_rule[event.rule].append(span)
     for rule, event in open_spans.values():
-        of_rule[rule].append(Span(event.start_time, max(end, event.start_time), event.subject, open=True))
+        last = max(end, event.start_time)
+        of_rule[rule].append(Span(event.start_time, last, event.subject, open=True, recording=event.recording))
     return _matched(first, second, sorted(of_rule[first]), sorted(of_rule[second]))
 
 

@@ -2,12 +2,14 @@
 
 Folders stand for the recordings in them, patterns such as `drives/*.mcap` for what they match. Files are one recording
 where the metadata.yaml of their rosbag2 folder names them, and where a recorder split it: their names differ by a
-number that counts on, and each begins where the one before ends.
+number that counts on, and each begins where the one before ends. The order in which they are given does not matter.
 """
 
 from __future__ import annotations
 
 import glob
+import itertools
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,7 +19,8 @@ import yaml
 
 from detector.actions.record.description import DESCRIPTION
 from detector.replay.errors import RecordingError
-from detector.replay.recordings import check_kind, span_of
+from detector.replay.intake_file import is_intake_file
+from detector.replay.recordings import check_exists, span_of
 
 Recording = tuple[Path, ...]
 """The files that are one recording; or one rosbag2 folder."""
@@ -28,7 +31,7 @@ _SPLIT = 10 * 10**9
 _OVERLAP = 10**9
 """Nanoseconds: messages that were under way when a file was closed may stand in the next."""
 
-_DATE = re.compile(r"\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d|\d{14}")
+_DATE = re.compile(r"\d{4}(?:[-_]\d\d){5}|\d{14}")
 _NUMBERED = re.compile(r"(.*?)(\d+)([_.-]*)")
 _TEXT = (".jsonl", ".ndjson")
 _BINARY = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
@@ -37,12 +40,28 @@ _BINARY = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
 def recordings_of(given: Sequence[Path], *, as_one: bool = False) -> list[Recording]:
     """The recordings that are given, in that order; as_one: all of them as a single one.
 
-    Raises RecordingError for what is missing or no recording, and for folders and patterns without any.
+    What is damaged or of no known kind is a recording of its own: an error when it is played. Raises RecordingError
+    for what is missing, and for folders and patterns without any recording.
     """
     paths = paths_of(given)
     for path in paths:
-        check_kind(path)
+        check_exists(path)
     return [tuple(paths)] if as_one else list(_joined(paths))
+
+
+def intake_file_of(given: Sequence[Path]) -> Path | None:
+    """The intake file, if one is given. Raises RecordingError where other recordings are given with it."""
+    paths = paths_of(given)
+    found = next(filter(_is_intake_file, paths), None)
+    if found is not None and len(paths) > 1:
+        raise RecordingError(f"{found} is an intake file: replay it alone")
+    return found
+
+
+def name_of(recording: Recording) -> str:
+    """For people, and for the events of several recordings."""
+    first = os.fsencode(recording[0]).decode(errors="replace")
+    return first if len(recording) == 1 else f"{first} and {len(recording) - 1} more"
 
 
 def paths_of(given: Iterable[Path]) -> list[Path]:
@@ -77,6 +96,13 @@ def _inside(folder: Path) -> Iterator[Path]:
             yield from (path,) if _is_bag(path) else _inside(path)
         elif path.suffix in (*_BINARY, *_TEXT):
             yield path
+
+
+def _is_intake_file(path: Path) -> bool:
+    try:
+        return path.exists() and is_intake_file(path)
+    except OSError:
+        return False  # whoever reads it says why it cannot be read
 
 
 def _is_bag(folder: Path) -> bool:
@@ -116,16 +142,27 @@ def _named_files(folder: Path) -> list[str]:
 
 
 def _split(paths: Sequence[Path]) -> Recording:
-    """The first of the paths, and the files that its recorder went on in."""
-    recording = [paths[0]]
-    numbered = {place: path for path in paths if (place := _place(path)) is not None}
+    """The first of the paths, and the files of its recorder before and after it, in the order of their numbers."""
+    numbered: dict[_Place, list[Path]] = {}
+    for path in paths:
+        if (place := _place(path)) is not None:
+            numbered.setdefault(place, []).append(path)
     place = _place(paths[0])
-    while place is not None:
-        place = place._replace(number=place.number + 1)
-        following = numbered.get(place)
-        if following is None or not _goes_on(recording[-1], following):
+    if place is None:
+        return (paths[0],)
+    recording = [paths[0]]
+    for number in itertools.count(place.number + 1):
+        others = numbered.get(place._replace(number=number), ())
+        following = next((other for other in others if _goes_on(recording[-1], other)), None)
+        if following is None:
             break
         recording.append(following)
+    for number in range(place.number - 1, -1, -1):
+        others = numbered.get(place._replace(number=number), ())
+        previous = next((other for other in others if _goes_on(other, recording[0])), None)
+        if previous is None:
+            break
+        recording.insert(0, previous)
     return tuple(recording)
 
 
@@ -146,6 +183,9 @@ def _place(path: Path) -> _Place | None:
 
 
 def _goes_on(one: Path, other: Path) -> bool:
-    """Whether the second begins where the first ends."""
-    first, second = span_of(one), span_of(other)
+    """Whether the second begins where the first ends. What cannot be read is a recording of its own."""
+    try:
+        first, second = span_of(one), span_of(other)
+    except RecordingError:
+        return False
     return first is not None and second is not None and -_OVERLAP <= second[0] - first[1] <= _SPLIT

@@ -118,9 +118,12 @@ def mcap_types(path: Path) -> list[RecordedType]:
 
 
 def mcap_span(path: Path) -> tuple[int, int] | None:
-    """The first and the last log time, as the file's index tells; None where it does not."""
+    """The first and the last log time in the file's index; None where it has none. Raises RecordingError if damaged."""
     with path.open("rb") as file:
-        index = _index(file)
+        try:
+            index = _index(file)
+        except _DAMAGE as error:
+            raise _damaged(path, error) from error
         statistics = None if index is None else index.summary.statistics
         if statistics is None or not statistics.message_count:
             return None

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Protocol
+from dataclasses import replace
+from typing import NamedTuple, Protocol
 
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.replay.errors import RecordingError
-from detector.replay.gathering import Recording
+from detector.replay.gathering import Recording, name_of
 from detector.replay.latched import recorded_arrivals
 from detector.replay.message import Cut
 from detector.replay.recorded_types import with_recorded_types
@@ -28,46 +29,90 @@ class Watch(Protocol):
         """The same arrivals."""
 
 
+class Played(NamedTuple):
+    """What several recordings came to."""
+
+    outcomes: dict[str, Outcome]
+    """By the recording's name, in the order given; at least one."""
+    errors: list[RecordingError]
+    """Why the other recordings could not be replayed."""
+
+
 def play(
     recordings: Sequence[Recording],
     detector: Detector,
     rules: Sequence[EventRule],
     plugins: Plugins = nullcontext,
     watch: Watch = lambda arrivals: arrivals,
-) -> list[Outcome]:
+) -> Played:
     """What each recording came to. Without `plugins` they run in this process.
+
+    Of several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
+    task names differ even if all begin at the same time.
 
     Raises:
         DetectorError: the Detector cannot run.
-        RecordingError: a recording is damaged or does not fit the streams, or no message of any belongs to a stream.
+        RecordingError: the one recording is damaged or does not fit the streams, or no message of any belongs to a
+            stream; an ExceptionGroup of these where several recordings have several errors.
     """
-    outcomes: list[Outcome] = []
-    keys: set[str] = set()
-    for recording in recordings:
-        cuts: list[Cut] = []
-        completed = with_recorded_types(detector, recording)
-        router = Router(completed.spec.streams)
-        arrivals = recorded_arrivals(recording, router, completed, cuts.append)
-        with plugins() as host:
-            outcome = replay_arrivals(watch(arrivals), completed, rules, host)
-        outcome.doubts[:0] = map(str, cuts)
-        if not outcome.samples:
-            outcome.notes.append(f"no message belongs to a stream of the Detector; keys: {_listed(router.unrouted)}")
-        keys.update(router.unrouted)
-        outcomes.append(outcome)
-    if not any(outcome.samples for outcome in outcomes):
-        cut = "".join(f"{doubt}; " for outcome in outcomes for doubt in outcome.doubts)
+    outcomes: dict[str, Outcome] = {}
+    errors: list[RecordingError] = []
+    unrouted: dict[str, list[str]] = {}
+    for number, recording in enumerate(recordings, start=1):
+        name = name_of(recording)
+        try:
+            holder = detector.name if number == 1 else f"{detector.name}.{number}"
+            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, holder)
+        except RecordingError as error:
+            errors.append(error)
+            continue
+        if len(recordings) > 1:
+            outcome.events = [replace(event, recording=name) for event in outcome.events]
+        outcomes[name] = outcome
+    if not any(outcome.samples for outcome in outcomes.values()):
+        errors += _without_samples(outcomes, unrouted, detector)
+        raise errors[0] if len(errors) == 1 else ExceptionGroup("no recording can be replayed", errors)
+    return Played(outcomes, errors)
+
+
+def _played(
+    recording: Recording,
+    detector: Detector,
+    rules: Sequence[EventRule],
+    plugins: Plugins,
+    watch: Watch,
+    holder: str,
+) -> tuple[Outcome, list[str]]:
+    """What a recording came to, and its keys that belong to no stream."""
+    cuts: list[Cut] = []
+    completed = with_recorded_types(detector, recording)
+    router = Router(completed.spec.streams, name_of(recording))
+    arrivals = recorded_arrivals(recording, router, completed, cuts.append)
+    with plugins() as host:
+        outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder)
+    outcome.cuts = cuts
+    if not outcome.samples:
+        keys = router.unrouted
+        none = f"no message belongs to a stream of the Detector; keys: {_listed(keys)}"
+        outcome.notes.append(none if keys else "it holds no message")
+    return outcome, router.unrouted
+
+
+def _without_samples(
+    outcomes: dict[str, Outcome], unrouted: dict[str, list[str]], detector: Detector
+) -> Iterator[RecordingError]:
+    """Why there is nothing to evaluate in any of the recordings."""
+    for name, outcome in outcomes.items():
+        if not unrouted[name]:
+            cut = "".join(f": it is cut ({each.reason})" for each in outcome.cuts[:1])
+            yield RecordingError(f"{name} holds no message{cut}")
+    if keys := sorted({key for found in unrouted.values() for key in found}):
+        cut = "".join(f"{each}; " for name, outcome in outcomes.items() if unrouted[name] for each in outcome.cuts)
         asked = _listed([stream.key for stream in detector.spec.streams])
-        raise RecordingError(
+        yield RecordingError(
             f"{cut}no message belongs to a stream of the Detector: the recordings hold the keys "
-            f"{_listed(sorted(keys))}, the streams ask for {asked}: correct the streams' key"
+            f"{_listed(keys)}, the streams ask for {asked}: correct the streams' key"
         )
-    return outcomes
-
-
-def name_of(recording: Recording) -> str:
-    """For people."""
-    return str(recording[0]) if len(recording) == 1 else f"{recording[0]} and {len(recording) - 1} more"
 
 
 def _listed(keys: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ from detector.replay.rosbag2 import SQLITE_MAGIC, read_rosbag2, rosbag2_types
 
 _Read = Callable[[Path, Wanted, OnCut], Iterator[Message]]
 
-_KINDS = "rosbag2 folders, ROS 1 bags, .mcap, .db3, .pcap, .pcapng, and JSON lines"
+_KINDS = "rosbag2 folders, ROS 1 bags, .mcap, .db3, .pcap, .pcapng and JSON lines"
 
 
 def open_recordings(
@@ -35,9 +35,10 @@ def open_recordings(
     return heapq.merge(*(read(path, wanted, on_cut) for read, path in readers), key=attrgetter("time"))
 
 
-def check_kind(path: Path) -> None:
-    """Raises RecordingError where the recording is missing or of no known kind."""
-    _reader(path)
+def check_exists(path: Path) -> None:
+    """Raises RecordingError where the recording is missing."""
+    if not path.exists():
+        raise RecordingError(f"{path}: there is no such file or folder")
 
 
 def span_of(path: Path) -> tuple[int, int] | None:
@@ -67,8 +68,7 @@ def types_of(path: Path) -> list[RecordedType]:
 
 
 def _reader(path: Path) -> _Read:
-    if not path.exists():
-        raise RecordingError(f"{path}: there is no such file or folder")
+    check_exists(path)
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
             raise RecordingError(f"{path}: a folder without metadata.yaml is no rosbag2: give the recordings in it")
@@ -94,4 +94,4 @@ def _reader(path: Path) -> _Read:
         return read_json_lines
     if not head:
         raise RecordingError(f"{path}: the file is empty")
-    raise RecordingError(f"{path}: no kind of recording that is known: {_KINDS} are")
+    raise RecordingError(f"{path} is no recording that Wayside reads; it reads {_KINDS}")

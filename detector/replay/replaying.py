@@ -26,6 +26,7 @@ from detector.losses import Losses
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control
 from detector.replay.intake_versions import detector_as_of, rule_as_of
+from detector.replay.message import Cut
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.times import format_time
 
@@ -45,8 +46,10 @@ class Outcome:
     samples: int = 0
     notes: list[str] = field(default_factory=list)
     """What a person should know: pauses, losses, and what was unknown or failed."""
+    cuts: list[Cut] = field(default_factory=list)
+    """Files of the recording whose end is missing."""
     doubts: list[str] = field(default_factory=list)
-    """A recording that is cut, rules that used many old samples, streams that go stale between their samples."""
+    """Rules that used many old samples, streams that go stale between their samples."""
     cut: bool = False
     """The intake file ends in the middle: its writer was killed."""
     end: int = 0
@@ -290,9 +293,15 @@ def _rules(document: Mapping[str, Any]) -> list[EventRule]:
 
 
 def replay_arrivals(
-    arrivals: Iterable[Arrival], detector: Detector, rules: Sequence[EventRule], plugins: PluginHost | None = None
+    arrivals: Iterable[Arrival],
+    detector: Detector,
+    rules: Sequence[EventRule],
+    plugins: PluginHost | None = None,
+    holder: str | None = None,
 ) -> Outcome:
     """Replay what any other recording holds, as the live intake would have queued it; `plugins` as for an intake file.
+
+    `holder`: as which detector; by default under the Detector's name.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -301,10 +310,11 @@ def replay_arrivals(
     replay: Replay | None = None
     batch: list[Arrival] = []
     last = 0
+    holder = holder or detector.name
     for arrival in arrivals:
         if replay is None:
             start = arrival.received - 1
-            replay = Replay(detector, rules, holder=detector.name, start=start, outcome=outcome, plugins=plugins)
+            replay = Replay(detector, rules, holder=holder, start=start, outcome=outcome, plugins=plugins)
         elif arrival.received - last > PAUSE:
             replay.take(batch, last)
             batch = []
@@ -319,7 +329,7 @@ def replay_arrivals(
         batch.append(arrival)
         last = arrival.received
     if replay is None:
-        replay = Replay(detector, rules, holder=detector.name, start=0, outcome=outcome, plugins=plugins)
+        replay = Replay(detector, rules, holder=holder, start=0, outcome=outcome, plugins=plugins)
     replay.take(batch, last)
     replay.finish()
     outcome.notes += replay.report()

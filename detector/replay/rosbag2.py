@@ -64,4 +64,13 @@ def rosbag2_types(path: Path) -> list[RecordedType]:
 
 def _damaged(path: Path, error: Exception) -> RecordingError:
     reason = str(error) or type(error).__name__
-    return RecordingError(f"{path}: the rosbag2 cannot be read, it is damaged or of a kind that is not known: {reason}")
+    files = sorted(file for kind in ("mcap", "db3") for file in path.glob(f"*.{kind}")) if path.is_dir() else [path]
+    repairs = " and ".join(f"`{_repair(file)}`" for file in files)
+    remedy = f"repair it with {repairs}" if repairs else "give the folder with its .mcap or .db3 files"
+    return RecordingError(
+        f"{path}: the rosbag2 cannot be read, it is damaged or of an unknown kind ({reason}): {remedy}"
+    )
+
+
+def _repair(file: Path) -> str:
+    return f"mcap recover {file}" if file.suffix == ".mcap" else f"sqlite3 {file} .recover"

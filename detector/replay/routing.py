@@ -38,8 +38,9 @@ def _written(message: Message, stream: Stream) -> bytes:
 class Router:
     """Sends recorded messages into the Detector's streams."""
 
-    def __init__(self, streams: Sequence[Stream]) -> None:
-        """Raises DetectorError where a stream's key or an expression of its own is wrong."""
+    def __init__(self, streams: Sequence[Stream], recording: str = "") -> None:
+        """`recording` is its name for errors. Raises DetectorError where a stream's key or an expression is wrong."""
+        self._where = f"{recording}: " if recording else ""
         problems = [problem for index, stream in enumerate(streams) for problem in stream_problems(stream, index)]
         if problems:
             raise DetectorError(problems)
@@ -99,18 +100,18 @@ class Router:
             return
         if message.decode is not None and stream.encoding not in (*_WRITERS, Encoding.RAW):
             raise RecordingError(
-                f"{message.key} is recorded as {message.encoding}, which replay turns into json, or cbor, but "
-                f"streams[{stream.name}].encoding is {stream.encoding.value}: write json, cbor or raw"
+                f"{self._where}{message.key} is recorded as {message.encoding}, which replay turns into json or cbor, "
+                f"but streams[{stream.name}].encoding is {stream.encoding.value}: write json, cbor or raw"
             )
         as_recorded = message.decode is None and stream.encoding is not Encoding.RAW
         if as_recorded and message.encoding != stream.encoding.value:
             raise RecordingError(
-                f"{message.key} is recorded as {message.encoding}, but streams[{stream.name}].encoding is "
+                f"{self._where}{message.key} is recorded as {message.encoding}, but streams[{stream.name}].encoding is "
                 f"{stream.encoding.value}: correct it, or the stream's key"
             )
         if stream.encoding is Encoding.CDR and message.type not in (None, "", stream.type):
             raise RecordingError(
-                f"{message.key} is recorded as {message.type}, but streams[{stream.name}].type is {stream.type}: "
-                "correct it, or the stream's key"
+                f"{self._where}{message.key} is recorded as {message.type}, but "
+                f"streams[{stream.name}].type is {stream.type}: correct it, or the stream's key"
             )
         self._fits.add(recorded)

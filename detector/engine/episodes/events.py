@@ -46,6 +46,9 @@ class Event:
     traceparent: str | None = None
     """Where the episode stands in a trace; None where traces are off. The engine knows nothing of it."""
 
+    recording: str | None = None
+    """The recording that it is from, where several were replayed. The engine knows nothing of it."""
+
     @property
     def started(self) -> bool:
         """Whether the episode started; else it ended."""
@@ -86,6 +89,7 @@ class Event:
             "time": format_time(time),
             "datacontenttype": "application/json",
             **({} if self.traceparent is None else {"traceparent": self.traceparent}),
+            **({} if self.recording is None else {"recording": self.recording}),
             "data": data,
         }
 

@@ -105,7 +105,7 @@ def test_a_learning_based_and_a_rule_based_rule_over_one_recording(
     files = ["--detector", str(tmp_path / "detector.yaml"), "--rules", str(tmp_path / "rules.yaml")]
     command = ["replay", str(tmp_path / "drive.jsonl"), *files, "--output", str(tmp_path / "out")]
     assert run(cli.app, "detector", (), [*command, "--compare", "threshold", "learned"]) == 0
-    assert "1 episodes in both, 1 only in threshold, 0 only in learned" in capsys.readouterr().err
+    assert "1 episode in both, 1 only in threshold, 0 only in learned" in capsys.readouterr().err
     comparison = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert [each["startDifference"] for each in comparison["both"]] == [2.0]
     assert run(cli.app, "detector", (), [*command, "--compare", "threshold", "lerned"]) == 2
