@@ -46,7 +46,7 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     """What a person should know: pauses, losses, and what was unknown or failed."""
     doubts: list[str] = field(default_factory=list)
-    """A recording that is cut, rules that used many old samples, streams that go stale between their samples."""
+    """A recording that is cut, stamps that do not fit, many old samples, streams stale between their samples."""
     cut: bool = False
     """The intake file ends in the middle: its writer was killed."""
     end: int = 0

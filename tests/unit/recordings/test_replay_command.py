@@ -183,9 +183,32 @@ def test_with_clock_data_a_header_that_is_seconds_behind_is_named_with_its_strea
     streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
     desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
     recording = recorded(stamped("pose", 0.1), stamped("speed", 5.2, v=1))
+    path = write_lines(desk.folder / "drive.jsonl", *recording)
+    warning = (
+        "warning: stamps of stream speed are 5.1 s further behind the receive times than those of stream pose: with "
+        "clock Data its samples are late for the others; set the sender's clock, give streams[speed].stamp"
+    )
+    assert warning in desk.replay(path).said
+    ran = desk.run("check", "--strict", "detector.yaml", "rules.yaml", "--recording", str(path))
+    assert (ran.code, warning in ran.said) == (1, True)
+
+
+def test_with_clock_data_a_stream_whose_stamps_are_ahead_of_its_receipt_is_named_and_no_other(desk: Desk) -> None:
+    streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
+    desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
+    recording = recorded(stamped("pose", 0.1), stamped("speed", -5, v=1))
     ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recording))
-    assert "stamps of stream speed are 5.1 s further behind the receive times than those of stream pose" in ran.said
-    assert "streams[speed].stamp" in ran.said
+    assert "warning: stamps of stream speed are 5.0 s ahead of the receive times: " in ran.said
+    assert "stamps of stream pose" not in ran.said
+
+
+def test_with_clock_data_stamps_of_0_are_named_as_such(desk: Desk) -> None:
+    streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
+    desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
+    unfilled = [{**line, "value": {"time": 0, "v": 1}} for line in stamped("speed", 0)]
+    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recorded(stamped("pose", 0), unfilled)))
+    assert "warning: 40 samples of stream speed are without a time: their stamps are 0; " in ran.said
+    assert "behind" not in ran.said
 
 
 def test_the_stamps_of_a_simulation_may_all_be_years_behind(desk: Desk) -> None:

@@ -184,8 +184,8 @@ def test_check_and_replay_warn_of_old_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     detector, rules, drive, out = left_behind(tmp_path, stay=5.0, staleAfter="20s")
-    warning = "warning: EventRule fast used samples of stream speed, which come every 0.1 s, "
-    remedy = "lower streams[speed].staleAfter"
+    warning = "warning: EventRule fast used old samples of stream speed: they come every 0.1 s, and "
+    remedy = "lower streams[speed].staleAfter\n"
     for arguments, code in (
         (["replay", drive, "--detector", detector, "--rules", rules, "--output", out], 0),
         (["check", detector, rules, "--recording", drive], 0),
