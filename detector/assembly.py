@@ -118,6 +118,15 @@ def inlets(detector: Detector) -> Inlets:
     return Inlets(decoders, read_key, fields, types)
 
 
+def detector_problems(detector: Detector) -> tuple[RuleProblem, ...]:
+    """What keeps the Detector from running; reads the files that it names."""
+    try:
+        inlets(detector)
+    except DetectorError as error:
+        return error.problems
+    return ()
+
+
 def message_types(messages: Sequence[MessageDefinition]) -> tuple[RosTypes, list[RuleProblem]]:
     """The message types that a Detector knows; without its own where there are problems with them."""
     try:
