@@ -118,6 +118,24 @@ def inlets(detector: Detector) -> Inlets:
     return Inlets(decoders, read_key, fields, types)
 
 
+def detector_problems(detector: Detector) -> tuple[RuleProblem, ...]:
+    """What keeps the Detector from running; reads the files that it names."""
+    try:
+        inlets(detector)
+    except DetectorError as error:
+        return error.problems
+    return ()
+
+
+def lasting_problems(detector: Detector) -> tuple[RuleProblem, ...]:
+    """What is wrong with its streams whatever a recording brings along: types and their fields may come with one."""
+    return tuple(
+        problem
+        for index, stream in enumerate(detector.spec.streams)
+        for problem in stream_problems(stream, index, message_fields(stream) if stream.type is None else None)
+    )
+
+
 def message_types(messages: Sequence[MessageDefinition]) -> tuple[RosTypes, list[RuleProblem]]:
     """The message types that a Detector knows; without its own where there are problems with them."""
     try:

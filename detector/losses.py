@@ -8,14 +8,16 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 
 from detector.engine.ages import OLD
+from detector.engine.counters import RuleCounters
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
 from detector.engine.timing.data import DataTimeline
 from detector.streams.tally import Tally
+from wayside.rules import PairSubject
 
 _log = logging.getLogger(__name__)
 
@@ -81,7 +83,7 @@ class Losses:
         """Log how many samples came, all losses since the start, and how the evaluations went."""
         counters, buffer = self._engine.counters, self._engine.buffer
         _log.info("%d samples in, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
-        for line in self.report():
+        for line in (*self.report(), *self.doubts()):
             _log.warning("in all, %s", line)
 
     def report(self) -> Iterator[str]:
@@ -89,17 +91,15 @@ class Losses:
         for loss in self.all():
             if loss.count:
                 yield _line(loss, loss.count)
-        yield from (text for _, text in self._apart())
         for name, rule in self._engine.counters.rules.items():
             if rule.unknowns:
-                often = "; ".join(f"{count} times {what}" for what, count in rule.absences.most_common(3))
-                yield (
-                    f"{rule.unknowns} unknown values in {rule.evaluations} evaluations of EventRule {name}"
-                    + (f": {often}" if often else ", samples not being there or stale")
-                )
+                often = "; ".join(_often(rule, in_pairs=self._in_pairs(name)))
+                of_rule = f"{rule.unknowns} unknown values in {rule.evaluations} evaluations of EventRule {name}"
+                yield f"{of_rule}: {often}" if often else of_rule
 
     def doubts(self) -> Iterator[str]:
-        """Where rules used many old samples, or cannot use most; only of an engine whose counters watch ages."""
+        """Streams whose stamps do not fit the clock; where counters watch ages, rules that use or lack old samples."""
+        yield from (text for _, text in self._apart())
         spec = self._engine.detector.spec
         for name, rule in self._engine.counters.rules.items():
             for stream_name, use in {} if rule.ages is None else rule.ages.uses.items():
@@ -114,29 +114,41 @@ class Losses:
                         f"{name} finds them unknown in between; raise streams[{stream_name}].staleAfter"
                     )
                 elif use.old:
-                    old = f"{use.old} of {use.count} times one older than {OLD * period / 1e9:.2g} s"
+                    old = f"{use.old} of the {use.count} it used were older than {OLD * period / 1e9:.2g} s"
                     yield (
-                        f"EventRule {name} used samples of stream {stream_name}, which come {every}, {old}: what a "
-                        "client sent last counted on after it fell silent; lower "
-                        f"streams[{stream_name}].staleAfter, or maxAge of the position"
+                        f"EventRule {name} used old samples of stream {stream_name}: they come {every}, and {old}. "
+                        "A client's last sample counts on after it falls silent: lower "
+                        f"streams[{stream_name}].staleAfter"
+                        + (", or maxAge of the position" if self._in_pairs(name) else "")
                     )
 
+    def _in_pairs(self, rule: str) -> bool:
+        """Whether the rule, as it is now, is about pairs, whose positions have a limit of their own."""
+        run = self._engine.rules.get(rule)
+        return run is not None and isinstance(run.rule.subject, PairSubject)
+
     def _apart(self) -> Iterator[tuple[str, str]]:
-        """With clock Data, streams whose stamps are not of one time with the others': a name for each line, and it."""
+        """With clock Data, streams whose stamps do not fit those of the others: a name for each line, and it."""
         counters = self._engine.counters
-        prompt = min(counters.delays, key=counters.delays.__getitem__, default="")
         all_unstamped = counters.delays.keys() <= counters.unstamped.keys()
-        for name, delay in sorted(counters.delays.items()):
+        right = _right(counters.delays)
+        for name in sorted({*counters.delays, *counters.zeros}):
             remedy = f"give streams[{name}].stamp, e.g. msg.time or sample.received, or write clock: Wall"
+            if zeros := counters.zeros[name]:
+                what = f"{zeros} samples of stream {name} are without a time: their stamps are 0"
+                yield f"zero {name}", f"{what}; let the sender fill them in, {remedy}"
             if (unstamped := counters.unstamped[name]) and not all_unstamped:
                 what = f"{unstamped} samples of stream {name} carry no stamp, those of other streams do"
                 yield f"unstamped {name}", f"{what}: with clock Data their receive time counts; {remedy}"
-            if (behind := delay - counters.delays[prompt]) > _APART:
-                what = (
-                    f"stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those of"
-                )
+            behind = counters.delays.get(name, right[1]) - right[1]
+            if behind < -_APART:
+                what = f"stamps of stream {name} are {-counters.delays[name] / 1e9:.1f} s ahead of the receive times"
+                late = "with clock Data the samples of other streams are late for it; set the sender's clock"
+                yield f"ahead {name}", f"{what}: {late}, {remedy}"
+            elif behind > _APART:
+                what = f"stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those"
                 late = "with clock Data its samples are late for the others; set the sender's clock"
-                yield f"behind {name}", f"{what} stream {prompt}: {late}, {remedy}"
+                yield f"behind {name}", f"{what} of stream {right[0]}: {late}, {remedy}"
 
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, also those that did not happen."""
@@ -183,4 +195,31 @@ class Losses:
 
 
 def _line(loss: Loss, count: int) -> str:
-    return f"{count} {loss.what}" + (f"; the last: {loss.last}" if loss.last else "")
+    what = loss.what.removeprefix("times ")
+    counted = f"{count} {loss.what}" if what == loss.what else f"{_times(count)} {what}"
+    return counted + (f"; the last: {loss.last}" if loss.last else "")
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _often(rule: RuleCounters, *, in_pairs: bool) -> Iterator[str]:
+    """Why values were unknown, the most frequent reasons."""
+    unexplained = rule.unknowns - rule.absences.total()
+    if unexplained:
+        limit = " (a position is old after its maxAge)" if in_pairs else ""
+        yield f"{_times(unexplained)} no sample or an old one{limit}"
+    for what, count in rule.absences.most_common(3):
+        yield f"{_times(count)} {what}"
+
+
+def _right(delays: Mapping[str, int]) -> tuple[str, int]:
+    """The stream whose stamps are taken as right, and its delay in nanoseconds.
+
+    No stamp lies after its receipt, so the smallest delay is right; where all do, that nearest to the receipt.
+    """
+    ahead = {name: -delay for name, delay in delays.items() if delay < -_APART}
+    nearest = {name: delay for name, delay in delays.items() if name not in ahead} or ahead
+    name = min(nearest, key=nearest.__getitem__, default="")
+    return name, delays.get(name, 0)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler
+from detector.assembly import detector_problems
 from detector.memory import tune_garbage_collection
 from detector.restoring import what_was_open
 from detector.rules.files import load_rules
@@ -88,7 +89,7 @@ async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces 
 async def _run_from_files(
     files: Files, options: Options, stopping: asyncio.Event, traces: EpisodeTraces | None
 ) -> None:
-    loaded = load_rules(files.detector, files.rules)
+    loaded = load_rules(files.detector, files.rules, detector_problems)
     for warning in loaded.warnings:
         _log.warning("%s", warning)
     holder = loaded.rule_set.detector.name
@@ -104,7 +105,9 @@ async def _run_from_files(
             with Running(
                 loaded.rule_set, holder, reconciler, files.output, record, restored, port, state, traces
             ) as running:
-                following = group.create_task(running.follow(follow_files(files.detector, files.rules)))
+                following = group.create_task(
+                    running.follow(follow_files(files.detector, files.rules, detector_problems))
+                )
                 await running.until(stopping)
                 following.cancel()
         finally:

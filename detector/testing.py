@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from detector.assembly import lasting_problems
 from detector.engine.episodes.events import Event
 from detector.replay.gathering import intake_file_of, recordings_of
 from detector.replay.intake_file import read_intake
@@ -42,7 +43,7 @@ def run(rules: Paths, detector: str | Path, recording: Paths, *, as_one: bool = 
         RefusedError: a rule has problems, or the Detector does not select it.
         DocumentError, DetectorError, RecordingError: a file cannot be used.
     """
-    loaded = load_rules(detector, _paths(rules))
+    loaded = load_rules(detector, _paths(rules), lasting_problems)
     if loaded.warnings:
         raise RefusedError("; ".join(loaded.warnings))
     recordings = _paths(recording)

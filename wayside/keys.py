@@ -21,8 +21,9 @@ class KeyPatternError(ValueError):
 
     def __init__(self, text: str, offset: int, problem: str) -> None:
         """`offset` counts from 0 within `text`."""
-        super().__init__(f"key {text!r}, column {offset + 1}: {problem}")
-        self.column = offset + 1
+        cut = 1 if not text or text.startswith("/") else 0  # the leading slash, which the author wrote as well
+        self.column = offset + 1 + (cut if text else 0)
+        super().__init__(f"key {'/' * cut + text!r}, column {self.column}: {problem}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +102,15 @@ def _parts(text: str) -> Iterator[tuple[int, str]]:
 
 def _nonempty(text: str, offset: int, part: str) -> str:
     if not part:
-        raise KeyPatternError(
-            text, offset, "a chunk is empty: remove the slash at the start or the end, or the second of two in a row"
-        )
+        if offset == len(text):
+            problem = "the key ends with a slash: remove it"
+        elif text[offset] == "}":
+            problem = "the pattern ends with a slash: remove it"
+        elif text[offset - 1] == ":":
+            problem = "the pattern begins with a slash: remove it"
+        else:
+            problem = "two slashes stand in a row: remove one"
+        raise KeyPatternError(text, offset, problem)
     return part
 
 

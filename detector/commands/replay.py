@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from detector.actions.deploy.file_store import write_tasks_yaml
+from detector.assembly import lasting_problems
 from detector.comparison import write_comparison
 from detector.engine.episodes.demands import from_task
 from detector.engine.episodes.events import Event
@@ -135,7 +136,7 @@ def _replayed(
         return Played({name_of((intake,)): _intake_replayed(intake, detector, rules, progress)}, [])
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
-    loaded = load_rules(detector, rules)
+    loaded = load_rules(detector, rules, lasting_problems)
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
     gathered = recordings_of(recordings, as_one=as_one)
@@ -151,7 +152,7 @@ def _replayed(
 def _intake_replayed(recording: Path, detector: Path | None, rules: Sequence[Path], progress: Progress) -> Outcome:
     if detector is None and rules:
         refuse("give --detector as well: rules are compiled against their Detector")
-    given = None if detector is None else load_rules(detector, rules).rule_set
+    given = None if detector is None else load_rules(detector, rules, lasting_problems).rule_set
     with _plugins(Outages(lambda: recorded_outages(recording) if detector is None else ())) as plugins:
         return replay_intake(
             progress.watch(read_intake(recording)),

@@ -10,8 +10,14 @@ from wayside.expressions import Reason
 
 _MAXIMUM_NOTES = 1000
 
+_EARLY = 3600 * 1_000_000_000
+"""Nanoseconds: a recording whose receive times are smaller counts from 0, and a stamp of 0 is a time."""
+
 _MAXIMUM_REASONS = 16
 """So many different reasons are kept for each rule: some name values, of which there is no end."""
+
+OTHERS = "for other reasons"
+"""What counts the reasons beyond these."""
 
 
 @dataclass(slots=True)
@@ -62,8 +68,8 @@ class RuleCounters:
             self.last_error = f"{place}: {message}" if place else message
         else:
             self.unknowns += 1
-            if message in self.absences or len(self.absences) < _MAXIMUM_REASONS:
-                self.absences[message] += 1
+            known = message in self.absences or len(self.absences) < _MAXIMUM_REASONS
+            self.absences[message if known else OTHERS] += 1
 
     def timed(self, tick: int, spent: int) -> None:
         """The rule was evaluated at the tick; nanoseconds, both."""
@@ -92,6 +98,8 @@ class Counters:
     """The key of the last one, and what its message said instead of a name, by stream."""
     unstamped: Counter[str] = field(default_factory=Counter)
     """With clock Data, samples without a stamp, by stream: their receive time counts."""
+    zeros: Counter[str] = field(default_factory=Counter)
+    """With clock Data, samples whose stamp is 0, by stream: a header that nobody filled in."""
     delays: dict[str, int] = field(default_factory=dict)
     """With clock Data, by stream: how far stamps were behind the receive times at least, in nanoseconds."""
     crowded: Counter[str] = field(default_factory=Counter)
@@ -111,6 +119,9 @@ class Counters:
         if stamp is None:
             self.unstamped[stream] += 1
             stamp = received
+        elif stamp == 0 and received > _EARLY:
+            self.zeros[stream] += 1
+            return
         delay = received - stamp
         if delay < self.delays.get(stream, delay + 1):
             self.delays[stream] = delay

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -23,7 +24,9 @@ from detector.engine.scoping.snapshots import snapshot
 from detector.engine.timing.schedule import Only
 from wayside.api.base import JsonValue
 from wayside.expressions import Expression, Unknown
-from wayside.rules import CompiledRule
+from wayside.rules import CompiledRule, FleetSubject
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class Sight(NamedTuple):
@@ -289,7 +292,11 @@ def same_semantics(run: RuleRun, rule: CompiledRule) -> bool:
 
 def _read(rule: CompiledRule, expression: Expression | None) -> str:
     """The signals that an expression reads, with their streams, for people."""
-    steps = frozenset(step for path in expression.paths for step in path) if expression is not None else frozenset()
+    steps: set[object] = set()
+    if expression is not None:
+        steps.update(step for path in expression.paths for step in path)
+        if isinstance(rule.subject, FleetSubject):  # it reads the clients' signals by names of its own for them
+            steps.update(_NAME.findall(expression.source))
     found = [f"{each.name} of stream {each.stream}" for each in rule.signals if each.name in steps and not each.rule]
     return f" ({', '.join(found)})" if found else ""
 

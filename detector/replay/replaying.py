@@ -49,7 +49,7 @@ class Outcome:
     cuts: list[Cut] = field(default_factory=list)
     """Files of the recording whose end is missing."""
     doubts: list[str] = field(default_factory=list)
-    """Rules that used many old samples, streams that go stale between their samples."""
+    """Stamps that do not fit the clock, many old samples, streams that go stale between their samples."""
     cut: bool = False
     """The intake file ends in the middle: its writer was killed."""
     end: int = 0

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from detector.rules.selection import RuleSet, select
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, DocumentError, Problem, load_documents
+from wayside.rules import RuleProblem
 
 
 @dataclass(frozen=True)
@@ -23,12 +24,16 @@ class FileRules:
     """Rules that are given but not evaluated, and why."""
 
 
-def load_rules(detector: str | Path, rules: Iterable[str | Path]) -> FileRules:
+Check = Callable[[Detector], Iterable[RuleProblem]]
+
+
+def load_rules(detector: str | Path, rules: Iterable[str | Path], check: Check = lambda _: ()) -> FileRules:
     """Read exactly one Detector, and the rules that it selects.
 
     Args:
         detector: a file or folder. It may hold other kinds too; they are not looked at.
         rules: files or folders, likewise. EventRules beside the detector count only if they are given here.
+        check: finds what keeps the Detector from running.
 
     Raises:
         DocumentError: with every problem of every file; also where there is no Detector, or more than one, or two
@@ -40,6 +45,9 @@ def load_rules(detector: str | Path, rules: Iterable[str | Path]) -> FileRules:
     detectors = [document for document in beside_detector if isinstance(document.object, Detector)]
     if not problems and len(detectors) != 1:
         problems.extend(_not_one(str(detector), detectors))
+    for document in () if problems else detectors:
+        assert isinstance(document.object, Detector)  # noqa: S101  picked above
+        problems.extend(document.problem(each.path, each.message) for each in check(document.object))
     documents: dict[str, Document] = {}
     for document in given:
         if not isinstance(document.object, EventRule):

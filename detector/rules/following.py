@@ -8,14 +8,14 @@ import signal
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
-from detector.rules.files import load_rules
+from detector.rules.files import Check, load_rules
 from detector.rules.selection import RuleSet
 from wayside.api.documents import DocumentError
 
 _log = logging.getLogger(__name__)
 
 
-async def follow_files(detector: Path, rules: Sequence[Path]) -> AsyncIterator[RuleSet]:
+async def follow_files(detector: Path, rules: Sequence[Path], check: Check) -> AsyncIterator[RuleSet]:
     """What the files say, at each SIGHUP. Files that are wrong are said, and change nothing."""
     changed = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -25,7 +25,7 @@ async def follow_files(detector: Path, rules: Sequence[Path]) -> AsyncIterator[R
             await changed.wait()
             changed.clear()
             try:
-                loaded = load_rules(detector, rules)
+                loaded = load_rules(detector, rules, check)
             except (DocumentError, OSError) as error:
                 _log.error("the files are not followed, what was good goes on: %s", error)
                 continue

@@ -158,7 +158,7 @@ def _remarks(rule: RuleStatus) -> Iterator[str]:
     if rule.last_error:
         yield f"{rule.name}: the last error: {rule.last_error}"
     for what, count in sorted(rule.absences.items(), key=lambda item: -item[1])[:3]:
-        yield f"{rule.name}: {count} times {what}"
+        yield f"{rule.name}: {'once' if count == 1 else f'{count} times'} {what}"
 
 
 def _table(*columns: str) -> Table:

@@ -93,8 +93,8 @@ def test_a_client_whose_poses_cannot_be_read_or_make_no_sense_harms_nobody_else(
             chain,
             vehicles,
             senseless,
-            r"times a sample of stream pose could not be read; the last: vehicles/van1/pose: no CDR of geometry_msgs",
-            r"times a sample had no position for EventRule close; the last: [xy] of van1 is ",
+            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: no CDR of geometry_msgs",
+            r"a sample had no position for EventRule close; the last: [xy] of van1 is ",
         )
 
 
@@ -109,9 +109,9 @@ def test_json_of_the_wrong_shape_harms_nobody_else(chain: Chain) -> None:
             chain,
             vehicles,
             in_turn(*(text.encode for text in shapes)),
-            r"times a sample of stream pose could not be read; the last: vehicles/van1/pose: no JSON",
+            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: no JSON",
             r"evaluation errors in EventRule close; the last: ",
-            r"times a sample had no position for EventRule close; the last: x of van1 is absent",
+            r"a sample had no position for EventRule close; the last: x of van1 is absent",
         )
 
 

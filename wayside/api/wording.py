@@ -13,6 +13,8 @@ FieldPath = tuple[str | int, ...]
 
 _PATTERNS = {
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": "lower-case letters, digits and -, with a letter or digit at both ends",
+    r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$": "a name of up to 63 letters, digits, . _ : -, or a template such as "
+    "its-${msg.id}",
     r"^[A-Za-z0-9._:-]+$": "letters, digits and . _ : -",
     r"^[A-Za-z_][A-Za-z0-9_]*$": "letters, digits and _, not beginning with a digit",
     r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$": "package/msg/Type, e.g. geometry_msgs/msg/PoseStamped",

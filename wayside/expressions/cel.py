@@ -197,8 +197,7 @@ class Expression:
             value = self._run(values, known=True)
         except EvaluationError as error:
             if on_unknown is not None:
-                message = no_member(self.paths, values) if error.message in NO_MEMBERS else None
-                on_unknown(Reason.ABSENT if error.absent else Reason.ERROR, message or error.message)
+                on_unknown(Reason.ABSENT if error.absent else Reason.ERROR, error.message)
             return UNKNOWN
         if value is None or (isinstance(value, float) and math.isnan(value)):
             if on_unknown is not None:
@@ -216,6 +215,15 @@ class Expression:
                 settle()
 
     def _run_holding(self, values: Mapping[str, object], *, known: bool) -> Value:
+        try:
+            return self._result(values, known=known)
+        except EvaluationError as error:
+            message = no_member(self.paths, values) if error.message in NO_MEMBERS else None
+            if message is None:
+                raise
+            raise EvaluationError(message, absent=error.absent) from None
+
+    def _result(self, values: Mapping[str, object], *, known: bool) -> Value:
         try:
             data = project(self._read, values, known=known)
         except RecursionError:

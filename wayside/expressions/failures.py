@@ -13,7 +13,10 @@ NO_MEMBERS: Final = frozenset({"a member is read of what has none"})
 
 _ABSENT = ("no value for ", "no key ", "no index ")
 _OVERLOAD: Final = re.compile(r"^\w+: No matching overloads found : (.*)$")
-_CALL: Final = re.compile(r"^(\w+)\((.*)\)$")
+_CALL: Final = re.compile(r"^([^(]+)\((.*)\)$")
+_COMPARISONS: Final = frozenset({"<", "<=", ">", ">="})
+_NAMES: Final = {"[]": "[…]", "?:": "? :"}
+_OF_BYTES: Final = "byteCount, checksum, allZero, numberAt or utf8"
 _CLEANING: Final = (
     (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
     (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
@@ -55,6 +58,18 @@ def _no_overload(operation: str) -> str:
     if call is not None and (function := FUNCTIONS.get(call[1])) is not None:
         given = ", ".join(_TYPES.get(kind, kind) for kind in call[2].split(", "))
         return f"{function.usage()} takes {function.types()}, was given {given}"
-    if "uint64" in operation:
-        return f"the operation does not take bytes: {operation}; use byteCount, checksum, allZero, numberAt or utf8"
-    return f"the operation does not take these types: {operation}"
+    if call is None:
+        return f"the operation does not take these types: {operation}"
+    name = call[1].replace("_", "").lstrip("@") if not call[1].isalpha() else call[1]
+    kinds = [_a(kind) for kind in call[2].split(", ")]
+    if name in _COMPARISONS:
+        text = f"`{name}` compares {kinds[0]} with {kinds[1]}"
+    else:
+        text = f"`{_NAMES.get(name, name)}` does not take {' and '.join(kinds)}"
+    return f"{text}: of bytes use {_OF_BYTES}" if "uint64" in operation else text
+
+
+def _a(kind: str) -> str:
+    """The type as it stands in a sentence."""
+    name = _TYPES.get(kind, kind)
+    return name if name == "null" else f"{'an' if name[0] in 'aeiou' else 'a'} {name}"

@@ -98,19 +98,42 @@ def no_member(paths: Iterable[Path], values: Mapping[str, object]) -> str | None
     for path in sorted(paths, key=str):
         at: object = values
         for depth, step in enumerate(path):
+            if _is_array(at):
+                at = at.tolist()  # type: ignore[attr-defined]
             if isinstance(at, Mapping):
                 if step not in at:
                     break
                 at = at[step]
-            elif isinstance(at, list) and isinstance(step, int) and step < len(at):
+            elif _is_record(at):
+                if step not in _field_names(at):
+                    break
+                at = getattr(at, str(step))
+            elif isinstance(at, list | tuple) and isinstance(step, int):
+                if step >= len(at):
+                    break
                 at = at[step]
-            elif isinstance(at, list | str | bool | int | float) and isinstance(step, str):
+            elif depth and isinstance(step, str):
                 written = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path[:depth])[1:]
-                value = f"the list of {len(at)}" if isinstance(at, list) else f"{at!r:.40}"
-                return f"`{written}` is {value}, which has no field `{step}`: correct the path"
+                return f"`{written}` is {_shown(at)}, which has no field `{step}`: {_remedy(at)}"
             else:
                 break
     return None
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, list | tuple):
+        return f"the list of {len(value)}"
+    if isinstance(value, bytes | bytearray | memoryview):
+        return f"a block of {len(value)} bytes"
+    return f"{value!r:.40}"
+
+
+def _remedy(value: object) -> str:
+    if isinstance(value, bytes | bytearray | memoryview):
+        return "read it with numberAt or utf8, or give the stream the encoding of its messages"
+    return "ask has(…) first, or correct the path" if value is None else "correct the path"
 
 
 def _project(below: Tree | Leaf | None, value: object, known: bool) -> object:

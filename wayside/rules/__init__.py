@@ -19,13 +19,14 @@ from wayside.rules.compiled import (
 )
 from wayside.rules.compiling import compile_rule
 from wayside.rules.dependencies import dependency_problems, depends, in_order
-from wayside.rules.fields import Fields
+from wayside.rules.fields import BYTES, Fields
 from wayside.rules.parameters import unknown_rules
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.sources import source_problems
 from wayside.rules.streams import compile_stream, stream_problems
 
 __all__ = [
+    "BYTES",
     "ClientSubject",
     "CompiledAction",
     "CompiledDeploy",

@@ -11,6 +11,10 @@ Fields = Mapping[str, "Fields | None"]
 """The fields of a message by name; None below a field: it has none of its own, or they are not known."""
 
 
+BYTES: Fields = {}
+"""Those of a message that is bytes: none."""
+
+
 def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iterable[str]:
     """A message for each path that starts at the variable and names a field that is not there."""
     for path in sorted(paths, key=str):
@@ -28,5 +32,9 @@ def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iter
 
 def _message(parent: str, step: str, here: Fields) -> str:
     close = difflib.get_close_matches(step, here, n=1)
+    if here is BYTES:
+        return (
+            f"{parent} has no field {step}: it is bytes; read it with numberAt or utf8, or give the stream's encoding"
+        )
     hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(here)) or 'no fields'}"
     return f"{parent} has no field {step}; {hint}"

@@ -42,7 +42,8 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
     try:
         expression = stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
     except ExpressionError as error:
-        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        received = stream.stamp.strip() == "t" and "; write sample.received for the t of JSON lines"
+        yield from (RuleProblem(path, f"{each}{received or ''}") for each in (error, *error.others))
         return
     for variable, members in (("sample", {"received": None}), ("msg", fields)):
         if members is not None:

@@ -82,7 +82,7 @@ class Episode:
                     parameters = deploy.parameters.render(self.variables or {})
                 except InterpolationError as error:
                     counters.errors += 1
-                    counters.last_error = f"action {deploy.action}: {error}"
+                    counters.last_error = f"action {deploy.action} of {self.subject.text}: {error}"
                     continue
                 self.demands[deploy.action] = self._demand(rule, identity, deploy, parameters)
                 self.outdated.discard(deploy.action)
@@ -95,7 +95,7 @@ class Episode:
         for deploy in rule.deploys:
             demand = self.demands.get(deploy.action)
             if deploy.follow and demand is not None and deploy.action not in self.outdated:
-                parameters = followed(deploy, demand.parameters, variables, counters)
+                parameters = followed(deploy, self.subject, demand.parameters, variables, counters)
                 if parameters != demand.parameters:
                     self.demands[deploy.action] = replace(demand, parameters=parameters)
                     changes += 1

@@ -6,13 +6,18 @@ from collections.abc import Mapping
 from typing import Any
 
 from detector.engine.counters import RuleCounters
+from detector.engine.episodes.subjects import Subject
 from wayside.api.base import JsonValue
 from wayside.expressions import InterpolationError
 from wayside.rules import CompiledDeploy
 
 
 def followed(
-    deploy: CompiledDeploy, before: Mapping[str, JsonValue], variables: Mapping[str, Any], counters: RuleCounters
+    deploy: CompiledDeploy,
+    subject: Subject,
+    before: Mapping[str, JsonValue],
+    variables: Mapping[str, Any],
+    counters: RuleCounters,
 ) -> dict[str, JsonValue]:
     """The action's parameters as they are now.
 
@@ -25,7 +30,7 @@ def followed(
             value = template.render(variables)
         except InterpolationError as error:
             counters.unfollowed += 1
-            counters.last_unfollowed = f"action {deploy.action}: {error}"
+            counters.last_unfollowed = f"action {deploy.action} of {subject.text}: {error}"
             if name in before:
                 now[name] = before[name]
         else:

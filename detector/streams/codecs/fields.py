@@ -9,11 +9,13 @@ from rosbags.interfaces.typing import FieldDesc
 
 from detector.streams.codecs.ros import RosTypes, standard
 from wayside.api.stream import Encoding, Stream
-from wayside.rules import Fields
+from wayside.rules import BYTES, Fields
 
 
 def message_fields(stream: Stream, types: RosTypes | None = None) -> Fields | None:
-    """The fields of a ROS message type; None for other encodings, whose messages can have any."""
+    """The fields of a ROS message type, none of a raw message; None for other encodings, which can have any."""
+    if stream.encoding is Encoding.RAW:
+        return BYTES
     types = types or standard()
     if stream.encoding is not Encoding.CDR or stream.type is None or not types.known(stream.type):
         return None

@@ -60,7 +60,7 @@ def test_a_parameter_that_is_unknown_or_fails_keeps_its_last_value_while_the_oth
     assert counters.unfollowed == 1
     drive.take(speed(4.5, 30), until=5)
     assert parameters(drive) == [{"v": 30, "x": 8, "text": "at 8", "f": 1}]
-    assert "action d: " in counters.last_unfollowed
+    assert "action d of car: " in counters.last_unfollowed
     # f fails at 2, 3, 4 and 5; x is stale from 4 on, and with it the text.
     assert counters.unfollowed == 4 + 2 * 2
 

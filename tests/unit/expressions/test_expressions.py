@@ -92,13 +92,18 @@ def test_maps_come_back_sorted_in_every_process() -> None:
         ("a.regoin", "there is no `a.regoin`; did you mean `region`?"),
         ("l[3]", "no index 3 in the list$"),
         ("speed + a.region", "there is no `speed`"),
-        ("a.region > 3", r"the operation does not take these types: _>_\(string, double\)"),
+        ("a.region > 3", "`>` compares a text with a number$"),
+        ("-a.region", "`-` does not take a text$"),
+        ("a.region + l[0]", r"`\+` does not take a text and a number$"),
+        ("a.region.hdr.id > 3", "`a.region` is 'north', which has no field `hdr`: correct the path$"),
+        ("a.none.id", "`a.none` is null, which has no field `id`: "),
+        ("msg.x > 3", "`msg` is a block of 2 bytes, which has no field `x`: read it with numberAt or utf8"),
         ("int", "yields a value of type Type, which is no data"),
     ],
 )
 def test_failures_say_what_is_wrong(source: str, message: str) -> None:
     with pytest.raises(EvaluationError, match=f"^{message}"):
-        evaluate(source, a={"region": "north"}, l=[1])
+        evaluate(source, a={"region": "north", "none": None}, msg=b"ab", l=[1])
 
 
 @dataclasses.dataclass

@@ -165,7 +165,7 @@ def test_integers_beyond_2_to_53_keep_equality_membership_and_order() -> None:
     assert holds(f"x == {MAX_EXACT + 1} && x != {MAX_EXACT + 3} && x in [1, {MAX_EXACT + 1}]") is True
     assert holds("x > 1.5 && x > d") is True
     assert holds("x") == MAX_EXACT + 1
-    with pytest.raises(EvaluationError, match="does not take these types"):
+    with pytest.raises(EvaluationError, match="does not take"):
         holds("x - 1")
 
 
@@ -189,7 +189,7 @@ def test_whole_numbers_are_written_with_all_their_digits(source: str, text: str)
 
 @pytest.mark.parametrize("value", [b"ab", [1], {"a": 1}])
 def test_what_has_no_text_is_named_as_the_author_wrote_it(value: object) -> None:
-    with pytest.raises(EvaluationError, match=r"string\("):
+    with pytest.raises(EvaluationError, match="`string` does not take a"):
         ENVIRONMENT.compile("string(x)").evaluate(VALUES | {"x": value})
     with pytest.raises(ExpressionError, match="`string` does not take"):
         ENVIRONMENT.compile("string([1])")

@@ -25,8 +25,10 @@ def test_a_key_may_begin_with_the_slash_of_its_ros_topic(desk: Desk) -> None:
 @pytest.mark.parametrize(
     ("key", "words"),
     [
-        ("odom/", ["spec.streams[0].key", "'odom/'", "column 6", "remove the slash at the start or the end"]),
-        ("a//b", ["spec.streams[0].key", "'a//b'", "column 3", "the second of two in a row"]),
+        ("odom/", ["spec.streams[0].key", "'odom/'", "column 6", "the key ends with a slash: remove it"]),
+        ("a//b", ["spec.streams[0].key", "'a//b'", "column 3", "two slashes stand in a row: remove one"]),
+        ("//${client:*}/odom", ["'//${client:*}/odom'", "column 2", "two slashes stand in a row: remove one"]),
+        ("/", ["'/'", "it is empty: give a key such as"]),
         ("v/${client}/x", ["key", "write ${client:*}"]),
     ],
 )
@@ -51,6 +53,49 @@ def test_an_error_of_a_value_names_client_and_stream_and_what_was_there(desk: De
         "evaluation errors in EventRule r; the last: signal x of car, stream speed: "
         "`msg.v` is 3.0, which has no field `x`: correct the path" in ran.said
     )
+
+
+def test_a_stamp_that_reads_a_member_of_a_number_is_explained(desk: Desk) -> None:
+    desk.write(a_detector(a_stream("speed", stamp="msg.v.t"), clock="Data"), a_rule("r", **FAST))
+    ran = desk.replay(desk.drive("drive.jsonl", (0.5, {"v": 3})))
+    assert "the last: vehicles/car/speed: `msg.v` is 3.0, which has no field `t`: correct the path" in ran.said
+
+
+def test_an_error_of_a_parameter_names_the_client(desk: Desk) -> None:
+    deploy = {"name": "go", "deploy": {"template": "app", "parameters": {"vehicle": "${v.q}"}}}
+    desk.write(a_detector(a_stream("speed")), a_rule("r", **FAST, actions=[deploy]))
+    ran = desk.replay(desk.drive("drive.jsonl", (0.5, {"v": 30}), (2.0, {"v": 30})))
+    assert "action go of car: vehicle, line 1, column 3: `v.q`: `v` is 30.0, which has no field `q`" in ran.said
+
+
+def test_an_error_of_a_fleet_condition_names_the_signals_that_it_reads(desk: Desk) -> None:
+    desk.write(
+        a_detector(a_stream("speed")),
+        a_rule("r", scope={"fleet": {"members": "true"}}, signals=FAST["signals"], when="members.exists(c, c.v > 10)"),
+    )
+    ran = desk.replay(desk.drive("drive.jsonl", (0.5, {"v": "fast"}), (2.0, {"v": "fast"})))
+    assert "the last: when of ~fleet (v of stream speed): `>` compares a text with a number" in ran.said
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "said"),
+    [
+        ("key", "veh/${client:*}/odom/", "detector.yaml:29:10: spec.streams[0].key: "),
+        ("stamp", "msg.", "detector.yaml:31:12: spec.streams[0].stamp: line 1, "),
+        ("stamp", "t", "; write sample.received for the t of JSON lines"),
+    ],
+)
+def test_what_is_wrong_with_a_stream_has_file_line_and_column_in_replay_as_in_check(
+    desk: Desk, field: str, text: str, said: str
+) -> None:
+    detector = a_detector().to_json()
+    stream = {"name": "odom", "key": "veh/${client:*}/odom", "encoding": "json", field: text}
+    detector["spec"]["streams"] = [stream]
+    desk.write(detector, a_rule("fast", **FAST))
+    desk.drive("drive.jsonl", (0.5, {"v": 20}))
+    checked = desk.run("check", "detector.yaml").said
+    assert said in checked
+    assert checked in desk.replay("drive.jsonl").said
 
 
 def test_an_error_of_a_condition_names_client_and_stream(desk: Desk) -> None:
@@ -120,9 +165,32 @@ def test_with_clock_data_a_header_that_is_seconds_behind_is_named_with_its_strea
     streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
     desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
     recording = recorded(stamped("pose", 0.1), stamped("speed", 5.2, v=1))
+    path = write_lines(desk.folder / "drive.jsonl", *recording)
+    warning = (
+        "warning: stamps of stream speed are 5.1 s further behind the receive times than those of stream pose: with "
+        "clock Data its samples are late for the others; set the sender's clock, give streams[speed].stamp"
+    )
+    assert warning in desk.replay(path).said
+    ran = desk.run("check", "--strict", "detector.yaml", "rules.yaml", "--recording", str(path))
+    assert (ran.code, warning in ran.said) == (1, True)
+
+
+def test_with_clock_data_a_stream_whose_stamps_are_ahead_of_its_receipt_is_named_and_no_other(desk: Desk) -> None:
+    streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
+    desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
+    recording = recorded(stamped("pose", 0.1), stamped("speed", -5, v=1))
     ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recording))
-    assert "stamps of stream speed are 5.1 s further behind the receive times than those of stream pose" in ran.said
-    assert "streams[speed].stamp" in ran.said
+    assert "warning: stamps of stream speed are 5.0 s ahead of the receive times: " in ran.said
+    assert "stamps of stream pose" not in ran.said
+
+
+def test_with_clock_data_stamps_of_0_are_named_as_such(desk: Desk) -> None:
+    streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
+    desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
+    unfilled = [{**line, "value": {"time": 0, "v": 1}} for line in stamped("speed", 0)]
+    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recorded(stamped("pose", 0), unfilled)))
+    assert "warning: 40 samples of stream speed are without a time: their stamps are 0; " in ran.said
+    assert "behind the receive times" not in ran.said
 
 
 def test_the_stamps_of_a_simulation_may_all_be_years_behind(desk: Desk) -> None:

@@ -95,3 +95,12 @@ def test_all_problems_come_at_once_and_each_once(write: Write) -> None:
     assert fields.count("spec.wen") == 1
     assert fields.count("spec.when") == 1
     assert any("no such file" in problem.message for problem in caught.value.problems)
+
+
+def test_a_client_that_is_no_name_is_told_what_a_name_is(write: Write) -> None:
+    stream = {"name": "cam", "key": "all/cams", "encoding": "json", "client": "a b"}
+    with pytest.raises(
+        DocumentError, match=r"must be a name of up to 63 letters, .* or a template such as its-"
+    ) as told:
+        load_rules(write("d.yaml", detector(streams=[stream])), [])
+    assert "given: 'a b'" in str(told.value)

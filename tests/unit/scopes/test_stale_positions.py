@@ -14,6 +14,7 @@ import pytest
 
 from detector.cli import main
 from detector.engine.samples.sample import Arrival
+from detector.losses import Losses
 from detector.replay.replaying import Outcome, replay_arrivals
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 
@@ -219,8 +220,8 @@ def test_check_and_replay_warn_of_old_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     detector, rules, drive, out = left_behind(tmp_path, stay=5.0, staleAfter="20s")
-    warning = "warning: EventRule fast used samples of stream speed, which come every 0.1 s, "
-    remedy = "lower streams[speed].staleAfter"
+    warning = "warning: EventRule fast used old samples of stream speed: they come every 0.1 s, and "
+    remedy = "lower streams[speed].staleAfter\n"
     for arguments, code in (
         (["replay", drive, "--detector", detector, "--rules", rules, "--output", out], 0),
         (["check", detector, rules, "--recording", drive], 0),
@@ -244,3 +245,13 @@ def test_a_stream_that_goes_stale_between_its_samples_is_named(
     ran(monkeypatch, "check", detector, rules, "--recording", drive)
     said = "samples of stream speed come every 8 s and go stale after 5 s: EventRule fast finds them unknown in between"
     assert said in capsys.readouterr().err
+
+
+def test_a_rule_about_pairs_is_told_of_the_maximum_age_as_well(caplog: pytest.LogCaptureFixture) -> None:
+    position = {"stream": "speed", "x": "msg.v", "y": "0.0"}
+    rule = a_rule("near", scope={"pairs": {"position": position, "within": 10}}, when="distance < 1")
+    drive = Drive(a_detector(a_stream("speed")), rule)
+    drive.take(arrival(0.5, "a", {"v": 3}), arrival(0.5, "b", {"v": 3}), until=4)
+    Losses(drive.engine).sum_up()
+    (told,) = [each for each in caplog.messages if "unknown values" in each]
+    assert "no sample or an old one (a position is old after its maxAge)" in told

@@ -27,7 +27,7 @@ def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
         losses.say()
     said = [message for message in caplog.messages if "could not be read" in message]
     assert len(said) == 2
-    assert said[0].startswith("1 times a sample of stream pose could not be read; the last: vehicles/car/pose: no JSON")
+    assert said[0].startswith("once a sample of stream pose could not be read; the last: vehicles/car/pose: no JSON")
     assert said[1].startswith("3 times a sample of stream pose could not be read")
     caplog.clear()
     losses.sum_up()
@@ -50,7 +50,7 @@ def test_a_sample_without_a_position_is_told_with_client_and_axis(
     drive = Drive(a_detector(), PAIRS)
     drive.take(arrival(0.5, "car", payload, "pose"), until=1)
     Losses(drive.engine, Intake(lambda: 0)).say()
-    assert f"1 times a sample had no position for EventRule near; the last: {said}" in caplog.messages
+    assert f"once a sample had no position for EventRule near; the last: {said}" in caplog.messages
 
 
 def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCaptureFixture) -> None:
@@ -63,3 +63,17 @@ def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCap
     Losses(drive.engine, Intake(lambda: 0)).say()
     (message,) = [each for each in caplog.messages if "stamps being ahead" in each]
     assert "the last: c is 3601 s ahead of the rest" in message
+
+
+def test_unknown_values_are_told_by_their_reasons_with_samples_that_are_not_there_or_old(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    speeding = a_rule("fast", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 1")
+    stream = {"name": "speed", "key": "vehicles/${client:*}/speed", "encoding": "json", "staleAfter": "1s"}
+    drive = Drive(a_detector(stream), speeding)
+    drive.take(arrival(0.5, "car", {}, "speed"), until=4)
+    Losses(drive.engine).sum_up()
+    assert (
+        "in all, 9 unknown values in 4 evaluations of EventRule fast: 4 times no sample or an old one; "
+        '4 times no value for `v`; once no key "v" in the map'
+    ) in caplog.messages

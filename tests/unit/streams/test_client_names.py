@@ -87,6 +87,18 @@ def test_a_template_that_does_not_compile_is_told_with_its_field(client: str, pr
         inlets(a_detector(a_stream(client)))
 
 
+def test_a_template_that_reads_a_member_of_a_number_is_told_with_the_number() -> None:
+    drive = Drive(a_detector(a_stream("${msg.hdr.id}")), a_rule(**FAST))
+    drive.take(sent(0.5, '{"hdr": 3}'), until=1)
+    told = "`msg.hdr` is 3.0, which has no field `id`: correct the path"
+    assert told in drive.engine.counters.last_unnamed["speed"]
+
+
+def test_a_member_of_a_raw_message_is_refused() -> None:
+    with pytest.raises(DetectorError, match=r"spec.streams\[0\].client: msg has no field id: it is bytes; read"):
+        inlets(a_detector(a_stream(encoding="raw")))
+
+
 def test_a_field_that_the_message_type_does_not_have_is_told() -> None:
     stream = {"name": "o", "key": "odom", "encoding": "cdr", "type": "nav_msgs/msg/Odometry", "client": "${msg.child}"}
     with pytest.raises(DetectorError, match=r"spec.streams\[0\].client: msg has no field child; it has child_frame_id"):
