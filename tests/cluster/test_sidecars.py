@@ -216,7 +216,13 @@ def test_a_pod_that_cannot_have_it_is_made_and_its_event_says_why(api: Api, aske
     event_of(api, "foreign", f"serviceAccountNames of Detector {HOLDER} has only vehicle, not other: add it")
 
     api.patch("Detector", HOLDER, {"spec": {"mode": "Standalone", "serviceAccountNames": None}})
-    assert not sidecars(api.create(pod("late")))  # what the manager does not know yet is looked up
+    # The manager learns of a change by its watch, a moment later.
+    wait_until(
+        lambda: sidecars(api.apply(pod("probe"), dry_run=True)),
+        lambda injected: not injected,
+        what="the manager knows that the Detector is Standalone",
+    )
+    assert not sidecars(api.create(pod("late")))
     event_of(api, "late", "is of mode Standalone: give it mode Sidecar")
 
 
