@@ -91,4 +91,4 @@ requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by th
 	  --generate-hashes --universal --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements.txt
 
 clean: ## remove what was made here; the caches outside the tree stay
-	rm -rf $(VENV) out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache benchmarks/peers/*/target

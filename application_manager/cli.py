@@ -138,7 +138,7 @@ def run(
         list[str] | None, typer.Option(help="A namespace to look after; repeatable. Default: all.")
     ] = None,
     max_instances: MaxInstances = None,
-    resync: Annotated[str, typer.Option(metavar="DURATION", help="How often everything is listed anew.")] = "60s",
+    resync: Annotated[str, typer.Option(metavar="DURATION", help="How often to list everything again.")] = "60s",
     ttl_after_finished: Annotated[
         str, typer.Option(metavar="DURATION", help="How long finished tasks are kept.")
     ] = "1h",

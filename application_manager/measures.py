@@ -43,7 +43,7 @@ class Measures:
             "reviews", "Questions of the API server about objects to be stored", "kind", "answer"
         )
         self._resynced = Gauge(
-            f"{PREFIX}resync_time_seconds", "When everything was last listed anew, since 1970", registry=self.registry
+            f"{PREFIX}resync_time_seconds", "When everything was last listed again, since 1970", registry=self.registry
         )
         self._active = Gauge(f"{PREFIX}active", "1 for the manager that acts, 0 for a standby", registry=self.registry)
         ProcessCollector(registry=self.registry)

@@ -1,108 +1,183 @@
 """How many samples a second `detector run` takes from Zenoh into its buffer, beside a callback that only counts.
 
-Publishers send poses of fifteen vehicles as fast as they can with congestion control BLOCK: nothing is dropped on the
-way, so what they manage to send is what the receiver takes. Receivers alternate: a bare zenoh-python subscriber whose
-callback counts, and `detector run` with the rules of the cooperative-recording example active. All samples must have
-arrived in the detector's buffer, or the run does not count.
+Publishers are processes of their own. They send the speeds of 100 clients as fast as they can with congestion control
+BLOCK, so nothing is dropped on the way and what they send is what the receiver takes. Receivers alternate: a bare
+zenoh-python subscriber whose callback counts, and the program `detector run` with 50 rules over the maximum of the last
+1 to 5 s, evaluated every 100 ms. A rate counts up to the last sample that the receiver has: for the detector, that is
+in its buffer. A run where a sample is lost does not count; evaluations that were left out are printed.
 
-    python benchmarks/intake_rate.py [--rounds 5] [--seconds 5] [--publishers 1 2]
+The table of stages gives the CPU time of the detector's threads for each message, measured in the same runs around
+batches, never around single messages.
+
+    python -m benchmarks.intake_rate [--rounds 5] [--seconds 8] [--publishers 1 2] [--rules 50] [--clients 100]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
+import math
 import signal
-import socket
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import yaml
 import zenoh
-from rosbags.typesys import Stores, get_typestore
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "cooperative-recording"
-TARGET = 0.9
-PATIENCE = 20.0  # s until a publisher gives up on its subscriber
+from benchmarks.workloads import speeds
+from tests.ports import free_endpoint
+
+TARGETS = {1: 0.9, 2: 0.6}
+"""By number of publishers: of what the bare callback takes."""
+
+PATIENCE = 30.0  # s until a publisher gives up on its subscriber
+PHASES = 1024
+"""Payloads of a client: its speed goes up and down once in as many."""
+BARE, DETECTOR = "bare", "detector"
+MARK = "benchmark: "
+"""Begins the line of standard error with what a receiver found out."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--publishers", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--role", choices=["publisher", "bare"], help=argparse.SUPPRESS)
+class Run(NamedTuple):
+    """What one receiver took."""
+
+    rate: float
+    """Samples a second."""
+    count: int
+    report: Mapping[str, Any]
+    """What the receiver says of itself."""
+
+
+def main() -> int:
+    """Measure and print; 1 means that a target was missed."""
+    parser = argparse.ArgumentParser(
+        prog="intake_rate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rounds", type=int, default=5, help="of each receiver (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=8.0, help="of each run (%(default)g)")
+    parser.add_argument("--publishers", type=int, nargs="+", default=[1, 2], help="processes (1 2)")
+    parser.add_argument("--rules", type=int, default=50, help="(%(default)s)")
+    parser.add_argument("--clients", type=int, default=100, help="(%(default)s)")
+    parser.add_argument("--role", choices=["publisher", BARE], help=argparse.SUPPRESS)
     parser.add_argument("--endpoint", help=argparse.SUPPRESS)
+    parser.add_argument("--share", type=int, nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role == "publisher":
-        publish(options.endpoint, options.seconds)
-        return
-    if options.role == "bare":
+        publish(options.endpoint, options.seconds, range(options.clients)[options.share[0] :: options.share[1]])
+        return 0
+    if options.role == BARE:
         count(options.endpoint)
-        return
+        return 0
+    missed = False
     for publishers in options.publishers:
-        rates: dict[str, list[float]] = {"bare": [], "detector": []}
+        runs: dict[str, list[Run]] = {BARE: [], DETECTOR: []}
         for _ in range(options.rounds):
-            for receiver, found in rates.items():
-                found.append(measure(receiver, publishers, options.seconds))
-        bare, detector = (statistics.median(rates[receiver]) for receiver in ("bare", "detector"))
-        ratios = sorted(d / b for d, b in zip(rates["detector"], rates["bare"], strict=True))
-        print(
-            f"{publishers} publisher(s): bare callback {bare / 1e3:.0f} k/s, detector run {detector / 1e3:.0f} k/s, "
-            f"ratio of medians {detector / bare:.2f} (pairs {ratios[0]:.2f} to {ratios[-1]:.2f}; target {TARGET})"
-        )
+            for receiver, found in runs.items():
+                found.append(measure(receiver, publishers, options))
+        missed |= not show(publishers, options.rules, runs)
+    return int(missed)
 
 
-def measure(receiver: str, publishers: int, seconds: float) -> float:
-    """One run; samples a second."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{found.getsockname()[1]}"
+def show(publishers: int, rules: int, runs: Mapping[str, Sequence[Run]]) -> bool:
+    """Print rates, ratio and stages; whether the target is reached."""
+    bare, ours = (statistics.median(run.rate for run in runs[receiver]) for receiver in (BARE, DETECTOR))
+    ratios = sorted(mine.rate / other.rate for mine, other in zip(runs[DETECTOR], runs[BARE], strict=True))
+    ratio, target = statistics.median(ratios), TARGETS.get(publishers, 0.0)
+    print(
+        f"{publishers} publisher(s): bare callback {bare / 1e3:.0f} k/s, detector run {ours / 1e3:.0f} k/s, "
+        f"ratio {ratio:.2f} (from {ratios[0]:.2f} to {ratios[-1]:.2f}; target {target})"
+    )
+    least, stages = (a_message(runs[receiver]) for receiver in (BARE, DETECTOR))
+    print(f"  ns of CPU a message: bare {sum(least.values()):.0f}, detector {sum(stages.values()):.0f}, which is")
+    print("  " + ", ".join(f"{stage} {spent:.0f}" for stage, spent in stages.items()))
+    messages = sum(run.count for run in runs[DETECTOR])
+    print(
+        f"  messages in a burst {messages / sum(run.report['bursts'] for run in runs[DETECTOR]):.1f}, "
+        f"longest wait for the buffer {max(run.report['wait'] for run in runs[DETECTOR]):.2f} s, "
+        f"ticks a second and rule {statistics.median(run.report['ticks'] for run in runs[DETECTOR]):.1f}, "
+        f"evaluations left out of a rule {max(run.report['skipped'] for run in runs[DETECTOR]) / max(rules, 1):.0f}, "
+        f"gaps {max(run.report['gaps'] for run in runs[DETECTOR])}, "
+        f"events {sum(run.report['events'] for run in runs[DETECTOR])}",
+        flush=True,
+    )
+    return ratio >= target
+
+
+def a_message(runs: Sequence[Run]) -> dict[str, float]:
+    """Nanoseconds of CPU time a message, by stage; without the main threads, which only start and wait."""
+    total: Counter[str] = Counter()
+    for run in runs:
+        total.update(run.report["stages"])
+    return {stage: spent / sum(run.count for run in runs) for stage, spent in total.items()}
+
+
+def measure(receiver: str, publishers: int, options: argparse.Namespace) -> Run:
+    """One run."""
+    endpoint = free_endpoint()
     with tempfile.TemporaryDirectory() as folder:
-        process = start_receiver(receiver, endpoint, Path(folder))
+        log_file = Path(folder) / "log"
+        process = start_receiver(receiver, endpoint, Path(folder), options.rules, log_file)
+        common = ["--endpoint", endpoint, "--seconds", str(options.seconds), "--clients", str(options.clients)]
         senders = [
             subprocess.Popen(
-                [sys.executable, __file__, "--role", "publisher", "--endpoint", endpoint, "--seconds", str(seconds)],
+                [*module("intake_rate"), "--role=publisher", *common, "--share", str(index), str(publishers)],
                 stdout=subprocess.PIPE,
                 text=True,
             )
-            for _ in range(publishers)
+            for index in range(publishers)
         ]
-        told = [sender.communicate()[0] for sender in senders]
+        outputs = [sender.communicate()[0] for sender in senders]
         if any(sender.returncode for sender in senders):
             process.kill()
-            raise SystemExit(f"{receiver}: the publishers found no subscriber\n{process.communicate()[1]}")
-        sent = [json.loads(each) for each in told]
-        time.sleep(1.0)  # what Zenoh has taken from the publishers must reach the callback
+            raise SystemExit(f"{receiver}: a publisher failed\n{tail(log_file.read_text())}")
+        sent = [json.loads(output) for output in outputs]
+        time.sleep(1.0)  # what Zenoh has taken from the publishers must reach the receiver
         process.send_signal(signal.SIGTERM)
-        report = process.communicate(timeout=60)[1]
-    total = sum(each["count"] for each in sent)
-    arrived = int(re.search(r"(\d+) samples in", report)[1])  # type: ignore[index]
-    if arrived != total:
-        raise SystemExit(f"{receiver}: {total} samples were sent, {arrived} arrived: the run proves nothing\n{report}")
-    return sum(each["count"] / each["seconds"] for each in sent)
+        process.wait(timeout=120)
+        log = log_file.read_text()
+    found = [line.removeprefix(MARK) for line in log.splitlines() if line.startswith(MARK)]
+    if not found:
+        raise SystemExit(f"{receiver}: there is no report in its log\n{tail(log)}")
+    report, total = json.loads(found[0]), sum(each["count"] for each in sent)
+    if report["count"] != total:
+        raise SystemExit(f"{receiver}: of {total} samples {report['count']} arrived: a run without all does not count")
+    return Run(total / (report["last"] - min(each["begin"] for each in sent)), total, report)
 
 
-def start_receiver(receiver: str, endpoint: str, folder: Path) -> subprocess.Popen[str]:
-    if receiver == "bare":
-        command = [sys.executable, __file__, "--role", "bare", "--endpoint", endpoint]
+def tail(log: str) -> str:
+    """The end of a log."""
+    return "\n".join(log.splitlines()[-20:])
+
+
+def module(name: str) -> list[str]:
+    """The command that runs a module beside this one."""
+    return [sys.executable, "-m", f"benchmarks.{name}"]
+
+
+def start_receiver(receiver: str, endpoint: str, folder: Path, rules: int, log: Path) -> subprocess.Popen[bytes]:
+    """Start it with its standard error in the log; it ends with SIGTERM."""
+    if receiver == BARE:
+        command = [*module("intake_rate"), "--role", BARE, "--endpoint", endpoint]
     else:
-        document = yaml.safe_load((EXAMPLE / "detector.yaml").read_text())
-        document["spec"]["zenoh"]["listen"] = [endpoint]
-        (folder / "detector.yaml").write_text(yaml.safe_dump(document))
-        command = [
-            sys.executable, "-m", "detector.cli", "run", "--detector", str(folder / "detector.yaml"),
-            "--rules", str(EXAMPLE / "rules.yaml"), "--output", str(folder / "out"),
-        ]  # fmt: skip
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        detector, rule_file = speeds.write_documents(folder, rules)
+        document = yaml.safe_load(detector.read_text())
+        document["spec"]["zenoh"] = {"mode": "peer", "listen": [endpoint], "scouting": False}
+        detector.write_text(yaml.safe_dump(document))
+        files = ["--detector", str(detector), "--rules", str(rule_file), "--output", str(folder / "out")]
+        command = [*module("intake_stages"), "run", *files]
+    with log.open("wb") as file:  # a pipe that nobody reads would stop the detector
+        return subprocess.Popen(command, stderr=file)
 
 
 def settings(**values: object) -> zenoh.Config:
+    """A configuration without scouting; double underscores stand for slashes."""
     config = zenoh.Config()
     for key, value in values.items():
         config.insert_json5(key.replace("__", "/"), json.dumps(value))
@@ -111,59 +186,54 @@ def settings(**values: object) -> zenoh.Config:
 
 
 def count(endpoint: str) -> None:
-    """The baseline: a callback that does nothing but count."""
+    """The baseline: a callback that only counts."""
     total = 0
 
     def receive(_: zenoh.Sample) -> None:
         nonlocal total
         total += 1
 
+    seen, last = 0, 0.0
     with zenoh.open(settings(listen__endpoints=[endpoint])) as session:
-        session.declare_subscriber("vehicles/*/pose", receive)
-        session.declare_subscriber("vehicles/*/points", receive)
-        signal.sigwait({signal.SIGTERM})
-        time.sleep(0.2)
-    print(f"{total} samples in", file=sys.stderr)
+        session.declare_subscriber("vehicles/*/speed", receive)
+        while signal.sigtimedwait({signal.SIGTERM}, 0.02) is None:
+            if total != seen:
+                seen, last = total, time.monotonic()
+    cpu = time.process_time_ns() - time.thread_time_ns()
+    print(MARK + json.dumps({"count": total, "last": last, "stages": {"all": cpu}}), file=sys.stderr)
 
 
-def publish(endpoint: str, seconds: float) -> None:
-    """Send poses for so many seconds, as fast as they are taken."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    payload = pose()
+def publish(endpoint: str, seconds: float, clients: Sequence[int]) -> None:
+    """Send the speeds of these clients as fast as they are taken."""
     config = settings(connect__endpoints=[endpoint], connect__timeout_ms=20_000, listen__endpoints=[])
+    turn = 2 * math.pi / PHASES
+    payloads = [b'{"speed": %.3f}' % (speeds.MEAN + speeds.SWING * math.sin(turn * phase)) for phase in range(PHASES)]
     with zenoh.open(config) as session:
         publishers = [
-            session.declare_publisher(f"vehicles/car{i}/pose", congestion_control=zenoh.CongestionControl.BLOCK)
-            for i in range(15)
+            session.declare_publisher(f"vehicles/c{client}/speed", congestion_control=zenoh.CongestionControl.BLOCK)
+            for client in clients
         ]
+        shifts = [round(client / turn) for client in clients]
         patience = time.monotonic() + PATIENCE
         while not all(publisher.matching_status.matching for publisher in publishers):
             if time.monotonic() > patience:
                 raise SystemExit(f"nobody subscribed within {PATIENCE:g} s")
             time.sleep(0.01)
-        begin = time.monotonic()
+        pairs = [*zip([publisher.put for publisher in publishers], shifts, strict=True)]
+        begin = now = time.monotonic()
         sent = 0
-        while time.monotonic() - begin < seconds:
-            for _ in range(100):
-                for publisher in publishers:
-                    publisher.put(payload)
-            sent += 1500
-        taken = time.monotonic() - begin
+        while now - begin < seconds:
+            phase = round(speeds.PACE * now / turn)
+            for put, shift in pairs:
+                put(payloads[(phase + shift) % PHASES])
+            sent += len(pairs)
+            now = time.monotonic()
         time.sleep(0.5)  # closing the session would drop what it still holds
-    print(json.dumps({"count": sent, "seconds": taken}))
-
-
-def pose() -> bytes:
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](1_767_225_600, 0), "map")
-    point = types["geometry_msgs/msg/Point"](1.0, 2.0, 0.0)
-    turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    message = types["geometry_msgs/msg/PoseStamped"](header, types["geometry_msgs/msg/Pose"](point, turn))
-    return bytes(store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
+    print(json.dumps({"count": sent, "begin": begin}))
 
 
 if __name__ == "__main__":
-    if "--role" in sys.argv and "bare" in sys.argv:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # before Zenoh's threads, so that sigwait gets it
-    main()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if BARE in sys.argv:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # before Zenoh's threads start
+    sys.exit(main())

@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -107,37 +110,40 @@ def _modules(command: Command, folder: Path) -> int:
 
 
 def _start(command: Command, folder: Path) -> tuple[Start, str]:
-    """Start the command, and end it again where it does not end by itself; also what it wrote on stderr."""
-    log = folder / "log"
-    with log.open("w") as stderr:
-        environment = os.environ | {"KUBECONFIG": str(folder / "kubeconfig")}
-        began = time.monotonic()
-        process = subprocess.Popen(
-            [sys.executable, *command.words], stdout=subprocess.DEVNULL, stderr=stderr, env=environment
-        )
-        try:
-            if command.until is not None:
-                _wait(process, log, command.until)
-                wall = time.monotonic() - began
-                process.kill()
-            _, status, used = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-            if command.until is None:
-                wall = time.monotonic() - began
-        finally:
-            process.kill()
+    """Start the command, and kill it when it says `until`; also what it wrote on stderr up to then.
+
+    Raises RuntimeError if it fails, TimeoutError if it does not say `until` in time or before its end.
+    """
+    environment = os.environ | {"KUBECONFIG": str(folder / "kubeconfig")}
+    began = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, *command.words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment, text=True
+    )
+    assert process.stderr is not None
+    kill = partial(os.kill, process.pid, signal.SIGKILL)  # process.kill() may reap it, and wait4 would have no times
+    limit = threading.Timer(PATIENCE, kill)
+    limit.start()
+    lines: list[str] = []
+    try:
+        for line in process.stderr:  # to its end, which is that of the process
+            lines.append(line)
+            if command.until is not None and command.until in line:
+                break
+        wall = time.monotonic() - began
+        if command.until is not None:
+            kill()
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    finally:
+        limit.cancel()
+        process.kill()
+        process.stderr.close()
+    log = "".join(lines)
     if command.until is None and process.returncode:
-        raise RuntimeError(f"{command.words} ended with {process.returncode}:\n{log.read_text()[-2000:]}")
-    return Start(wall, used.ru_utime + used.ru_stime), log.read_text()
-
-
-def _wait(process: subprocess.Popen[bytes], log: Path, words: str) -> None:
-    """Wait until the words stand in the log. Raises TimeoutError, also where the process ends before."""
-    deadline = time.monotonic() + PATIENCE
-    while words not in log.read_text():
-        if time.monotonic() > deadline or os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
-            raise TimeoutError(f"{words!r} is not said:\n{log.read_text()[-2000:]}")
-        time.sleep(0.005)
+        raise RuntimeError(f"{command.words} ended with {process.returncode}:\n{log[-2000:]}")
+    if command.until is not None and command.until not in log:
+        raise TimeoutError(f"{command.words} did not say {command.until!r}:\n{log[-2000:]}")
+    return Start(wall, used.ru_utime + used.ru_stime), log
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import TypeVar
 import msgspec
 
 from detector.actions.trigger.requests import RECORDINGS
-from detector.engine.episodes.demands import plain
+from detector.engine.episodes.plain import plain
 from detector.evaluator import Evaluator
 from detector.outlet import LiveOutlet
 from detector.requested import Requested

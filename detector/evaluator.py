@@ -43,6 +43,9 @@ Result = TypeVar("Result")
 _DRAIN_EVERY = 0.05
 """Seconds between two looks at the intake, so that its queue stays short however rare the ticks are."""
 
+_SAY_EVERY = 1.0
+"""Seconds between two looks at what was lost: there are counters for each rule and stream."""
+
 _STALL = 1_000_000_000
 """Nanoseconds: a tick that is overdue by more is not made up for, and a clock that stepped back further is believed."""
 
@@ -108,6 +111,8 @@ class Evaluator:
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
         self._stopping = False
+        self._urgent = False
+        """Whether samples came that rules are evaluated with, since the last look began."""
         self._ended = False
         self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
         self._overload = Overload()
@@ -118,6 +123,7 @@ class Evaluator:
         self.status = StatusKeeper(engine, self.losses, now)
         engine.stopwatch = time.perf_counter_ns
         engine.consequences.wanted = True
+        intake.on_urgent = self._hurry
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
     def start(self, rule_set: RuleSet, restored: Restored) -> None:
@@ -186,11 +192,12 @@ class Evaluator:
 
     def _run(self) -> None:
         try:
-            stopping = False
+            stopping, say_due = False, time.monotonic()
             while not stopping:
                 with self._wake:
-                    if self._wanted is None and not self._stopping and not self._calls:
+                    if self._wanted is None and not self._stopping and not self._calls and not self._urgent:
                         self._wake.wait(self.pause())
+                    self._urgent = False
                     wanted, self._wanted = self._wanted, None
                     calls, self._calls = self._calls, []
                     stopping = self._stopping
@@ -198,7 +205,9 @@ class Evaluator:
                 for future, work in calls:
                     _answer(future, work)
                 self.status.looked()
-                self.losses.say()
+                if time.monotonic() >= say_due:
+                    say_due = time.monotonic() + _SAY_EVERY
+                    self.losses.say()
                 self._sweeper.look()
             self._finish()
             self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
@@ -209,6 +218,13 @@ class Evaluator:
                 self._ended = True
                 for future, _ in self._calls:
                     future.cancel()
+
+    def _hurry(self) -> None:
+        """Look at the intake now; thread-safe."""
+        if not self._urgent:  # else the next look, which has not drained the intake yet, finds what came
+            with self._wake:
+                self._urgent = True
+                self._wake.notify()
 
     def _finish(self) -> None:
         """Nothing more comes: evaluate what is still to be evaluated, as the replay of the recording will."""
@@ -308,7 +324,9 @@ class Evaluator:
             _log.error("%s", refusal)
         self.status.refused(refused)
         self._outlet.follow(self._rule_book.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
-        return self._engine.set_rules(compiled)
+        events = self._engine.set_rules(compiled)
+        self._intake.urgent = self._engine.triggers
+        return events
 
     def _hand_over(self, events: Sequence[Event]) -> None:
         if events:

@@ -1,4 +1,4 @@
-"""`detector recordings start`, `stop` and `status`: what triggers ask of other detectors, by hand."""
+"""`detector recordings start`, `stop` and `status`: send by hand the requests that triggers send to detectors."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def start(
     identity: Annotated[str | None, typer.Argument(help="An id of your choice. Default: a new one.")] = None,
     stream: Annotated[list[str] | None, typer.Option(help="A stream; may be repeated. Default: all allowed.")] = None,
     client: Annotated[list[str] | None, typer.Option(help="A client; may be repeated. Default: all.")] = None,
-    before: Annotated[str, typer.Option(help="From so long before now, as far as it is still there.")] = "0s",
-    maximum_duration: Annotated[str, typer.Option(help="It ends after so long at the latest.")] = "10m",
+    before: Annotated[str, typer.Option(help="How long before now it begins, as far as the buffer reaches.")] = "0s",
+    maximum_duration: Annotated[str, typer.Option(help="The recording ends after this time at the latest.")] = "10m",
     detector: DetectorFile = None,
     name: Name = None,
     connect: Connect = None,
@@ -54,7 +54,7 @@ def start(
 @app.command()
 def stop(
     identity: Id,
-    after: Annotated[str, typer.Option(help="Until so long after now.")] = "0s",
+    after: Annotated[str, typer.Option(help="How long after now the recording ends.")] = "0s",
     detector: DetectorFile = None,
     name: Name = None,
     connect: Connect = None,

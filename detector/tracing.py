@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+import msgspec
+
 from detector.engine.consequences.consequences import Begun, Consequence, Over
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
@@ -28,7 +30,7 @@ class EpisodeTraces:
 
     def event(self, event: Event) -> Event:
         """The event, with where its episode stands."""
-        return replace(event, traceparent=str(self._context(event.rule, event.episode)))
+        return msgspec.structs.replace(event, traceparent=str(self._context(event.rule, event.episode)))
 
     def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:
         """Likewise, of what actions are told."""

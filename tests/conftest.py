@@ -15,7 +15,7 @@ settings.register_profile(
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
 )
-# For whoever wants to know only whether a test fails: the smallest example is not searched for.
+# Only whether a test fails: hypothesis does not look for the smallest example.
 settings.register_profile(
     "unshrunk",
     settings.get_profile("wayside"),

@@ -1,4 +1,4 @@
-"""What a failing test prints: what helps, and where the whole of it is."""
+"""What a failing test prints: the useful lines, and the path of the whole report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 MOST = 200
 """Lines of a report, with the headings that pytest adds."""
 WIDEST = 1000  # characters of a line
-_FRAME = 20  # lines for headings, and for what is said of the rest
+_FRAME = 20  # lines for headings, and for the notes on the lines left out
 
 
 def shorten(report: pytest.TestReport, folder: Path) -> None:

@@ -10,10 +10,13 @@ FLEET = "~fleet"
 """The subject of a rule over the whole fleet."""
 
 _OUTSIDE = re.compile(rb"[^A-Za-z0-9_.-]")
+_all_inside = re.compile(r"[A-Za-z0-9_.-]*").fullmatch
 
 
 def encode(text: str) -> str:
     """The text with every byte (UTF-8) outside `[A-Za-z0-9_.-]` as `%XX`: one chunk of a key, whatever it held."""
+    if _all_inside(text):  # most names are
+        return text
     return _OUTSIDE.sub(lambda found: b"%%%02X" % found[0][0], text.encode()).decode("ascii")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import UTC, datetime
+from functools import lru_cache
 
 _SECOND = 1_000_000_000
 _PATTERN = re.compile(
@@ -25,10 +26,15 @@ def format_time(ns: int) -> str:
     """
     seconds, fraction = divmod(ns, _SECOND)
     try:
-        whole = datetime.fromtimestamp(seconds, UTC)
+        return f"{_whole(seconds)}.{fraction:09}Z"
     except (OverflowError, OSError, ValueError) as error:
         raise ValueError(f"{ns} ns since the epoch is no time of the years 1 to 9999") from error
-    return f"{whole.year:04}-{whole:%m-%dT%H:%M:%S}.{fraction:09}Z"
+
+
+@lru_cache(maxsize=256)  # times that are printed together mostly share few seconds
+def _whole(seconds: int) -> str:
+    """Up to the second: ``2026-01-01T00:00:00``."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat()[:19]
 
 
 def parse_time(text: str) -> int:

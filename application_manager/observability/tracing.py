@@ -78,10 +78,19 @@ class TaskTraces:
             elif each.type == "Ready" and each.status == "True" and not holds(old.conditions, "Ready"):
                 self._ready(task, context, new, now, None)
             elif each.type == "Finished" and each.status == "True":
-                ready = find(new.conditions, "Ready")
-                if ready is not None and ready.status == "False":
-                    self._ready(task, context, new, now, f"{ready.reason}: {ready.message}")
-                self._known.pop(task.metadata.uid, None)
+                self._finished(task, context, new, now)
+
+    def _finished(self, task: ApplicationTask, context: TraceContext, status: ApplicationTaskStatus, now: int) -> None:
+        """The task's demand is over: emit a failed `ready` if an instance served it and was not ready for it.
+
+        A task may end before its status says anything of an instance; then `reconcile` alone shows that one served it.
+        """
+        known, ready = self._known.get(task.metadata.uid), find(status.conditions, "Ready")
+        if ready is not None and ready.status == "False":
+            self._ready(task, context, status, now, f"{ready.reason}: {ready.message}")
+        elif ready is None and known is not None and known.reconcile is not None:
+            self._ready(task, context, status, now, "NotReady: the task ended before its instance was seen ready")
+        self._known.pop(task.metadata.uid, None)
 
     def _reconciled(self, name: Name, began: int, record: Record) -> None:
         ended = time.time_ns()
@@ -130,6 +139,10 @@ class TaskTraces:
             self._emit(span)
         if aspect.holds:
             known.applied = ended
+        if task.status is not None and holds(task.status.conditions, "Finished"):  # it ended during this work
+            if find(task.status.conditions, "Ready") is None:
+                self._finished(task, context, task.status, ended)
+            self._known.pop(task.metadata.uid, None)
 
     def _ready(
         self, task: ApplicationTask, context: TraceContext, status: ApplicationTaskStatus, now: int, failure: str | None

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from detector.actions.episode import Episode, Outcome, OutcomeState
-from detector.engine.episodes.demands import plain
+from detector.engine.episodes.plain import plain
 from wayside.times import format_time
 
 ENCODING = "application/cloudevents+json"

@@ -145,7 +145,7 @@ def _replayed(
         loaded.rule_set.detector,
         loaded.rule_set.rules,
         lambda: _plugins(Outages(lambda: ())),
-        progress.watch,
+        progress.watch_batches,
     )
 
 

@@ -59,21 +59,21 @@ class RuleCounters:
     notes: list[str] | None = None
     """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
 
-    def note(self, reason: Reason, message: str, place: str = "") -> None:
-        """Count an expression's unknown result; `place` says of an error which client and stream it is about."""
+    def note(self, reason: Reason, message: str, place: str = "", times: int = 1) -> None:
+        """Count an expression's unknown results; `place` says of an error which client and stream it is about."""
         if self.notes is not None and len(self.notes) < _MAXIMUM_NOTES:
             self.notes.append(message)
         if reason is Reason.ERROR:
-            self.errors += 1
+            self.errors += times
             self.last_error = f"{place}: {message}" if place else message
         else:
-            self.unknowns += 1
+            self.unknowns += times
             known = message in self.absences or len(self.absences) < _MAXIMUM_REASONS
-            self.absences[message if known else OTHERS] += 1
+            self.absences[message if known else OTHERS] += times
 
-    def timed(self, tick: int, spent: int) -> None:
-        """The rule was evaluated at the tick; nanoseconds, both."""
-        self.ticks += 1
+    def timed(self, tick: int, spent: int, ticks: int = 1) -> None:
+        """The rule was evaluated at so many ticks up to this one; nanoseconds, both."""
+        self.ticks += ticks
         self.last_tick = tick
         self.time_ns += spent
 

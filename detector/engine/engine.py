@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
+from detector.engine.blocks import Blocks, RuleGroup
 from detector.engine.buffering.messages import KeyReader
+from detector.engine.columns.table import LONGEST
 from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
 from detector.engine.episodes.current import Identity
@@ -18,8 +20,10 @@ from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
 from detector.engine.episodes.subjects import Subject
-from detector.engine.evaluation import Answer, RuleRun, same_semantics
+from detector.engine.evaluation import Answer, Change, RuleRun, same_semantics
+from detector.engine.happened import Happened
 from detector.engine.knowledge import Knowledge
+from detector.engine.pairs import PairGroup
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals
@@ -78,6 +82,19 @@ class Engine:
         self.consequences = Consequences(self.buffer)
         """What the actions other than deploy are told."""
         self._timeline = self._make_timeline(start)
+        self._blocks = Blocks(self._known.context, lambda: self._known.floor)
+        self._order: dict[str, int] = {}
+        """The rules' places in the order of evaluation."""
+        self._others: list[CompiledRule] = []
+        """Rules that are not evaluated in blocks."""
+        self._alone: set[str] = set()
+        """Rules of which somebody looks at each evaluation by itself."""
+        self._losing: set[str] = set()
+        """Rules that have not looked yet who was lost."""
+        self._last_wait = start
+        """The last tick that waits to be evaluated."""
+        self.journal: list[Change] | None = None
+        """What became of demands, in order; None while nobody wants to know."""
 
     def set_detector(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
         """Go on with a changed Detector; call `set_rules` afterwards, with the rules compiled against it.
@@ -90,6 +107,8 @@ class Engine:
         """
         before = self.detector.spec
         self._known.follow(detector, decoders, read_key, self._timeline.now)
+        self._blocks = Blocks(self._known.context, lambda: self._known.floor)
+        self._others = [run.rule for run in self._runs.values() if run.rule.enabled]
         if isinstance(self._timeline, DataTimeline):
             self._timeline.max_behind = _longest(detector)
             self._timeline.latched = _latched(detector)
@@ -157,6 +176,7 @@ class Engine:
         self.schedule.set_rules([run.rule for run in self._runs.values()])
         self._wake_anew(now)
         self._rules_version += 1
+        self._plan()
         return events
 
     def restore(self, demands: Sequence[Demand], now: int, episodes: Sequence[OpenEpisode] = ()) -> list[Event]:
@@ -205,11 +225,13 @@ class Engine:
         for name in self._runs.keys() & names:
             self._runs[name].forget_pending()
         self.schedule.paused = frozenset(self._runs.keys() & names)
+        self._plan()
         self._wake_anew(self.now)
 
     def set_level(self, level: int) -> None:
         """Leave out so many evaluations from now on (see load.py); 0: none."""
         self.schedule.set_level(level)
+        self._plan()
 
     def ask(self, name: str) -> tuple[list[Event], list[Answer]]:
         """Evaluate a rule with `onDemand` now: after the last tick, with what was taken in since up to `now`.
@@ -277,30 +299,174 @@ class Engine:
         """What is in the buffer now."""
         return self._known.queries(self.now)
 
+    def _plan(self) -> None:
+        """Rules, or what is left out, changed: which rules are evaluated in columns, and which together."""
+        if self._known.tables.full:
+            self._known.new_tables()
+        self._make_blocks()
+        if self._known.tables.wasteful:
+            self._known.new_tables()
+            self._make_blocks()
+        self._order = {name: order for order, name in enumerate(self._runs)}
+        names = self._blocks.names
+        rules = (run.rule for run in self._runs.values() if run.rule.enabled)
+        self._others = [rule for rule in rules if rule.name not in names or rule.every_ns is None]
+        self._alone = {name for name, run in self._runs.items() if run.alone}
+        for run in self._runs.values():
+            run.journal = self.journal
+        self._known.settle()
+
+    def _make_blocks(self) -> None:
+        self._blocks = Blocks(self._known.context, lambda: self._known.floor)
+        thinning = self.schedule.thinning
+        self._blocks.set_rules(self._runs, self.schedule.paused, lambda run: thinning(run.rule))
+
     def _run(self, steps: Iterable[Step]) -> list[Event]:
+        if {name for name, run in self._runs.items() if run.alone} != self._alone:
+            self._plan()
         events: list[Event] = []
         for step in steps:
             match step:
                 case Insert(arrivals, times):
+                    if self._blocks.waiting and not self._may_wait(arrivals, times):
+                        events += self._evaluate_waiting()
                     self._known.inflow.insert(arrivals, times)
                 case Tick():
                     events += self._tick(step)
                 case Gap(time, backwards):
+                    events += self._evaluate_waiting()
                     self._gap(time, backwards)
+        events += self._evaluate_waiting()
+        if self._known.tables.full:
+            self._plan()
+        self._known.looked(self.now)
         return events
+
+    def _may_wait(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> bool:
+        """Whether what comes changes nothing that the ticks that wait see."""
+        first, last = (arrivals[0].received, arrivals[-1].received) if times is None else (min(times), max(times))
+        in_order = times is None or first > self._last_wait
+        return in_order and last - self._blocks.since <= LONGEST and self._known.fits(arrivals)
+
+    def _evaluate_waiting(self) -> list[Event]:
+        """Evaluate the ticks that wait."""
+        if not self._blocks.waiting:
+            return []
+        self._known.settle()
+        happened = self._in_columns()
+        self._known.forget_rows(self._last_wait)
+        self._known.looked(self.now)
+        events = [each.event for each in happened]
+        if self._starts.needed or self.consequences.wanted:
+            for event in events:
+                self._noted(self._runs[event.rule], (event,))
+        return events
+
+    def _in_columns(self) -> list[Happened]:
+        """Evaluate what waits, and put in order what happened."""
+        noted = 0 if self.journal is None else len(self.journal)
+        happened = self._blocks.run(self.stopwatch)
+        if self.journal is not None:
+            self.journal[noted:] = sorted(
+                self.journal[noted:], key=lambda change: (change.time, self._order[change.demand.rule])
+            )
+        return happened
 
     def _tick(self, tick: Tick) -> list[Event]:
         time, regular = tick.time, self._ticks.is_regular(tick.time)
-        if regular:  # else it is there for a single sample or subject, and must cost no look at all the others
-            self._keep_house(time)
         events: list[Event] = []
-        sampled = self._known.sampled(tick.sampled)
+        if self._known.tables.full:
+            events += self._evaluate_waiting()
+            self._plan()
+        if regular:  # else it is there for a single sample or subject, and must cost no look at all the others
+            if self._known.clients.may_lose(time):
+                events += self._evaluate_waiting()  # who is lost now was known at the ticks before
+                self._keep_house(time)
+            elif time % HOUSEKEEPING == 0:
+                self._keep_house(time)
+        self._blocks.skip(time)
+        groups = self._blocks.due(time)
+        if self._is_alone(tick, groups):
+            events += self._evaluate_waiting()
+            self._known.settle()
+            return events + self._tick_alone(tick, regular, groups)
+        self._last_wait = time
+        if self._blocks.wait(time, groups) or self.consequences.wanted:
+            events += self._evaluate_waiting()
+        return events
+
+    def _is_alone(self, tick: Tick, groups: Sequence[RuleGroup | PairGroup]) -> bool:
+        """Whether the tick cannot wait: for rules that are not in columns, or have to look who was lost."""
+        if self._losing and any(run.rule.name in self._losing for group in groups for run in group.runs):
+            return True
+        return any(
+            tick.time % rule.every_ns == 0 if rule.every_ns is not None else rule.on_sample or self._losing
+            for rule in self._others
+        )
+
+    def _tick_alone(self, tick: Tick, regular: bool, groups: Sequence[RuleGroup | PairGroup]) -> list[Event]:
+        """Evaluate a tick by itself, rule by rule in their order."""
+        time, sampled = tick.time, self._known.sampled(tick.sampled)
+        due = {run.rule.name for group in groups for run in group.runs}
+        happened: dict[str, list[Event]] = {name: self._lost(name, time) for name in due}
+        self._blocks.wait(time, groups)
+        for each in self._in_columns():
+            happened[each.event.rule].append(each.event)
+        happened |= self._with_samples(time, regular, sampled)
+        events: list[Event] = []
         for name, run in self._runs.items():
-            if not run.rule.enabled or name in self.schedule.paused:
-                continue
-            events += self._noted(run, self._turn(run, time, sampled, regular))
+            if run.rule.enabled and name not in self.schedule.paused:
+                own = happened.get(name)
+                if own is None and name not in self._blocks.names:
+                    self._losing.discard(name)
+                    own = self._turn(run, time, sampled, regular)
+                events += self._noted(run, sorted(own or (), key=lambda event: event.subject))
+        self._known.forget_rows(time)
         self._known.looked(self.now)
         return events
+
+    def _lost(self, name: str, time: int) -> list[Event]:
+        """The ends of a rule's episodes whose clients are lost."""
+        if name not in self._losing:
+            return []
+        self._losing.discard(name)
+        return self._runs[name].lose(time, self.clients)
+
+    def _with_samples(
+        self, time: int, regular: bool, sampled: Mapping[str, frozenset[str]]
+    ) -> Mapping[str, list[Event]]:
+        """What happens to the rules in columns that are evaluated with samples, by rule."""
+        happened: dict[str, list[Event]] = {}
+        for stream, runs in self._blocks.with_samples.items():
+            chosen: dict[str, Only] = {}
+            for run in runs:
+                name = run.rule.name
+                happened[name] = self._lost(name, time) if regular else []
+                only, thinned = self.schedule.whom(run.rule, time, sampled)
+                run.counters.skipped += thinned
+                if only.clients or only.subjects:
+                    chosen[name] = only
+            if chosen:
+                for each in self._blocks.run_with_samples(stream, time, chosen, self.stopwatch):
+                    happened[each.event.rule].append(each.event)
+                for name, only in chosen.items():
+                    self._wake(self._runs[name], time, self._looked_at(self._runs[name], only))
+        return happened
+
+    def _looked_at(self, run: RuleRun, only: Only) -> list[Subject]:
+        """The subjects of a rule about clients that were evaluated."""
+        subjects = (
+            Subject((client,), element.name) for element in run.rule.elements for client in only.present(self.clients)
+        )
+        return [subject for subject in subjects if only.takes(subject)]
+
+    def _noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
+        """The events, once the rules over this one and its actions know of them."""
+        happened = list(events)
+        for event in happened:
+            self._starts.note(event)
+            self.consequences.note(run.rule, event)
+        return happened
 
     def _turn(self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool) -> list[Event]:
         """What happens to a rule at a tick; `regular`: it is one of some rule's periods, or of housekeeping."""
@@ -322,14 +488,6 @@ class Engine:
             self._wake(run, time, run.looked_at)
         return sorted(events, key=lambda event: event.subject)
 
-    def _noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
-        """The events, once the rules over this one and its actions know of them."""
-        happened = list(events)
-        for event in happened:
-            self._starts.note(event)
-            self.consequences.note(run.rule, event)
-        return happened
-
     def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
         begin = self.stopwatch()
         events = run.tick(time, self._known.views(run, time), self.clients, self._plugins, only)
@@ -342,6 +500,7 @@ class Engine:
         if time % HOUSEKEEPING == 0:
             self._starts.buffer.expire(time)
         if lost:
+            self._losing.update(self._runs)
             self._starts.lose(lost)
             self._plugins.lose(lost)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ from detector.engine.episodes.current import Episode, Identity
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.subjects import Subject, fits
 from detector.engine.scoping.plugins import PluginSignals
@@ -55,6 +54,14 @@ class Answer:
     """When it started; nanoseconds since the epoch."""
 
 
+class Change(NamedTuple):
+    """A demand began or changed (end None), or ended; nanoseconds since the epoch."""
+
+    time: int
+    demand: Demand
+    end: int | None
+
+
 class RuleRun:
     """A rule and the states of its subjects."""
 
@@ -65,6 +72,7 @@ class RuleRun:
         self.counters = counters
         self._identity = identity
         self._timing = _timing(rule)
+        self._follows = any(deploy.follow for deploy in rule.deploys)
         self.witness: Callable[[Sight], None] | None = None
         """Told what each evaluation sees, while somebody wants to know. It decides nothing."""
         self.version = 0
@@ -77,11 +85,16 @@ class RuleRun:
         self._answers: list[Answer] | None = None
         self.looked_at: list[Subject] = []
         """The subjects of the last evaluation."""
+        self.disturbed = True
+        """Whether states changed otherwise than by `run`, so that every subject has to be looked at again."""
+        self.journal: list[Change] | None = None
+        """What became of demands, in order of time; None while nobody wants to know."""
 
     def tick(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: Only | None = None
     ) -> list[Event]:
         """Evaluate the rule, for all subjects or those given; returns what started and ended, in order of subjects."""
+        self.disturbed = True
         events = [] if only is not None else [*self._lost(now, clients)]
         self.looked_at = []
         seen = candidates(self.rule, views, clients, self._in_progress(), only)
@@ -90,13 +103,14 @@ class RuleRun:
             self.looked_at.append(candidate.subject)
             events += self._subject(now, candidate)
         if only is None:
-            self._tidy(now)
+            self.tidy(now)
         return sorted(events, key=lambda event: event.subject)
 
     def lose(self, now: int, clients: Clients) -> list[Event]:
         """For a rule without a period: end the episodes of clients that are lost, and forget what is over."""
+        self.disturbed = True
         events = [*self._lost(now, clients)]
-        self._tidy(now)
+        self.tidy(now)
         return sorted(events, key=lambda event: event.subject)
 
     def answer(
@@ -110,8 +124,19 @@ class RuleRun:
 
     def forget_pending(self) -> None:
         """The rule is paused: open episodes hold, what was pending is forgotten."""
+        self.disturbed = True
         for state in self._states.values():
             state.gap()
+
+    @property
+    def read(self) -> Mapping[str, str]:
+        """By condition, what errors say that it reads."""
+        return self._read
+
+    @property
+    def alone(self) -> bool:
+        """Whether somebody looks at each evaluation by itself."""
+        return self.witness is not None or self.counters.notes is not None
 
     @property
     def subjects(self) -> Iterable[Subject]:
@@ -121,9 +146,11 @@ class RuleRun:
     def wakes(self, now: int, subjects: Iterable[Subject]) -> Iterator[tuple[Subject, int | None]]:
         """When each of the subjects must be looked at; nanoseconds after `now`, None: at no time."""
         for subject in subjects:
-            yield subject, self._states[subject].wake(now, self._timing)
+            state = self._states.get(subject)
+            yield subject, None if state is None else state.wake(now, self._timing)
 
-    def _tidy(self, now: int) -> None:
+    def tidy(self, now: int) -> None:
+        """Forget subjects that are as if they were new, and starts that are over an hour old."""
         self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}
         self._budget.expire(now)
 
@@ -139,6 +166,7 @@ class RuleRun:
 
     def gap(self, time: int) -> None:
         """Time went on (or back) without ticks: open episodes hold, what was pending is forgotten."""
+        self.disturbed = True
         for state in self._states.values():
             state.gap()
             state.rests_until = min(state.rests_until, time + self._timing.cooldown)
@@ -158,6 +186,7 @@ class RuleRun:
         Returns the event that told of its start then. Where an action is not what it was, its demand holds until it is
         rendered anew, at the next evaluation.
         """
+        self.disturbed = True
         deploys = {deploy.action: deploy.fixed for deploy in self.rule.deploys}
         self._states[episode.subject] = SubjectState(is_open=True)
         self._open[episode.subject] = Episode(
@@ -183,14 +212,17 @@ class RuleRun:
         """
         changed = {deploy.action for deploy in {*rule.deploys} ^ {*self.rule.deploys}}
         gone = changed - {deploy.action for deploy in rule.deploys}
+        self.disturbed = True
         self.rule = rule
         self._timing = _timing(rule)
+        self._follows = any(deploy.follow for deploy in rule.deploys)
         for episode in self._open.values():
             episode.change(changed, gone)
             self._render(episode)
 
     def end_all(self, now: int, reason: Reason) -> Iterator[Event]:
         """End every open episode, in order of the subjects, and forget what was pending."""
+        self.disturbed = True
         for subject in sorted(self._open, key=lambda each: each.text):
             yield self._ended(now, self._open.pop(subject), reason, {})
         self._states.clear()
@@ -226,32 +258,84 @@ class RuleRun:
         state = self._states.get(candidate.subject)
         if state is None:
             state = self._states[candidate.subject] = SubjectState()
-        variables = candidate.variables
         when = self._truth("when", self.rule.when, candidate)
         until = negation(when) if self.rule.until is None else self._truth("until", self.rule.until, candidate)
-        match state.step(now, self._timing, Observation(candidate.in_scope, candidate.near, when, until)):
-            case Started(onset):
-                limit = self.rule.maximum_per_hour
-                if limit is None or self._budget.takes(candidate.subject.clients, now, limit):
-                    yield self._started(now, onset, candidate)
-                else:
-                    self.counters.suppressed += 1
-                    self._muted.add(candidate.subject)
-            case Ended() if candidate.subject in self._muted:
-                self._muted.discard(candidate.subject)
-            case Ended(reason):
-                yield self._ended(now, self._open.pop(candidate.subject), reason, snapshot(self.rule, candidate))
-            case None:
-                episode = self._open.get(candidate.subject)
-                if episode is not None:
-                    if not episode.is_complete(self.rule):
-                        episode.variables = variables
-                        self._render(episode)
-                    self.version += episode.follow(self.rule, variables, self.counters)
+        happened = state.step(now, self._timing, Observation(candidate.in_scope, candidate.near, when, until))
+        if happened is None:
+            self.stays(now, candidate)
+        elif (event := self.happened(now, happened, candidate)) is not None:
+            yield event
         if self.witness is not None:
             self.witness(Sight(now, candidate, when, until, state.is_open, state.onset))
         if self._answers is not None:
             self._answers.append(self._answer(candidate, when))
+
+    def state(self, subject: Subject) -> SubjectState | None:
+        """The subject's state, if it has one of its own."""
+        return self._states.get(subject)
+
+    def new_state(self, subject: Subject) -> SubjectState:
+        """A state of its own for the subject, as of one that was never looked at."""
+        state = self._states[subject] = SubjectState()
+        return state
+
+    def drop_state(self, subject: Subject) -> None:
+        """The subject's state says no more than a new one would."""
+        del self._states[subject]
+
+    def tidy_starts(self, now: int) -> None:
+        """Forget starts that are over an hour old."""
+        self._budget.expire(now)
+
+    @property
+    def has_deploys(self) -> bool:
+        """Whether the rule's episodes have demands."""
+        return len(self.rule.deploys) > 0
+
+    @property
+    def timing(self) -> Timing:
+        """The rule's times."""
+        return self._timing
+
+    def needs_every_tick(self, subject: Subject) -> bool:
+        """Whether an evaluation matters although the subject's observation is the same: demands may change by it."""
+        episode = self._open.get(subject)
+        return episode is not None and (self._follows or not episode.is_complete(self.rule))
+
+    def happened(self, now: int, what: Started | Ended, candidate: Candidate) -> Event | None:
+        """An episode of the subject started or ended; None where nobody hears of it."""
+        subject = candidate.subject
+        if isinstance(what, Ended):
+            if subject in self._muted:
+                self._muted.discard(subject)
+                return None
+            return self._ended(now, self._open.pop(subject), what.reason, snapshot(self.rule, candidate))
+        limit = self.rule.maximum_per_hour
+        if limit is None or self._budget.takes(subject.clients, now, limit):
+            return self._started(now, what.onset, candidate)
+        self.counters.suppressed += 1
+        self._muted.add(subject)
+        return None
+
+    def stays(self, now: int, candidate: Candidate) -> None:
+        """Nothing started or ended: what the demands of an open episode follow may have changed."""
+        episode = self._open.get(candidate.subject)
+        if episode is None:
+            return
+        before = dict(episode.demands) if self.journal is not None else {}
+        if not episode.is_complete(self.rule):
+            episode.variables = candidate.variables
+            self._render(episode)
+        self.version += episode.follow(self.rule, candidate.variables, self.counters)
+        self._note_demands(now, episode, before)
+
+    def _note_demands(self, now: int, episode: Episode, before: Mapping[str, Demand], end: int | None = None) -> None:
+        """Note which demands differ from those before; or, where they end, all of them."""
+        if self.journal is None or self.rule.dry_run:
+            return
+        for action, demand in episode.demands.items():
+            if end is not None or demand != before.get(action):
+                self.journal.append(Change(now, demand, end))
 
     def _answer(self, candidate: Candidate, when: Truth) -> Answer:
         episode = self._open.get(candidate.subject)
@@ -269,16 +353,18 @@ class RuleRun:
 
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
         subject = candidate.subject
-        identifier = _episode_id(self._identity.holder, self.rule.name, subject.text, now)
+        identifier = episode_id(self._identity.holder, self.rule.name, subject.text, now)
         episode = Episode(identifier, subject, onset, now, snapshot(self.rule, candidate), candidate.variables)
         self._open[subject] = episode
         self.counters.started += 1
         self._render(episode)
+        self._note_demands(now, episode, {})
         return episode.started(self.rule, self._identity)
 
     def _ended(self, now: int, episode: Episode, reason: Reason, values: Mapping[str, Any]) -> Event:
         self.counters.ended += 1
         self.version += 1
+        self._note_demands(now, episode, {}, now)
         return episode.ended(self.rule, self._identity, now, reason, values)
 
     def _render(self, episode: Episode) -> None:
@@ -303,9 +389,3 @@ def _read(rule: CompiledRule, expression: Expression | None) -> str:
 
 def _timing(rule: CompiledRule) -> Timing:
     return Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
-
-
-def _episode_id(holder: str, rule: str, subject: str, start: int) -> str:
-    """16 letters and digits that only this episode has."""
-    text = "\0".join((holder, rule, subject, str(start)))
-    return base64.b32encode(hashlib.sha256(text.encode()).digest()[:10]).decode().lower()

@@ -14,11 +14,13 @@ from detector.engine.buffering.lanes import lane_makers
 from detector.engine.buffering.messages import KeyReader, Messages
 from detector.engine.buffering.naming import MessageClients
 from detector.engine.buffering.possible import Possible
+from detector.engine.columns.block import Context
+from detector.engine.columns.tables import Tables
 from detector.engine.counters import Counters
 from detector.engine.evaluation import RuleRun
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.queries.transforms import Transforms, TransformStream
-from detector.engine.samples.sample import Arrival, Decoder, Sample
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Decoder, Sample
 from detector.engine.scoping.positions import Positions
 from detector.engine.scoping.scopes import Views
 from detector.engine.signals.signals import Signals
@@ -59,6 +61,7 @@ class Knowledge:
         self._counters = counters
         self._starts = starts
         self._exact = exact
+        self._rows_forgotten = start
         self._floor: int | None = None
         """Windows do not reach back further than the last gap; nanoseconds."""
         self._configure(detector, decoders, read_key, start)
@@ -78,6 +81,7 @@ class Knowledge:
             if _reads_like(stream, before.stream(stream.name)) and (defined_alike or stream.encoding not in _DEFINED)
         }
         self.buffer.keep(kept)
+        self.tables.forget()
         if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
             for client in self.clients.tokens.forget():
                 self.clients.still_heard(client, now)
@@ -106,10 +110,47 @@ class Knowledge:
             self.buffer, self.clients, self.messages, self._stale_after, self._starts, possible, self._floor
         )
         self._positions = Positions(self.buffer, self.messages, self._stale_after, possible, self._floor)
+        self.tables = Tables(self.buffer)
+        self.tables.configure(detector, decoders, self.messages, self._counters)
+        self.context = Context(self.tables, self.clients, self._stale_after, possible, self._positions, self._exact)
+        """What rules in columns look at; a new one with each change of the Detector."""
+
+    @property
+    def floor(self) -> int | None:
+        """Windows do not reach back to this time or beyond; nanoseconds."""
+        return self._floor
+
+    def settle(self) -> None:
+        """Bring the tables up to date with the buffer."""
+        inflow = self.inflow
+        self.tables.settle(inflow.came, inflow.lanes)
+        inflow.came, inflow.lanes = [], []
+        inflow.noting = not self.tables.empty
+
+    def forget_rows(self, now: int) -> None:
+        """Forget what the tables need no longer, once a second: all ticks up to `now` (nanoseconds) have run."""
+        if not 0 <= now - self._rows_forgotten < HOUSEKEEPING:
+            self._rows_forgotten = now
+            self.tables.expire(now - now % HOUSEKEEPING)
+
+    def fits(self, arrivals: Sequence[Arrival]) -> bool:
+        """Whether the buffer takes in the arrivals without pushing anything out."""
+        buffer = self.buffer
+        room = buffer.maximum_bytes - buffer.bytes - SAMPLE_OVERHEAD * len(arrivals)
+        return room >= sum([len(arrival[3]) for arrival in arrivals])
+
+    def new_tables(self) -> None:
+        """Begin with new tables: rules that are evaluated in columns have to be set again."""
+        tables = self.tables
+        self.tables = Tables(self.buffer)
+        self.tables.follow(tables)
+        self.context = self.context._replace(tables=self.tables)
 
     def age(self, time: int) -> list[str]:
         """Forget old samples, at whole seconds, and lost clients; returns who is lost."""
         if time % HOUSEKEEPING == 0:  # not with the ticks of a rule: what the caps push out would depend on rules
+            if self.tables.behind:
+                self.settle()  # while the buffer still has what the ticks that wait look at
             self.buffer.expire(time)
         for client, latest in self.buffer.latest():
             self.clients.still_heard(client, latest)
@@ -123,6 +164,7 @@ class Knowledge:
         """Time went on from here without us, or (backwards) begins anew: windows do not reach back further."""
         if backwards:
             self.buffer.step_back(time)
+            self.tables.forget()
         self._floor = time
         self.signals.gap(time)
         self._positions.gap(time)

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import BaseModel, Field
 
+from detector.replay.batches import messages_of
 from detector.replay.gathering import name_of, paths_of
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
@@ -53,7 +54,7 @@ class BagSource(Source[BagParameters]):
         recordings = open_recordings(paths, router.wanted, lambda cut: _log.warning("%s", cut))
         first: int | None = None
         began = time.monotonic()
-        for message, _ in router.routed(recordings):
+        for message in messages_of(router.routed(recordings)):
             if first is None:
                 first, began = message.time, time.monotonic()
             due = began + (message.time - first) / 1e9 / self.parameters.rate

@@ -2,51 +2,121 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
+from detector.replay.batches import Batch, Channel
 from detector.replay.errors import RecordingError
-from detector.replay.message import Cut, Message, OnCut, Wanted, key_of
+from detector.replay.message import Cut, OnCut, Wanted, key_of
 
 EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x": 1.5}}'
 
+_BLOCK = 1 << 17
+"""About how many bytes of lines make a batch."""
 
-class _Line(msgspec.Struct, forbid_unknown_fields=True):
+
+class _Line(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     t: int
     key: str
     value: msgspec.Raw
 
 
 _read = msgspec.json.Decoder(_Line).decode
+_UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
-def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+class _Block(NamedTuple):
+    """The lines that can be read, up to the first that cannot."""
+
+    lines: list[_Line]
+    numbers: Sequence[int]
+    """Of each line."""
+    unreadable: tuple[int, bytes, Exception] | None = None
+    """Number, text and error of that first one."""
+
+
+def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
     """The lines' messages; their values stay the text that they are. Empty lines are passed over.
 
     A last line that was not written to its end is a cut. Raises RecordingError, with file and line, for what is no
     such line and where `t` goes back.
     """
+    channels: dict[str, Channel | None] = {}
     last = messages = 0
+    number = 1
     with path.open("rb") as file:
-        for number, text in enumerate(file, start=1):
-            if text.isspace():
-                continue
-            try:
-                line = _read(text)
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        while texts := file.readlines(_BLOCK):
+            block = _decoded(texts, number)
+            number += len(texts)
+            wrong = _first_wrong(block.lines, last)
+            lines = block.lines if wrong is None else block.lines[: wrong.position]
+            if lines:
+                last = lines[-1].t
+                batch = _batch(lines, wanted, channels)
+                if batch.times:
+                    messages += len(batch.times)
+                    yield batch
+            if wrong is not None:
+                raise RecordingError(f"{path}:{block.numbers[wrong.position]}: {wrong.problem}")
+            if block.unreadable is not None:
+                where, text, error = block.unreadable
                 if not text.endswith(b"\n"):
-                    on_cut(Cut(path, messages, f"line {number} has no end"))
+                    on_cut(Cut(path, messages, f"line {where} has no end"))
                     return
-                raise RecordingError(f"{path}:{number}: {error}: a line reads {EXAMPLE}") from error
-            key = key_of(line.key)
-            if line.t < last:
-                problem = "t is negative" if line.t < 0 else f"t goes back from {last} to {line.t}: sort the lines by t"
-                raise RecordingError(f"{path}:{number}: {problem}")
-            if not key:
-                raise RecordingError(f"{path}:{number}: key is empty: a line reads {EXAMPLE}")
-            last = line.t
-            if wanted(key):
-                messages += 1
-                yield Message(line.t, key, bytes(line.value), "json", None)
+                raise RecordingError(f"{path}:{where}: {error}: a line reads {EXAMPLE}") from error
+
+
+def _decoded(texts: Sequence[bytes], number: int) -> _Block:
+    """`number` is that of the first line."""
+    try:
+        return _Block(list(map(_read, texts)), range(number, number + len(texts)))
+    except _UNREADABLE:
+        pass  # or empty: look at each line
+    block = _Block([], numbers := [])
+    for where, text in enumerate(texts, start=number):
+        if text.isspace():
+            continue
+        try:
+            block.lines.append(_read(text))
+        except _UNREADABLE as error:
+            return block._replace(unreadable=(where, text, error))
+        numbers.append(where)
+    return block
+
+
+class _Wrong(NamedTuple):
+    position: int
+    problem: str
+
+
+def _first_wrong(lines: Sequence[_Line], last: int) -> _Wrong | None:
+    """The first line whose time goes back from that before, which is `last` at first, or that has no key."""
+    times = [last, *[line.t for line in lines]]
+    if sorted(times) == times and all(map(key_of, {line.key for line in lines})):
+        return None
+    for position, (line, previous) in enumerate(zip(lines, times[:-1], strict=True)):
+        if line.t < previous:
+            back = f"t goes back from {previous} to {line.t}: sort the lines by t"
+            return _Wrong(position, "t is negative" if line.t < 0 else back)
+        if not key_of(line.key):
+            return _Wrong(position, f"key is empty: a line reads {EXAMPLE}")
+    return None
+
+
+def _batch(lines: Sequence[_Line], wanted: Wanted, channels: dict[str, Channel | None]) -> Batch:
+    """The wanted messages, if any; `channels` holds those of the keys that are known, None for unwanted ones."""
+    keys = [line.key for line in lines]
+    there = set(keys)
+    for key in there - channels.keys():
+        channels[key] = Channel(key_of(key), "json", None) if wanted(key_of(key)) else None
+    kept = lines
+    if any(channels[key] is None for key in there):
+        kept = [line for line in lines if channels[line.key] is not None]
+    return Batch(
+        [line.t for line in kept],
+        [channel for line in kept if (channel := channels[line.key]) is not None],
+        [bytes(line.value) for line in kept],
+    )

@@ -22,8 +22,8 @@ from wayside.api import Detector
 
 def recorded_arrivals(
     recordings: Sequence[Path], router: Router, detector: Detector, on_cut: OnCut = ignore
-) -> Iterator[Arrival]:
-    """What the recordings hold for the Detector's streams, that of latched ones first.
+) -> Iterator[list[Arrival]]:
+    """What the recordings hold for the Detector's streams, in lists; that of latched streams first.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -35,16 +35,17 @@ def recorded_arrivals(
         return arrivals
     # Read once for these alone (a recording with an index skips the rest): the whole of it need not fit into memory.
     latched = Router([stream for stream in detector.spec.streams if stream.latched])
-    return latched_first(arrivals, latched.arrivals(open_recordings(recordings, latched.wanted)), topics)
+    latched_arrivals = chain.from_iterable(latched.arrivals(open_recordings(recordings, latched.wanted)))
+    return latched_first(arrivals, latched_arrivals, topics)
 
 
 def latched_first(
-    recorded: Iterable[Arrival], latched: Iterable[Arrival], topics: dict[str, Topic]
-) -> Iterator[Arrival]:
+    recorded: Iterable[list[Arrival]], latched: Iterable[Arrival], topics: dict[str, Topic]
+) -> Iterator[list[Arrival]]:
     """The arrivals of a recording. What was latched comes first, at the time of the recording's first sample.
 
     Args:
-        recorded: all arrivals in order.
+        recorded: all arrivals in order, in lists that are not empty.
         latched: the same, or those of latched streams alone, in order.
         topics: for each latched stream, what a sample speaks of.
     """
@@ -52,18 +53,21 @@ def latched_first(
     for arrival in latched:
         if arrival.stream in topics:
             first.setdefault(_about(arrival, topics), arrival)
-    rest = iter(recorded)
-    start = next(rest, None)
-    if start is None:
-        return
-    for arrival in first.values():
-        yield arrival._replace(received=start.received)
     taken: set[tuple[str, Hashable]] = set()
-    for arrival in chain((start,), rest):
-        if arrival.stream in topics and (about := _about(arrival, topics)) not in taken:
-            taken.add(about)
-        else:
-            yield arrival
+
+    def is_taken(arrival: Arrival) -> bool:
+        """Whether the arrival, of a latched stream, came first already."""
+        about = _about(arrival, topics)
+        if about in taken:
+            return False
+        taken.add(about)
+        return True
+
+    for number, arrivals in enumerate(recorded):
+        if not number and first:
+            yield [arrival._replace(received=arrivals[0].received) for arrival in first.values()]
+        if rest := [each for each in arrivals if each.stream not in topics or not is_taken(each)]:
+            yield rest
 
 
 def _about(arrival: Arrival, topics: dict[str, Topic]) -> tuple[str, Hashable]:

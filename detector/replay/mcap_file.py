@@ -10,11 +10,14 @@ from typing import BinaryIO, NamedTuple
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Schema
+from mcap.records import Channel as McapChannel
 from mcap.records import Message as McapMessage
+from mcap.records import Schema
 from mcap.summary import Summary
 
+from detector.replay.batches import Batch, Channel, batched
 from detector.replay.errors import DAMAGE, RecordingError
+from detector.replay.mcap_chunks import Chunks, Left
 from detector.replay.mcap_cut import MAGIC, Contents, Place, contents_of, messages_at
 from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, in_order, key_of
 from detector.replay.protobuf import ENCODING as PROTOBUF
@@ -24,9 +27,6 @@ __all__ = ["MAGIC", "Left", "is_cut", "mcap_span", "mcap_types", "read_mcap"]
 
 _DAMAGE = (*DAMAGE, McapError, zstandard.ZstdError)
 
-Left = Callable[[Channel, McapMessage], bool]
-"""Whether a message is to be passed over."""
-
 
 class _Index(NamedTuple):
     """The reader of a file that has an index, and that."""
@@ -35,20 +35,16 @@ class _Index(NamedTuple):
     summary: Summary
 
 
-def read_mcap(
-    path: Path, wanted: Wanted, on_cut: OnCut, left: Left = lambda channel, message: False
-) -> Iterator[Message]:
+def read_mcap(path: Path, wanted: Wanted, on_cut: OnCut, left: Left = lambda channel: None) -> Iterator[Batch]:
     """The file's messages, in the order of their log times. One that is cut is read up to there.
 
     Raises RecordingError if it is damaged, or holds Protobuf messages that cannot be read.
     """
     protobuf = Decoders(path)
 
-    def made(schema: Schema | None, channel: Channel, message: McapMessage) -> Message:
-        return Message(
-            message.log_time,
+    def described(schema: Schema | None, channel: McapChannel) -> Channel:
+        return Channel(
             key_of(channel.topic),
-            message.data,
             channel.message_encoding,
             _type(schema.name) if schema is not None and channel.message_encoding == "cdr" else None,
             protobuf.decoder(schema, channel.topic) if channel.message_encoding == PROTOBUF else None,
@@ -58,18 +54,47 @@ def read_mcap(
         try:
             index = _index(file)
             if index is None:
-                yield from _without_index(path, file, wanted, on_cut, left, made)
+                yield from batched(_without_index(path, file, wanted, on_cut, left, described))
                 return
-            topics = {channel.topic for channel in index.summary.channels.values() if wanted(key_of(channel.topic))}
+            summary = index.summary
+            topics = {channel.topic for channel in summary.channels.values() if wanted(key_of(channel.topic))}
             if not topics:
                 return
-            for schema, channel, message in index.reader.iter_messages(topics):
-                if not left(channel, message):
-                    yield made(schema, channel, message)
+            if summary.chunk_indexes:
+
+                def of_summary(channel: McapChannel) -> Channel:
+                    return described(summary.schemas[channel.schema_id] if channel.schema_id else None, channel)
+
+                yield from Chunks(file, summary, of_summary, wanted, left).batches()
+                return
+            kept = _Kept(left)
+            yield from batched(
+                _message(described(schema, channel), message)
+                for schema, channel, message in index.reader.iter_messages(topics)
+                if kept(channel, message)
+            )
         except RecordingError:
             raise
         except _DAMAGE as error:
             raise _damaged(path, error) from error
+
+
+class _Kept:
+    """Whether a message is not left out."""
+
+    def __init__(self, left: Left) -> None:
+        self._left = left
+        self._filters: dict[int, Callable[[int], bool] | None] = {}
+
+    def __call__(self, channel: McapChannel, message: McapMessage) -> bool:
+        if channel.id not in self._filters:
+            self._filters[channel.id] = self._left(channel)
+        leaves_out = self._filters[channel.id]
+        return leaves_out is None or not leaves_out(message.sequence)
+
+
+def _message(channel: Channel, message: McapMessage) -> Message:
+    return Message(message.log_time, channel.key, message.data, channel.encoding, channel.type, channel.decode)
 
 
 def _without_index(
@@ -78,16 +103,17 @@ def _without_index(
     wanted: Wanted,
     on_cut: OnCut,
     left: Left,
-    made: Callable[[Schema | None, Channel, McapMessage], Message],
+    described: Callable[[Schema | None, McapChannel], Channel],
 ) -> Iterator[Message]:
     contents = contents_of(file)
+    kept = _Kept(left)
 
     def messages(place: Place) -> Iterator[Message]:
         try:
             for message in messages_at(file, place, contents):
                 channel = contents.channels[message.channel_id]
-                if wanted(key_of(channel.topic)) and not left(channel, message):
-                    yield made(contents.schemas.get(channel.schema_id), channel, message)
+                if wanted(key_of(channel.topic)) and kept(channel, message):
+                    yield _message(described(contents.schemas.get(channel.schema_id), channel), message)
         except _DAMAGE:
             if contents.cut is None or place is not contents.places[-1]:
                 raise  # else it is what the recorder wrote last
@@ -133,10 +159,15 @@ def mcap_span(path: Path) -> tuple[int, int] | None:
 def is_cut(path: Path) -> bool:
     """Whether the file's end is missing."""
     with path.open("rb") as file:
-        file.seek(0, 2)
-        size = file.tell()
-        file.seek(max(0, size - len(MAGIC)))
-        return size < 2 * len(MAGIC) or file.read() != MAGIC
+        return not _is_whole(file)
+
+
+def _is_whole(file: BinaryIO) -> bool:
+    """Whether the file ends as MCAP files do."""
+    file.seek(0, 2)
+    size = file.tell()
+    file.seek(max(0, size - len(MAGIC)))
+    return size >= 2 * len(MAGIC) and file.read() == MAGIC
 
 
 def _define_all(file: BinaryIO, contents: Contents) -> dict[int, Schema]:
@@ -153,13 +184,9 @@ def _define_all(file: BinaryIO, contents: Contents) -> dict[int, Schema]:
 
 def _index(file: BinaryIO) -> _Index | None:
     """The file's index; None where it has none, having been cut or written without one."""
-    file.seek(0, 2)
-    size = file.tell()
-    file.seek(max(0, size - len(MAGIC)))
-    whole = size >= 2 * len(MAGIC) and file.read() == MAGIC
-    file.seek(0)
-    if not whole:
+    if not _is_whole(file):
         return None
+    file.seek(0)
     reader = SeekingReader(file, validate_crcs=True, record_size_limit=1 << 30)
     summary = reader.get_summary()
     return None if summary is None else _Index(reader, summary)

@@ -1,11 +1,9 @@
-"""What every kind of recording is read into."""
+"""A recorded message, and what else recordings tell."""
 
 from __future__ import annotations
 
 import heapq
-import itertools
 from collections.abc import Callable, Iterable, Iterator
-from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,17 +68,17 @@ class Piece(NamedTuple):
 def in_order(pieces: Iterable[Piece]) -> Iterator[Message]:
     """The messages of all pieces in the order of their times, those of equal times as they lie in the file.
 
-    A piece is read when its start is reached, so no more of them are in memory than overlap.
+    The pieces are given in that order. Each is read when its start is reached, so no more of them are in memory than
+    overlap.
     """
-    waiting: list[tuple[int, int, Message]] = []
-    numbers = itertools.count()
-    for piece in sorted(pieces, key=itemgetter(0)):
-        while waiting and waiting[0][0] < piece.start:
-            yield heapq.heappop(waiting)[2]
-        for message in piece.read():
-            heapq.heappush(waiting, (message.time, next(numbers), message))
+    waiting: list[tuple[int, int, int, Message]] = []
+    for place, piece in sorted(enumerate(pieces), key=lambda each: (each[1].start, each[0])):
+        while waiting and waiting[0][:2] < (piece.start, place):
+            yield heapq.heappop(waiting)[-1]
+        for number, message in enumerate(piece.read()):
+            heapq.heappush(waiting, (message.time, place, number, message))
     while waiting:
-        yield heapq.heappop(waiting)[2]
+        yield heapq.heappop(waiting)[-1]
 
 
 def key_of(topic: str) -> str:

@@ -7,16 +7,16 @@ said on latched streams; such a message has the number that it had the first tim
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from mcap.records import Channel
-from mcap.records import Message as McapMessage
 
 from detector.actions.record.description import DESCRIPTION, FORMAT
+from detector.replay.batches import Batch
 from detector.replay.errors import RecordingError
 from detector.replay.mcap_file import mcap_types, read_mcap
-from detector.replay.message import Message, OnCut, RecordedType, Wanted
+from detector.replay.message import OnCut, RecordedType, Wanted
 
 
 def is_own_recording(path: Path) -> bool:
@@ -28,18 +28,23 @@ def is_own_recording(path: Path) -> bool:
     return isinstance(told, dict) and told.get("format") == FORMAT
 
 
-def read_own_recording(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+def read_own_recording(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
     """The messages, file by file, in the order of their times. Raises RecordingError where a file is not as it was."""
     taken: set[tuple[str, str, int]] = set()
 
-    def repeated(channel: Channel, message: McapMessage) -> bool:
+    def repeated(channel: Channel) -> Callable[[int], bool] | None:
         if channel.metadata.get("latched") != "true":
+            return None
+        client = channel.metadata.get("client", "")
+
+        def is_repeated(sequence: int) -> bool:
+            about = channel.topic, client, sequence
+            if about in taken:
+                return True
+            taken.add(about)
             return False
-        about = channel.topic, channel.metadata.get("client", ""), message.sequence
-        if about in taken:
-            return True
-        taken.add(about)
-        return False
+
+        return is_repeated
 
     for file in _files(path):
         yield from read_mcap(file, wanted, on_cut, repeated)

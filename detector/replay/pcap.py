@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from detector.engine.samples.sample import DecodeError
+from detector.replay.batches import Batch, batched
 from detector.replay.errors import RecordingError
 from detector.replay.message import Cut, Message, OnCut, Wanted
 from detector.streams.codecs.etsi.messages import BY_NUMBER, PREFIX
@@ -46,7 +47,7 @@ class _CutError(ValueError):
     """The file ends inside a packet or block."""
 
 
-def read_pcap(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+def read_pcap(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
     """The file's ITS packets in the order of their times. Raises RecordingError if it is damaged."""
     messages = []
     try:
@@ -59,7 +60,7 @@ def read_pcap(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
     except _CutError as error:
         on_cut(Cut(path, len(messages), str(error)))
     # Captures of several interfaces go back in time by a little; they are small enough to be put in order as a whole.
-    yield from sorted(messages, key=attrgetter("time"))
+    yield from batched(sorted(messages, key=attrgetter("time")))
 
 
 def _key(packet: bytes) -> str:

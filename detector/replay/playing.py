@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from typing import NamedTuple, Protocol
+
+import msgspec
 
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
@@ -25,7 +26,7 @@ Plugins = Callable[[], AbstractContextManager[PluginHost | None]]
 class Watch(Protocol):
     """Sees what is replayed on its way."""
 
-    def __call__(self, arrivals: Iterator[Arrival], /) -> Iterator[Arrival]:
+    def __call__(self, batches: Iterable[Sequence[Arrival]], /) -> Iterable[Sequence[Arrival]]:
         """The same arrivals."""
 
 
@@ -43,7 +44,7 @@ def play(
     detector: Detector,
     rules: Sequence[EventRule],
     plugins: Plugins = nullcontext,
-    watch: Watch = lambda arrivals: arrivals,
+    watch: Watch = lambda batches: batches,
 ) -> Played:
     """What each recording came to. Without `plugins` they run in this process.
 
@@ -67,7 +68,7 @@ def play(
             errors.append(error)
             continue
         if len(recordings) > 1:
-            outcome.events = [replace(event, recording=name) for event in outcome.events]
+            outcome.events = [msgspec.structs.replace(event, recording=name) for event in outcome.events]
         outcomes[name] = outcome
     if not any(outcome.samples for outcome in outcomes.values()):
         errors += _without_samples(outcomes, unrouted, detector)

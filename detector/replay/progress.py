@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import TypeVar
 
@@ -33,5 +33,16 @@ class Progress:
         """The records, counted on their way."""
         for number, record in enumerate(records, start=1):
             if number % _EVERY == 0:
-                self._status.update(f"{number:,} messages replayed")
+                self._show(number)
             yield record
+
+    def watch_batches(self, batches: Iterable[Sequence[Record]]) -> Iterator[Sequence[Record]]:
+        """The batches, their records counted on their way."""
+        number = 0
+        for batch in batches:
+            number += len(batch)
+            self._show(number)
+            yield batch
+
+    def _show(self, number: int) -> None:
+        self._status.update(f"{number:,} messages replayed")

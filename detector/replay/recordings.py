@@ -2,37 +2,36 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator, Sequence
-from operator import attrgetter
 from pathlib import Path
 
+from detector.replay.batches import Batch, merged
 from detector.replay.errors import RecordingError
 from detector.replay.json_lines import read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
 from detector.replay.mcap_file import mcap_span, mcap_types, read_mcap
-from detector.replay.message import Message, OnCut, RecordedType, Wanted, ignore
+from detector.replay.message import OnCut, RecordedType, Wanted, ignore
 from detector.replay.own_recording import is_own_recording, own_recording_types, read_own_recording
 from detector.replay.pcap import MAGICS as PCAP_MAGICS
 from detector.replay.pcap import read_pcap
 from detector.replay.rosbag1 import ROSBAG1_MAGIC, read_rosbag1, rosbag1_span, rosbag1_types
 from detector.replay.rosbag2 import SQLITE_MAGIC, read_rosbag2, rosbag2_types
 
-_Read = Callable[[Path, Wanted, OnCut], Iterator[Message]]
+_Read = Callable[[Path, Wanted, OnCut], Iterator[Batch]]
 
 _KINDS = "rosbag2 folders, ROS 1 bags, .mcap, .db3, .pcap, .pcapng and JSON lines"
 
 
 def open_recordings(
     paths: Sequence[Path], wanted: Wanted = lambda key: True, on_cut: OnCut = ignore
-) -> Iterator[Message]:
+) -> Iterator[Batch]:
     """The messages of all recordings on the wanted keys, merged by time; of equal times, the recording given first.
 
     The kinds are told by what the files hold. One that is cut is read up to there; `on_cut` is told. Raises
     RecordingError at once for one that is missing or of no known kind, later where one turns out to be damaged.
     """
     readers = [(_reader(path), path) for path in paths]
-    return heapq.merge(*(read(path, wanted, on_cut) for read, path in readers), key=attrgetter("time"))
+    return merged([read(path, wanted, on_cut) for read, path in readers])
 
 
 def check_exists(path: Path) -> None:
@@ -51,8 +50,11 @@ def span_of(path: Path) -> tuple[int, int] | None:
     span = by_index[read](path) if read in by_index else None
     if span is not None:
         return span
-    times = [message.time for message in read(path, lambda key: True, ignore)]
-    return (times[0], times[-1]) if times else None
+    first = last = None
+    for batch in read(path, lambda key: True, ignore):
+        first = batch.times[0] if first is None else first
+        last = batch.times[-1]
+    return None if first is None or last is None else (first, last)
 
 
 def types_of(path: Path) -> list[RecordedType]:

@@ -7,11 +7,8 @@ events, byte by byte. Any other recording is a series of messages; its replay gi
 from __future__ import annotations
 
 import contextlib
-import itertools
-from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
 from typing import Any
 
 from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
@@ -27,13 +24,11 @@ from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control
 from detector.replay.intake_versions import detector_as_of, rule_as_of
 from detector.replay.message import Cut
+from detector.replay.parts import PAUSE, parts_of
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.times import format_time
 
 _BATCH = 4096
-
-PAUSE = 3600 * 1_000_000_000
-"""Nanoseconds: a longer pause in a recording is a gap; evaluating nothing for years helps nobody."""
 
 
 @dataclass(slots=True)
@@ -91,6 +86,7 @@ class Replay:
             detector, self._entries, holder=holder, start=start, plugins=plugins, order=order
         )
         self._engine.counters.watch_ages = True
+        self._engine.journal = []
         self._demands: dict[str, Demand] = {}
         self._demands_version: tuple[int, int] | None = None
         self.set_rules(rules)
@@ -98,8 +94,7 @@ class Replay:
     def take(self, arrivals: Sequence[Arrival], until: int) -> None:
         """Samples, and how far time has come."""
         self.outcome.samples += len(arrivals)
-        for part, time in self._tick_by_tick(arrivals, until):
-            self._note(self._engine.advance(part, time))
+        self._note(self._engine.advance(arrivals, until))
 
     @property
     def version(self) -> int:
@@ -151,29 +146,10 @@ class Replay:
         self.outcome.doubts += losses.doubts()
         return losses.report()
 
-    def _tick_by_tick(self, arrivals: Sequence[Arrival], until: int) -> Iterator[tuple[Sequence[Arrival], int]]:
-        """In steps so small that no episode starts and ends in one: its tasks would not be seen."""
-        if not self._engine.on_wall_clock:
-            yield from (((arrival,), until) for arrival in arrivals)
-            return
-        first = 0
-        while (tick := self._next(arrivals, first)) <= until:
-            last = bisect_right(arrivals, tick, first, key=itemgetter(0))
-            yield arrivals[first:last], tick
-            first = last
-        yield arrivals[first:], until
-
-    def _next(self, arrivals: Sequence[Arrival], first: int) -> int:
-        """When the engine evaluates next: at a tick, or with one of the samples from `first` on."""
-        tick, triggers = self._engine.next_tick(), self._engine.triggers
-        if not triggers:
-            return tick
-        ripe = itertools.takewhile(lambda each: each.received < tick, itertools.islice(arrivals, first, None))
-        return next((each.received for each in ripe if each.stream in triggers), tick)
-
     def _note(self, events: list[Event]) -> None:
         self.outcome.events += events
         self.outcome.end = max(self.outcome.end, self._engine.now)
+        self._note_changes()
         if self._engine.demands_version == self._demands_version:
             return
         self._demands_version = self._engine.demands_version
@@ -186,6 +162,18 @@ class Replay:
             if self._demands.get(name) != demand:
                 self.outcome.tasks[name] = to_task(demand)
         self._demands = demands
+
+    def _note_changes(self) -> None:
+        """What became of demands since the last time: one that began and ended in between is a task as well."""
+        journal = self._engine.journal or []
+        changed = {change.demand.name: change for change in journal}
+        for name, (_, demand, end) in changed.items():
+            self.outcome.tasks[name] = to_task(demand, end)
+            if end is None:
+                self._demands[name] = demand
+            else:
+                self._demands.pop(name, None)
+        journal.clear()
 
 
 def replay_intake(
@@ -293,7 +281,7 @@ def _rules(document: Mapping[str, Any]) -> list[EventRule]:
 
 
 def replay_arrivals(
-    arrivals: Iterable[Arrival],
+    batches: Iterable[Sequence[Arrival]],
     detector: Detector,
     rules: Sequence[EventRule],
     plugins: PluginHost | None = None,
@@ -301,36 +289,32 @@ def replay_arrivals(
 ) -> Outcome:
     """Replay what any other recording holds, as the live intake would have queued it; `plugins` as for an intake file.
 
-    `holder`: as which detector; by default under the Detector's name.
+    Args:
+        batches: the arrivals, whose times never go back; where a batch ends has no meaning.
+        holder: as which detector; by default under the Detector's name.
 
     Raises:
         DetectorError: the Detector cannot run.
     """
     outcome = Outcome()
     replay: Replay | None = None
-    batch: list[Arrival] = []
     last = 0
     holder = holder or detector.name
-    for arrival in arrivals:
+    for part in parts_of(batches):
+        first = part[0].received
         if replay is None:
-            start = arrival.received - 1
-            replay = Replay(detector, rules, holder=holder, start=start, outcome=outcome, plugins=plugins)
-        elif arrival.received - last > PAUSE:
-            replay.take(batch, last)
-            batch = []
-            replay.gap(arrival.received - 1)
+            replay = Replay(detector, rules, holder=holder, start=first - 1, outcome=outcome, plugins=plugins)
+        elif first - last > PAUSE:
+            replay.gap(first - 1)
             outcome.notes.append(
-                f"the recording pauses after {format_time(last)} for {(arrival.received - last) / 1e9:.0f} s: "
+                f"the recording pauses after {format_time(last)} for {(first - last) / 1e9:.0f} s: "
                 "nothing is evaluated in between, windows begin anew, open episodes hold"
             )
-        elif len(batch) >= _BATCH and arrival.received > last:  # what has one time is taken in together
-            replay.take(batch, last)
-            batch = []
-        batch.append(arrival)
-        last = arrival.received
+        last = part[-1].received
+        replay.take(part, last)
     if replay is None:
         replay = Replay(detector, rules, holder=holder, start=0, outcome=outcome, plugins=plugins)
-    replay.take(batch, last)
+        replay.take((), 0)
     replay.finish()
     outcome.notes += replay.report()
     return outcome

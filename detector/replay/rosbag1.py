@@ -17,6 +17,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from detector.replay.batches import Batch, batched
 from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, in_order, key_of
 from detector.replay.rosbag1_cut import Chunk, Contents, contents_of, messages_of
@@ -27,11 +28,15 @@ _HEADER = "std_msgs/msg/Header"
 _BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", _HEADER)
 
 
-def read_rosbag1(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+def read_rosbag1(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
     """The bag's messages as CDR, in the order of their times. One that was not closed is read as far as it goes.
 
     Raises RecordingError if it is damaged, or holds a type that ROS 2 defines otherwise.
     """
+    return batched(_messages(path, wanted, on_cut))
+
+
+def _messages(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
     try:
         cut = _contents(path)
         if cut is not None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
-from operator import attrgetter
 from pathlib import Path
 
 import apsw
@@ -12,6 +10,7 @@ from backports.zstd import ZstdError
 from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
+from detector.replay.batches import Batch, batched, merged
 from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.mcap_file import is_cut, mcap_types, read_mcap
 from detector.replay.message import Message, OnCut, RecordedType, Wanted, key_of
@@ -21,15 +20,18 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 _DAMAGE = (*DAMAGE, ReaderError, apsw.Error, ZstdError)
 
 
-def read_rosbag2(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+def read_rosbag2(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
     """The bag's messages in the order of their times. Raises RecordingError if it is damaged or of an unknown kind.
 
     Of a bag with MCAP files whose recorder was killed, each file is read up to where it is cut.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else []
     if any(is_cut(file) for file in files):
-        yield from heapq.merge(*(read_mcap(file, wanted, on_cut) for file in files), key=attrgetter("time"))
-        return
+        return merged([read_mcap(file, wanted, on_cut) for file in files])
+    return batched(_messages(path, wanted))
+
+
+def _messages(path: Path, wanted: Wanted) -> Iterator[Message]:
     try:
         with Reader(path) as reader:
             connections = [connection for connection in reader.connections if wanted(key_of(connection.topic))]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
 from detector.actions.outcomes import Which
 from detector.engine.consequences.consequences import Consequences, Run
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.identifiers import identifier
 from detector.requested.book import Entry
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.names import FLEET, parse_subject
@@ -41,8 +40,7 @@ def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[Event
 
 def run_of(identity: str) -> Run:
     """The run of a recording; its episode is a short name for the id, which may be long."""
-    digest = hashlib.sha256(identity.encode()).digest()[:10]
-    return Run(REQUESTED.rule, REQUESTED.action, base64.b32encode(digest).decode().lower())
+    return Run(REQUESTED.rule, REQUESTED.action, identifier(identity.encode()))
 
 
 def begin(

@@ -1,4 +1,4 @@
-"""What a source is: a class with typed parameters and one method that delivers messages until it is to stop."""
+"""What a source is: a class with typed parameters and one method that delivers messages until it must stop."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ P = TypeVar("P", bound=BaseModel)
 """The model of a source's parameters."""
 
 Put = Callable[[Sequence[tuple[str, bytes]]], None]
-"""Takes messages that came together: the key and the payload of each. Thread-safe, and never waits."""
+"""Receives messages that came together: the key and the payload of each. Thread-safe, and never waits."""
 
 
 class Putter(Protocol):
-    """Gives what takes the messages of some streams: each message goes to all of them, at one time."""
+    """Gives the function that receives the messages of some streams: each message goes to all of them, at one time."""
 
     def __call__(self, *streams: str) -> Put:
         """`streams` are their names."""
 
 
 _MAXIMUM_KEYS = 100_000
-"""So many keys' streams are remembered; beyond, they are looked up anew."""
+"""The routes of this many keys are cached; then the cache is cleared."""
 
 
 class SourceError(Exception):
-    """Raised by a source that cannot go on now, with a text for people. It is started again after a pause."""
+    """Raised by a source that cannot continue, with a text for people. The source starts again after a pause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +45,17 @@ class FedStream:
 
 
 class Feed:
-    """One run's way to the detector: the streams to deliver, where to put messages, and whether to stop."""
+    """Connects one run of a source to the detector: its streams, where to put messages, and whether to stop."""
 
     def __init__(self, streams: Sequence[Stream], putter: Putter, on_unrouted: Callable[[str], None]) -> None:
-        """`putter` gives what takes the messages of the streams of these names; `on_unrouted` gets each key that
-        belongs to no stream."""
+        """`putter` gives the function that receives the messages of named streams; `on_unrouted` is called with the key
+        of each message that belongs to no stream."""
         self.streams = tuple(FedStream(stream, KeyPattern.parse(stream.key)) for stream in streams)
         """The streams that name this source, in the Detector's order."""
         self._puts = {stream.name: putter(stream.name) for stream in streams}
         self._putter = putter
-        self._routes: dict[str, Put] = {}
+        self._routes: dict[str, Put | None] = {}
+        """The function that receives the messages of a key; None for a key that belongs to no stream."""
         self._on_unrouted = on_unrouted
         self._stop = threading.Event()
         self.messages = 0
@@ -63,11 +64,14 @@ class Feed:
     def put(self, key: str, payload: bytes) -> None:
         """Deliver a message to every stream that its key belongs to, at one time; never waits, thread-safe.
 
-        One that belongs to none is dropped and counted. After the stop nothing is taken any more.
+        A message that belongs to no stream is dropped and counted. After the stop, all messages are ignored.
         """
         if self._stop.is_set():
             return
-        put = self._routes.get(key) or self._route(key)
+        try:
+            put = self._routes[key]
+        except KeyError:
+            put = self._route(key)
         if put is None:
             self._on_unrouted(key)
             return
@@ -75,7 +79,7 @@ class Feed:
         self.messages += 1
 
     def deliver(self, stream: str, key: str, payload: bytes) -> None:
-        """Deliver a message to one stream of the source. Raises KeyError if it is none."""
+        """Deliver a message to one stream of the source. Raises KeyError if the source has no such stream."""
         put = self._puts[stream]
         if not self._stop.is_set():
             put([(key, payload)])
@@ -83,44 +87,42 @@ class Feed:
 
     @property
     def stopping(self) -> bool:
-        """Whether `run` is to return."""
+        """Whether `run` must return."""
         return self._stop.is_set()
 
     def wait(self, seconds: float) -> bool:
-        """Sleep, at most until `run` is to return; whether it is."""
+        """Sleep, at most until `run` must return; gives whether it must."""
         return self._stop.wait(seconds)
 
     def stop(self) -> None:
-        """For the detector: `run` is to return."""
+        """Called by the detector: `run` must return."""
         self._stop.set()
 
     def _route(self, key: str) -> Put | None:
-        """What takes the messages of the key; None where it belongs to no stream."""
+        """Find what receives the messages of the key, and cache it; None if the key belongs to no stream."""
         streams = [each.spec.name for each in self.streams if each.pattern.match(key) is not None]
-        if not streams:
-            return None
         if len(self._routes) >= _MAXIMUM_KEYS:
             self._routes.clear()
-        put = self._routes[key] = self._putter(*streams)
+        put = self._routes[key] = self._putter(*streams) if streams else None
         return put
 
 
 class Source(ABC, Generic[P]):
     """Brings messages from somewhere.
 
-    The detector makes a new one for every run, on a thread that belongs to it alone.
+    The detector makes a new one for every run, on a thread of its own.
     """
 
     Parameters: ClassVar[type[BaseModel]]
-    """The model of `spec.sources[].parameters`; what it refuses, `detector check` reports."""
+    """The model of `spec.sources[].parameters`; `detector check` reports what it rejects."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters
 
     @abstractmethod
     def run(self, feed: Feed) -> None:
-        """Deliver messages to the feed until `feed.stopping`, looking at it at least once a second.
+        """Deliver messages to the feed until `feed.stopping`, which it checks at least once a second.
 
-        Whatever it raises is logged and counted, and it is run again after a pause (0.5 s, doubling up to 30 s).
-        Returning without being told to stop says that there is nothing more to come.
+        An exception is logged and counted, and the source runs again after a pause (0.5 s, doubling up to 30 s).
+        A source that returns before `feed.stopping` has no more messages and does not run again.
         """

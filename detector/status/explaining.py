@@ -12,7 +12,7 @@ from typing import Any
 
 from detector.engine.buffering.buffer import NEVER
 from detector.engine.engine import Engine
-from detector.engine.episodes.demands import plain
+from detector.engine.episodes.plain import plain
 from detector.engine.evaluation import Sight
 from detector.engine.scoping.snapshots import snapshot
 from detector.status.model import Explanation, SubjectStatus

@@ -119,8 +119,9 @@ class StatusKeeper:
         self._watching = [watching for watching in self._watching if not watching.is_over()]
         now = self._now()
         if self._engine.on_wall_clock:
+            seen: dict[tuple[frozenset[str], int, int], list[float]] = {}
             for run in self._engine.rules.values():
-                self._look_at_rule(run, now)
+                self._look_at_rule(run, now, seen)
         if not self._taken <= now < self._taken + _EVERY:
             self.latest = self._take(now)
 
@@ -233,10 +234,11 @@ class StatusKeeper:
             if latency is not None:
                 latencies.add(latency)
 
-    def _look_at_rule(self, run: RuleRun, now: int) -> None:
+    def _look_at_rule(self, run: RuleRun, now: int, seen: dict[tuple[frozenset[str], int, int], list[float]]) -> None:
         """If the rule has just been evaluated, note how long ago the new samples were received that it saw.
 
-        Once a second, of a few clients the newest; no sample is counted twice.
+        Once a second, of a few clients the newest; no sample is counted twice. `seen` is shared by the rules of one
+        look: those that saw the same streams in the same time saw the same samples.
         """
         name, tick, ticks = run.rule.name, run.counters.last_tick, run.counters.ticks
         evaluated = ticks != self._ticks.get(name, 0)
@@ -248,10 +250,17 @@ class StatusKeeper:
         if tick < since:  # the wall clock stepped back: what is older was counted
             return
         latencies = self._rule_latencies.setdefault(name, _Latencies())
-        lanes = (lane for lane in self._engine.buffer if lane.latest > since and lane.stream in run.rule.streams)
-        seen = (next(lane.newest_first(since, tick), None) for lane in lanes)
-        for sample in islice((sample for sample in seen if sample is not None), _LOOKED_AT):
-            latencies.add((now - sample.received) / 1e9)
+        key = run.rule.streams, since, tick
+        if key not in seen:
+            seen[key] = [(now - received) / 1e9 for received in self._receipts(*key)]
+        for latency in seen[key]:
+            latencies.add(latency)
+
+    def _receipts(self, streams: Collection[str], since: int, tick: int) -> Iterator[int]:
+        """When the newest samples after `since` and up to the tick were received, of a few clients."""
+        lanes = (lane for lane in self._engine.buffer if lane.latest > since and lane.stream in streams)
+        newest = (next(lane.newest_first(since, tick), None) for lane in lanes)
+        return islice((sample.received for sample in newest if sample is not None), _LOOKED_AT)
 
     def _forget(self, streams: Iterable[str]) -> None:
         """What is kept of streams and rules that are gone."""

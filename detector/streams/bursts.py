@@ -1,4 +1,4 @@
-"""Messages are taken and handed over burst by burst: what a burst costs is shared by all that are in it."""
+"""Messages are received and passed on in bursts: all messages of a burst share its cost."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ Put = Callable[[Sequence[tuple[str, bytes]]], None]
 """Takes messages that came together: the key and the payload of each. Thread-safe, and never waits."""
 
 LONGEST = 256
-"""At most so many messages are queued at once: taking that many takes a fraction of a millisecond."""
+"""The most messages that are queued at once: receiving them takes a fraction of a millisecond."""

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -101,7 +101,7 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
     if loaded.warnings:
         raise RefusedError("; ".join(loaded.warnings))
     detector = _at(with_recorded_types(loaded.rule_set.detector, [recording]), output)
-    arrivals = recorded_arrivals([recording], Router(detector.spec.streams), detector)
+    arrivals = chain.from_iterable(recorded_arrivals([recording], Router(detector.spec.streams), detector))
     wire, outcome = _Wire(), Outcome()
     host = ActionHost(detector.name, wire)
     played = Played(output)

@@ -109,7 +109,7 @@ def test_json_of_the_wrong_shape_harms_nobody_else(chain: Chain) -> None:
             chain,
             vehicles,
             in_turn(*(text.encode for text in shapes)),
-            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: no JSON",
+            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: (no JSON|JSON nested)",
             r"evaluation errors in EventRule close; the last: ",
             r"a sample had no position for EventRule close; the last: x of van1 is absent",
         )

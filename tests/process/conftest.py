@@ -17,6 +17,7 @@ from tests.mongodb import MongoServer, running
 from tests.mongodb.way import Way
 from tests.networks import Arrivals
 from tests.ports import free_endpoint
+from tests.process.database_desk import Desk, MakeDesk
 from tests.sharing import run_folder, shared
 
 
@@ -44,6 +45,33 @@ def way(mongodb: MongoServer) -> Iterator[Way]:
     made = Way(mongodb)
     yield made
     made.cut()
+
+
+@pytest.fixture
+def desk(way: Way, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[MakeDesk]:
+    monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
+    made: list[Desk] = []
+
+    def make(
+        spool: int | None = None,
+        streams: Any = (),
+        files: bool = False,
+        above: str = "64Ki",
+        concern: str = "Majority",
+        **parameters: Any,
+    ) -> Desk:
+        place: dict[str, Any] = {"uriVariable": "TEST_MONGODB_URI", "writeConcern": concern}
+        if spool is not None:
+            place["spool"] = {"path": str(tmp_path / "spool"), "bytes": str(spool)}
+        if files:
+            place["files"] = {"path": str(tmp_path / "files")}
+            parameters["files"] = {"above": above}
+        made.append(Desk(place, name, streams, **parameters))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
 
 
 @pytest.fixture

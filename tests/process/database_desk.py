@@ -17,6 +17,9 @@ from detector.assembly import inlets
 from tests.driving import START, a_detector, a_rule, a_stream, at
 from wayside.api.actions.database import DatabaseAction
 
+SPEEDS = "json/speed"
+"""The collection of the samples of stream speed."""
+
 
 class Nobody:
     """No Zenoh: the action needs none."""
@@ -111,8 +114,26 @@ class Desk:
         self.action.close()
 
 
+MakeDesk = Callable[..., Desk]
+"""The fixture `desk`: makes a desk, and closes it at the end of the test."""
+
+
+def numbers(database: Any, scenario: str = "e1.keep", collection: str = SPEEDS) -> list[float]:
+    return [each["msg"]["v"] for each in database[collection].find({"scenario": scenario}, sort=[("_id", 1)])]
+
+
+def scenario(database: Any, name: str = "e1.keep") -> dict[str, Any]:
+    found = database["Scenarios"].find_one({"_id": name})
+    assert found is not None
+    return dict(found)
+
+
+def scenario_or_none(database: Any, name: str) -> dict[str, Any]:
+    return database["Scenarios"].find_one({"_id": name}) or {}
+
+
 def speeds(count: int, client: str = "car1", first: int = 0, pad: int = 0) -> list[EpisodeSample]:
-    """So many samples of JSON, at 100 Hz."""
+    """`count` JSON samples, at 100 Hz."""
     filler = b', "pad": "' + b"x" * pad + b'"' if pad else b""
     return [
         EpisodeSample(client, "speed", f"vehicles/{client}/speed", time, time, b'{"v": %d%b}' % (number, filler))

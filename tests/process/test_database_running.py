@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from detector.status.model import RuleStatus
 from detector.streams.codecs.cdr import CdrDecoder
 from tests.driving import a_rule, a_stream
 from tests.mongodb.way import Way
@@ -114,11 +115,34 @@ def read_keys(file: Path) -> list[tuple[str, Any]]:
     ]
 
 
-def send_bouts(process: Process, numbers: range) -> None:
-    """Each client's speed passes the threshold again and again, so that there are many episodes."""
-    for number in numbers:
-        for client in ("car1", "car2"):
-            process.send(client, {"v": 20 if number // 20 % 2 else 0, "n": number, "pad": "x" * 500})
+BOUTS = (0, 20) * 5
+"""Speeds that pass the threshold again and again, so that there are many episodes; the last of them stays open."""
+
+
+class Drive:
+    """Two clients that tell a process their speeds, in samples with numbers from `first` on."""
+
+    def __init__(self, process: Process, first: int = 0) -> None:
+        self._process = process
+        self._first = self._number = first
+
+    def send(self, *speeds: int) -> None:
+        """Send twenty samples of each speed for each client."""
+        for v in speeds:
+            for _ in range(20):
+                for client in ("car1", "car2"):
+                    self._process.send(client, {"v": v, "n": self._number, "pad": "x" * 500})
+                self._number += 1
+
+    def send_until(self, true: Callable[[RuleStatus], bool], *speeds: int) -> None:
+        """Send these until the rule is so: what comes while the detector stands still for a second starts nothing."""
+
+        def sent() -> bool:
+            self.send(*speeds)
+            count = 2 * (self._number - self._first)
+            return true(self._process.status_when(lambda status: status.streams[0].samples == count).rules[0])
+
+        wait_until(sent, PATIENCE)
 
 
 def check(database: Any) -> int:
@@ -142,27 +166,29 @@ def test_after_kill_9_nothing_that_looks_complete_is_incomplete(
     rule = a_rule("bout", signals=[FAST], when="v > 10", evaluation={"onSample": "speed"}, actions=[keep])
     process.write(rule, streams=(a_stream("speed"),), **place(process))
     process.start()
-    send_bouts(process, range(200))
-    process.status_when(lambda status: status.streams[0].samples == 400)
+    drive = Drive(process)
+    drive.send_until(lambda rule: rule.started > 2, *BOUTS)
     if away:
         wait_until(lambda: check(database) > 0, PATIENCE)
         way.cut()
-        send_bouts(process, range(200, 400))
-        wait_until(lambda: spooled(process.folder / "spool") > 0)
+        drive.send_until(lambda rule: rule.started > 12, *BOUTS)
+        wait_until(lambda: spooled(process.folder / "spool") > 0, PATIENCE)
     else:
-        wait_until(lambda: database["json/speed"].count_documents({}) > 100, PATIENCE)
-        send_bouts(process, range(200, 240))
+        wait_until(lambda: database["json/speed"].count_documents({}) > 20, PATIENCE)
+        drive.send(0, 20)
     process.process.kill()
     process.process.wait()
     process.vehicle.close()  # type: ignore[no-untyped-call]
     way.restore()
     before = check(database)
     process.start()
-    send_bouts(process, range(1000, 1210))
+    drive = Drive(process, first=100_000)
+    drive.send_until(lambda rule: rule.started > 2, *BOUTS)
+    drive.send_until(lambda rule: rule.open == 0, 0)
 
     def settled() -> bool:
         found = scenarios(database).values()
-        return bool(found) and all(each["state"] != "Open" for each in found) and check(database) > before
+        return all(each["state"] != "Open" for each in found) and check(database) > before
 
     wait_until(settled, PATIENCE, pause=0.3)
     states = {each["state"] for each in scenarios(database).values()}

@@ -133,7 +133,7 @@ class Environment:
                 f"a value in it would hold more than {MOST} copies of others", source=source, hint=_SMALLER
             )
         _check_static(typed.return_type(), result, source)
-        expression = Expression(source, program, read, leaves, result)
+        expression = Expression(source, program, read, leaves, result, self.variables)
         if len(self._cache) >= _CACHE_SIZE:
             self._cache.clear()  # a bound against rules that come and go for months; refilling costs 50 µs each
         self._cache[source, result] = expression
@@ -154,22 +154,34 @@ def _cel_environment(variables: Mapping[str, Kind]) -> cel.Env:
 
 
 class Expression:
-    """A compiled expression. `paths` are the literal paths it reads, `names` the variables among them."""
+    """A compiled expression. `paths` are the literal paths it reads, `names` and `kinds` those of their variables."""
 
-    __slots__ = ("_program", "_read", "names", "paths", "result", "source")
+    __slots__ = ("_program", "_read", "kinds", "names", "paths", "result", "source")
 
     def __init__(
-        self, source: str, program: cel.Expression, read: frozenset[Path], leaves: Mapping[Path, Leaf], result: Kind
+        self,
+        source: str,
+        program: cel.Expression,
+        read: frozenset[Path],
+        leaves: Mapping[Path, Leaf],
+        result: Kind,
+        variables: Mapping[str, Kind],
     ) -> None:
         self.source = source
         self.paths = read
         self.names = frozenset(str(path[0]) for path in read)
+        self.kinds: Mapping[str, Kind] = {name: variables[name] for name in self.names}
         self.result = result
         self._program = program
         self._read = tree(read, leaves)
 
     def __repr__(self) -> str:
         return f"Expression({self.source!r})"
+
+    @property
+    def tree(self) -> Node:
+        """The syntax tree as CEL runs it: macros unfolded, numbers as doubles. Decoded at each call."""
+        return parse(self._program.serialize())
 
     def evaluate(self, values: Mapping[str, object]) -> Value:
         """The result on `values`, in which null stays null; integral results are doubles, maps are sorted by key.
@@ -193,17 +205,20 @@ class Expression:
         `on_unknown` is told the reason and a message. Never raises for what the values hold. Null being unknown,
         `x == null` is never true: ask `has(msg.x)`, which is false for an absent, null or NaN field.
         """
+        value, why = self.explained(values)
+        if why is not None and on_unknown is not None:
+            on_unknown(*why)
+        return value
+
+    def explained(self, values: Mapping[str, object]) -> tuple[Value | Unknown, tuple[Reason, str] | None]:
+        """The same, and why the result is UNKNOWN: the reason and a message; None where it is known."""
         try:
             value = self._run(values, known=True)
         except EvaluationError as error:
-            if on_unknown is not None:
-                on_unknown(Reason.ABSENT if error.absent else Reason.ERROR, error.message)
-            return UNKNOWN
+            return UNKNOWN, (Reason.ABSENT if error.absent else Reason.ERROR, error.message)
         if value is None or (isinstance(value, float) and math.isnan(value)):
-            if on_unknown is not None:
-                on_unknown(Reason.ABSENT, "the result is null" if value is None else "the result is not a number")
-            return UNKNOWN
-        return value
+            return UNKNOWN, (Reason.ABSENT, "the result is null" if value is None else "the result is not a number")
+        return value, None
 
     def _run(self, values: Mapping[str, object], *, known: bool) -> Value:
         before = begin()

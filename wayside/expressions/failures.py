@@ -8,7 +8,8 @@ from typing import Final
 from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.numbers import DIGITS
 
-NO_MEMBERS: Final = frozenset({"a member is read of what has none"})
+_NO_MEMBERS: Final = "a member is read of what has none"
+NO_MEMBERS: Final = frozenset({_NO_MEMBERS})
 """What `clean` makes of a read of a member of a number, a text or a list."""
 
 _ABSENT = ("no value for ", "no key ", "no index ")
@@ -21,7 +22,7 @@ _CLEANING: Final = (
     (re.compile(r'^\w+: No value with name "(.*)" found in Activation$'), r"no value for `\1`"),
     (re.compile(r"^\w+: Key not found in map : (.*)$"), r"no key \1 in the map"),
     (re.compile(r"^\w+: Index error: index=(.*) size=(.*)$"), r"no index \1 in the list"),
-    (re.compile(r"^(?:\w+: )?Applying SELECT to non-message type.*$"), "a member is read of what has none"),
+    (re.compile(r"^(?:\w+: )?Applying SELECT to non-message type.*$"), _NO_MEMBERS),
     (re.compile(r"^[A-Z_]+: (.*?)(?: \[[A-Z_]+\])?$", re.DOTALL), r"\1"),
 )
 _TYPES: Final = {

@@ -184,7 +184,7 @@ def _convert(value: object, known: bool) -> object:
     if value is None:
         return _ABSENT if known else None
     if kind is int:
-        return _integer(cast("int", value))
+        return integer(cast("int", value))
     if kind is list or kind is tuple:
         return [
             None if item is _ABSENT else item
@@ -226,7 +226,8 @@ def _hand(value: object, known: bool) -> object:
     return _convert(value, known)
 
 
-def _integer(value: int) -> int | float:
+def integer(value: int) -> int | float:
+    """An integer as expressions have it: a double, but for those that only an integer holds."""
     if -MAX_EXACT <= value <= MAX_EXACT or not -(2**63) <= value < 2**64:
         try:
             return float(value)

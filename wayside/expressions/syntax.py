@@ -100,7 +100,7 @@ def nothing_but_arguments(node: Node, variables: frozenset[str], functions: froz
 
 def _paths(node: Node, free: frozenset[str], caller: str = "") -> Iterator[tuple[Path, str]]:
     """The paths, each with the function whose argument it is, if it is one itself."""
-    path = _path(node, free)
+    path = path_of(node, free)
     if path is not None:
         yield path, caller
         return
@@ -123,16 +123,17 @@ def _paths(node: Node, free: frozenset[str], caller: str = "") -> Iterator[tuple
             yield from _paths(result, free - {accumulator})
 
 
-def _path(node: Node, free: frozenset[str]) -> Path | None:
+def path_of(node: Node, free: frozenset[str]) -> Path | None:
+    """The literal path that the node is, below the variables `free`; None if it is something else."""
     match node:
         case Name(name):
             name = name.removeprefix(".")
             return (name,) if name in free else None
         case Select(operand, field):
-            above = _path(operand, free)
+            above = path_of(operand, free)
             return None if above is None else (*above, field)
         case Call("_[_]", None, (container, Constant(str() | int() as index))) if not isinstance(index, bool):
-            above = _path(container, free)
+            above = path_of(container, free)
             return None if above is None or (isinstance(index, int) and index < 0) else (*above, index)
     return None
 

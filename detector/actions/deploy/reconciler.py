@@ -29,7 +29,8 @@ from detector.actions.deploy.stores import (
     TaskStore,
 )
 from detector.cluster.backoff import Backoff
-from detector.engine.episodes.demands import Demand, plain, to_task
+from detector.engine.episodes.demands import Demand, to_task
+from detector.engine.episodes.plain import plain
 from detector.tracing import EpisodeTraces
 
 _log = logging.getLogger(__name__)

@@ -6,7 +6,8 @@ from enum import Enum
 from typing import Any
 
 from detector.actions.deploy.stores import StoredTask
-from detector.engine.episodes.demands import Demand, plain
+from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.plain import plain
 from wayside.times import format_time
 
 

@@ -29,7 +29,7 @@ class Lane:
 
     __slots__ = (
         "bytes", "came", "capped", "client", "duration", "evicted", "latest", "maximum_bytes", "maximum_count",
-        "samples", "stream",
+        "number", "samples", "stream",
     )  # fmt: skip
 
     latched = False
@@ -46,6 +46,8 @@ class Lane:
         """`duration` is in nanoseconds."""
         self.client = client
         self.stream = stream
+        self.number = -1
+        """The client's number in the tables (see columns/tables.py); -1 while it has none."""
         self.came: list[Sample] | None = None
         """What was put in since `record`; None while nobody wants to know."""
         self.limit(duration, maximum_bytes, maximum_count)
@@ -148,6 +150,8 @@ class Buffer:
         """Told each lane that is new."""
         self._evicted_before = 0
         """Evicted from lanes that are gone."""
+        self.evictions = 0
+        """Changes when samples go before their time: pushed out by the cap over all, or with their lane."""
 
     def lane(self, client: str, stream: str) -> Lane | None:
         """The client's lane of the stream, if it has one."""
@@ -212,9 +216,11 @@ class Buffer:
     def _drop(self, lane: Lane) -> None:
         self.bytes -= lane.bytes
         self._evicted_before += lane.evicted
+        self.evictions += 1
 
     def shrink(self) -> None:
         """Free the oldest samples over all lanes, those of latched lanes only where nothing else is left."""
+        self.evictions += 1
         self._shrink(latched=False)
         if self.bytes > self.maximum_bytes:
             self._shrink(latched=True)

@@ -30,7 +30,13 @@ class Clients:
         self._timeout = timeout
         self._expected: frozenset[str] = frozenset()
         self._present: dict[str, Presence] = {}
+        self._sorted: list[str] | None = None
+        """Their names, in order; None: someone came or went since."""
         self.tokens = Tokens()
+        self.newest = NEVER
+        """Since when the client is known that came last, or later; nanoseconds."""
+        self._loss: int | None = NEVER
+        """No client is lost before this time by its timeout (nanoseconds); None: not as things are."""
 
     def configure(
         self, labels: Mapping[str, Mapping[str, str]], timeout: int, expected: Collection[str], now: int
@@ -40,17 +46,23 @@ class Clients:
         The timeout of one that no longer is counts from `now` at the earliest.
         """
         self._labels, self._timeout = labels, timeout
+        self._loss = NEVER
         for client in self._expected.difference(expected):
             self.still_heard(client, now)
         self._expected = frozenset(expected)
         for client in self._expected:
             if client not in self._present:
                 self._present[client] = Presence(now, now)
+                self._sorted = None
+                self.newest = max(self.newest, now)
 
     def heard(self, client: str, time: int) -> None:
         """A sample of the client, or a restored episode about it."""
         if client not in self._present:
             self._present[client] = Presence(time, time)
+            self._sorted = None
+            self.newest = max(self.newest, time)
+            self._loss = NEVER if self._loss is None else min(self._loss, time + self._timeout)
         self.still_heard(client, time)
 
     def still_heard(self, client: str, time: int) -> None:
@@ -58,6 +70,10 @@ class Clients:
         presence = self._present.get(client)
         if presence is not None and time > presence.last:
             presence.last = time
+
+    def may_lose(self, now: int) -> bool:
+        """Whether `lose` may have something to do: it costs a look at every client."""
+        return self.tokens.changed or (self._loss is not None and now > self._loss)
 
     def lose(self, now: int) -> list[str]:
         """Forget the clients that have timed out without a token, or dropped their last one; returns them.
@@ -74,10 +90,18 @@ class Clients:
         tokens.forget_dropped()
         for name in lost:
             del self._present[name]
+            self._sorted = None
+        waited = (
+            presence.last + self._timeout
+            for name, presence in self._present.items()
+            if name not in self._expected and not tokens.hold(name)
+        )
+        self._loss = min(waited, default=None)
         return lost
 
     def gap(self, time: int) -> None:
         """Nobody could be heard up to `time`: timeouts count from there at the earliest."""
+        self.newest = min(self.newest, time)
         for presence in self._present.values():
             presence.since = min(presence.since, time)
             presence.last = time
@@ -110,7 +134,9 @@ class Clients:
         return client in self._present
 
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted(self._present))
+        if self._sorted is None:
+            self._sorted = sorted(self._present)
+        return iter(self._sorted)
 
 
 def fresh_streams(client: str, streams: Mapping[str, int | None], buffer: Buffer, now: int) -> list[str]:

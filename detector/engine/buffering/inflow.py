@@ -16,7 +16,7 @@ from detector.engine.buffering.messages import KeyReader
 from detector.engine.buffering.naming import MessageClients
 from detector.engine.counters import Counters
 from detector.engine.samples.liveliness import LIVELINESS, Token
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Stamped
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Sample, Stamped
 from wayside.api import Detector
 
 MAXIMUM_CLIENTS = 100_000
@@ -44,6 +44,11 @@ class Inflow:
         self._clients = clients
         self._counters = counters
         self._number = 0
+        self.came: list[Sample] = []
+        """What came since somebody took it, while `noting`."""
+        self.lanes: list[Lane | None] = []
+        """The lane of each of these; None: it was dropped."""
+        self.noting = False
         self._lost: dict[str, None] = {}
         """The lost clients of which samples are kept, in the order of their loss."""
 
@@ -74,12 +79,19 @@ class Inflow:
                     self._token(key, payload, time)
             else:
                 self._number += 1
-                self._buffer.grew(lane.insert(Stamped(time, self._number, payload, time, key)))
+                sample = Stamped(time, self._number, payload, time, key)
+                self._buffer.grew(lane.insert(sample))
+                if self.noting:
+                    self.came.append(sample)
+                    self.lanes.append(lane)
 
     def _insert_in_order(self, arrivals: Sequence[Arrival]) -> None:
         """The hot path. What `Lane.insert` and `Buffer.grew` do is written out: a call costs as much as the rest."""
         lanes, buffer = self._lanes, self._buffer
         held, cap = buffer.bytes, buffer.maximum_bytes
+        note = self.lanes.append
+        if self.noting:
+            self.came += arrivals
         for arrival in arrivals:
             time, stream, key, payload = arrival
             try:
@@ -89,8 +101,10 @@ class Inflow:
                 if found is None:
                     if stream == LIVELINESS:
                         self._token(key, payload, time)
+                    note(None)
                     continue
                 lane = found
+            note(lane)
             if time >= lane.latest and not lane.capped:
                 lane.latest = time
                 lane.samples.append(arrival)
@@ -104,6 +118,8 @@ class Inflow:
                 buffer.shrink()
                 held = buffer.bytes
         buffer.bytes = held
+        if not self.noting:
+            self.lanes.clear()
 
     def _lane(self, stream: str, key: str, time: int, payload: bytes) -> Lane | None:
         """The lane that takes a sample; None, and not counted among those taken in, where there is none for it."""

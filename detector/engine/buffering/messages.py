@@ -55,10 +55,16 @@ class Messages:
             try:
                 message = self._decoders[stream].decode(sample.payload)
             except DecodeError as error:
-                self._unreadable(stream, sample.key, error)
-                message = UNKNOWN
+                self.unreadable(stream, sample, error)
+                return UNKNOWN
             self._decoded[at] = message
         return message
+
+    def unreadable(self, stream: str, sample: Sample, error: DecodeError) -> None:
+        """Count a sample that cannot be read, at most once a tick."""
+        if (stream, sample) not in self._decoded:
+            self._decoded[stream, sample] = UNKNOWN
+            self._unreadable(stream, sample.key, error)
 
     def values(
         self, stream: str, sample: Sample, names: frozenset[str], parameters: Mapping[str, Any]

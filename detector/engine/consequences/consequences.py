@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
+
+import msgspec
 
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.consequences.excerpts import EpisodeSample, Excerpt, Excerpts
@@ -194,7 +196,7 @@ class Consequences:
         excerpt = self._running.pop(run)
         begun = self._requested.pop(run, None)
         if begun is not None and excerpt is not None and not cut:
-            self._noted.append(Over(run, replace(begun, end_time=excerpt.until, reason=Reason.UNTIL)))
+            self._noted.append(Over(run, msgspec.structs.replace(begun, end_time=excerpt.until, reason=Reason.UNTIL)))
         if excerpt is not None and self.watch_late and not cut:
             self._complete_ones.append(excerpt)
         elif excerpt is not None:

@@ -12,7 +12,7 @@ from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.episodes.rendering import render
+from detector.engine.episodes.rendering import Rendered, render
 from detector.engine.episodes.subjects import Subject
 from wayside.expressions import InterpolationError
 from wayside.rules import CompiledDeploy, CompiledRule
@@ -46,13 +46,13 @@ class Episode:
     def started(self, rule: CompiledRule, identity: Identity) -> Event:
         """The event of its start, with what is rendered for the rule's actions as they are now."""
         rendered = {action.name: render(action, self.variables) for action in rule.actions}
-        return replace(self._event(rule, identity, None, None, self.values), rendered=rendered)
+        return self._event(rule, identity, None, None, self.values, rendered)
 
     def ended(
         self, rule: CompiledRule, identity: Identity, now: int, reason: Reason, values: Mapping[str, Any]
     ) -> Event:
         """The event of its end; `values` are those of the last evaluation."""
-        return self._event(rule, identity, now, reason, values)
+        return self._event(rule, identity, now, reason, values, {})
 
     def kept(self, rule: CompiledRule) -> OpenEpisode:
         """As it is kept beyond a restart."""
@@ -123,7 +123,13 @@ class Episode:
         )
 
     def _event(
-        self, rule: CompiledRule, identity: Identity, end: int | None, reason: Reason | None, values: Mapping[str, Any]
+        self,
+        rule: CompiledRule,
+        identity: Identity,
+        end: int | None,
+        reason: Reason | None,
+        values: Mapping[str, Any],
+        rendered: Mapping[str, Rendered],
     ) -> Event:
         return Event(
             holder=identity.holder,
@@ -140,4 +146,5 @@ class Episode:
             models={model.name: model.runner.sha256 for model in rule.models if model.runner is not None},
             element=self.subject.element,
             dry_run=rule.dry_run,
+            rendered=rendered,
         )

@@ -6,14 +6,12 @@ restarts finds its own tasks again, and never makes two of one.
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
+from detector.engine.episodes.identifiers import identifier
+from detector.engine.episodes.plain import plain
 from wayside.api.applicationtask import (
     HOLDER_LABEL,
     RULE_DIGEST_ANNOTATION,
@@ -28,7 +26,6 @@ from wayside.api.operation import Operation
 from wayside.times import format_time, parse_time
 
 _LABEL_LIMIT = 63
-_DIGEST_BYTES = 10  # 16 letters of base32
 
 
 @dataclass(frozen=True)
@@ -150,29 +147,6 @@ def from_task(task: ApplicationTask) -> Demand | None:
     )
 
 
-def plain(values: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    """The values as JSON can carry them: nulls, NaN and infinities are left out, tuples become lists."""
-    return {key: _plain(value) for key, value in values.items() if not _is_null(value)}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(child) for key, child in value.items() if not _is_null(child)}
-    if isinstance(value, list | tuple):
-        # An item's place has a meaning, so here null stays.
-        return [None if _is_null(item) else _plain(item) for item in value]
-    return value
-
-
-def _is_null(value: Any) -> bool:
-    return value is None or (isinstance(value, float) and not math.isfinite(value))
-
-
 def _digest(*parts: str) -> str:
-    """16 lowercase letters and digits of a hash over the parts, length-prefixed so that no two lists agree."""
-    state = hashlib.sha256()
-    for part in parts:
-        data = part.encode()
-        state.update(len(data).to_bytes(8, "big"))
-        state.update(data)
-    return base64.b32encode(state.digest()[:_DIGEST_BYTES]).decode().lower()
+    """An identifier of the parts, length-prefixed so that no two lists agree."""
+    return identifier(b"".join(len(data).to_bytes(8, "big") + data for data in map(str.encode, parts)))

@@ -8,8 +8,11 @@ that lasts as long as `unknownTimeout` ends an open episode.
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from wayside.expressions import UNKNOWN, Unknown
 
@@ -47,18 +50,32 @@ class Observation:
     until: Truth
 
 
-@dataclass(frozen=True, slots=True)
-class Started:
+class Started(NamedTuple):
     """An episode started; the condition has held since `onset`."""
 
     onset: int
 
 
-@dataclass(frozen=True, slots=True)
-class Ended:
+class Ended(NamedTuple):
     """The open episode ended."""
 
     reason: Reason
+
+
+FALSE, UNSURE, TRUE = 0, 1, 2
+"""Whether an episode may start: the lower two bits of an observation that is one byte."""
+UNTIL_UNSURE, UNTIL, OUTSIDE = 4, 8, 12
+"""What may end one: the two bits above. 0: nothing."""
+
+
+class Ran(NamedTuple):
+    """What became of ticks at which a subject was observed alike."""
+
+    at: int
+    """The tick at which something happened, or after the last one."""
+    what: Started | Ended | None
+    wake: int | None
+    """When something will happen although nothing changes; nanoseconds."""
 
 
 @dataclass(slots=True)
@@ -99,6 +116,57 @@ class SubjectState:
         self.onset = None
         self.unknown_since = None
         self.rests_until = now + timing.cooldown
+
+    def run(self, ticks: Sequence[int], first: int, last: int, timing: Timing, code: int) -> Ran:
+        """The same as `step` at each of ticks[first:last], at which the observation is the same, up to what happens.
+
+        Nothing more happens at the ticks after that.
+        """
+        start, stop = code & 3, code & 12
+        if self.is_open:
+            return self._open_run(ticks, first, last, timing, stop)
+        if start == FALSE:
+            self.onset = self.unknown_since = None
+            return Ran(last, None, None)
+        if start == UNSURE:
+            if self.onset is None:
+                return Ran(last, None, None)
+            if self.unknown_since is None:
+                self.unknown_since = ticks[first]
+            due = self.unknown_since + timing.hold + 1
+            if ticks[last - 1] < due:
+                return Ran(last, None, due)
+            self.onset = self.unknown_since = None
+            return Ran(last, None, None)
+        self.unknown_since = None
+        if self.onset is None:
+            first = bisect_left(ticks, self.rests_until, first, last)
+            if first == last:
+                return Ran(last, None, self.rests_until)
+            self.onset = ticks[first]
+        at = bisect_left(ticks, self.onset + timing.hold, first, last)
+        if at == last:
+            return Ran(last, None, self.onset + timing.hold)
+        onset, self.onset = self.onset, None
+        self.is_open = True
+        return Ran(at, Started(onset), None)
+
+    def _open_run(self, ticks: Sequence[int], first: int, last: int, timing: Timing, stop: int) -> Ran:
+        at, reason = first, Reason.UNTIL
+        if stop == 0:
+            self.unknown_since = None
+            return Ran(last, None, None)
+        if stop == OUTSIDE:
+            reason = Reason.OUT_OF_SCOPE
+        elif stop == UNTIL_UNSURE:
+            if self.unknown_since is None:
+                self.unknown_since = ticks[first]
+            due = self.unknown_since + timing.unknown_timeout
+            at, reason = bisect_left(ticks, due, first, last), Reason.UNKNOWN
+            if at == last:
+                return Ran(last, None, due)
+        self.end(ticks[at], timing)
+        return Ran(at, Ended(reason), None)
 
     def step(self, now: int, timing: Timing, seen: Observation) -> Started | Ended | None:
         """Go on to the tick `now`; returns what happened."""

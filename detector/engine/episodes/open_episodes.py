@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from detector.engine.episodes.demands import Demand, plain
+from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.plain import plain
 from detector.engine.episodes.subjects import Subject
 from wayside.api.base import JsonValue
 from wayside.names import parse_subject

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 from wayside.names import subject_text
@@ -18,7 +19,10 @@ class Subject(NamedTuple):
     @property
     def text(self) -> str:
         """As in events' keys: `car1`, `car1+car2~north`, `~fleet`."""
-        return subject_text(self.clients, self.element)
+        return _text(self.clients, self.element)
+
+
+_text = lru_cache(maxsize=100_000)(subject_text)
 
 
 def fits(rule: CompiledRule, subject: Subject) -> bool:

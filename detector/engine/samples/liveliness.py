@@ -33,9 +33,12 @@ class Tokens:
         """By key, whose token it is."""
         self._counts: dict[str, int] = {}
         self._dropped: set[str] = set()
+        self.changed = False
+        """Whether any token came or went since the last tick."""
 
     def declare(self, key: str, client: str) -> bool:
         """A token is there; False where there are too many."""
+        self.changed = True
         if key not in self._clients:
             if len(self._clients) >= MAXIMUM_TOKENS:
                 return False
@@ -46,6 +49,7 @@ class Tokens:
 
     def withdraw(self, key: str, *, lost: bool) -> str | None:
         """A token is gone; returns the client that has none left now, if there is one. `lost`: it is lost by that."""
+        self.changed = True
         client = self._clients.pop(key, None)
         if client is None:
             return None
@@ -67,10 +71,12 @@ class Tokens:
 
     def forget_dropped(self) -> None:
         """The tick took note."""
+        self.changed = False
         self._dropped.clear()
 
     def forget(self) -> list[str]:
         """No token counts any more, the Detector asks for others; returns whose they were."""
+        self.changed = True
         clients = list(self._counts)
         self._clients.clear()
         self._counts.clear()

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from wayside.expressions.columns.values import MISSING
+
+__all__ = ["MISSING"]
 
 SAMPLE_OVERHEAD = 160
 """What a sample costs in memory beside its payload, in bytes: its tuple, its numbers and its place in a queue."""
@@ -68,3 +73,31 @@ class NearDecoder(Decoder, Protocol):
 
     def stamp_near(self, payload: bytes, received: int) -> int | None:
         """The sender's time nearest to the receive time; nanoseconds since the epoch. Asked instead of `stamp`."""
+
+
+class Fields(NamedTuple):
+    """Some fields of several messages."""
+
+    columns: Sequence[Sequence[Any]]
+    """By path, a value for each payload: plain as `decode` gives it, or MISSING."""
+    errors: Mapping[int, DecodeError]
+    """The payloads that cannot be read, by their places among the payloads; they are MISSING in all columns."""
+    odd: Sequence[int]
+    """Places of the messages in which a path goes through what has no members, such as a number, a text or null, or a
+    list that is asked for a name. Only the whole message says what an expression makes of it. Ascending, each once."""
+
+
+FieldReader = Callable[[Sequence[bytes]], Fields]
+"""Reads the same fields of many payloads. Raises nothing: what cannot be read is in `errors`."""
+
+
+@runtime_checkable
+class FieldDecoder(Decoder, Protocol):
+    """Reads single fields faster than whole messages."""
+
+    def field_reader(self, paths: Sequence[tuple[str | int, ...]]) -> FieldReader | None:
+        """A reader of just these paths below `msg`, none of them empty: names of fields, and indices of lists.
+
+        It gives the values that `decode` gives, and refuses the payloads that `decode` refuses, with the same errors.
+        None where these paths can only be read from whole messages.
+        """

@@ -22,7 +22,7 @@ Pair = tuple[str, str]
 Distance = Callable[[str, str], float]
 """Between two clients, in metres, as expressions see it."""
 
-_FEW = 1024
+FEW = 1024
 """Up to so many pairs to compare, doing so is faster than building trees."""
 
 _ROUNDING = 1 + 1e-9
@@ -30,7 +30,7 @@ _SLACK = 1e-6
 """The trees search a little farther than asked, by a factor and in metres, so that rounding hides no pair: what decides
 is `distance`. Points on the Earth are 6,400 km from the origin, so they are exact to a nanometre only."""
 
-_ROOM = 4
+ROOM = 4
 """Up to so many times the wanted number of pairs is made, to be sorted exactly."""
 
 _HALVINGS = 40
@@ -57,11 +57,16 @@ class Search(NamedTuple):
     """Who can be the second, where `first` is given."""
 
 
+def reach(within: float) -> float:
+    """How far trees search for pairs that are at most `within` metres apart."""
+    return within * _ROUNDING + _SLACK
+
+
 def near_pairs(search: Search, within: float, maximum: int) -> Near:
     """The pairs that are at most `within` metres apart; if more than `maximum`, the nearest, then by names."""
     first = sorted(search.points if search.first is None else search.points.keys() & search.first)
     second = sorted(search.points if search.second is None else search.points.keys() & search.second)
-    if len(first) * len(second) <= _FEW:
+    if len(first) * len(second) <= FEW:
         return _nearest(search, ((a, b) for a in first for b in second), within, maximum)
     return _by_trees(search, first, second, within, maximum)
 
@@ -86,18 +91,18 @@ def _by_trees(search: Search, first: list[str], second: list[str], within: float
 
     one = cKDTree(np.array([search.points[name] for name in first]))
     other = one if first == second else cKDTree(np.array([search.points[name] for name in second]))
-    reach = within * _ROUNDING + _SLACK
+    radius = reach(within)
     # Each client is near itself; without roles, each pair is found from both sides.
     themselves = len(set(first) & set(second))
     sides = 2 if search.first is None else 1
 
-    def count(radius: float) -> int:
-        return (int(one.count_neighbors(other, radius)) - themselves) // sides
+    def count(distance: float) -> int:
+        return (int(one.count_neighbors(other, distance)) - themselves) // sides
 
-    found = count(reach)
-    if found <= maximum * _ROOM:
-        return _nearest(search, _all(one, other, first, second, reach), within, maximum)
-    low, high = 0.0, reach
+    found = count(radius)
+    if found <= maximum * ROOM:
+        return _nearest(search, _all(one, other, first, second, radius), within, maximum)
+    low, high = 0.0, radius
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         number = count(middle)
@@ -105,9 +110,9 @@ def _by_trees(search: Search, first: list[str], second: list[str], within: float
             low = middle
         else:
             high = middle
-            if number <= maximum * _ROOM:
+            if number <= maximum * ROOM:
                 break
-    if count(high) <= maximum * _ROOM:
+    if count(high) <= maximum * ROOM:
         pairs = _nearest(search, _all(one, other, first, second, high), within, maximum).pairs
     else:
         # Very many are equally far from each other: those that are nearer, and then by names until it is enough.

@@ -8,7 +8,6 @@ nothing, or a failure for an answer.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 from detector.engine.counters import RuleCounters
@@ -116,7 +115,7 @@ class PluginSignals:
         for candidate in candidates:
             known[candidate.subject.text] = subjects[candidate.subject.text] = candidate.subject.clients
             values = dict(self._values(rule, candidate, queries, counters))
-            yield replace(candidate, variables={**candidate.variables, **values})
+            yield candidate._replace(variables={**candidate.variables, **values})
         if every_subject:
             self._subjects[rule.name] = subjects
             self._host.keep(rule.name, subjects)

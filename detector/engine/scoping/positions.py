@@ -21,10 +21,10 @@ Place = tuple[float, ...]
 Point = tuple[float, float, float]
 """Metres, straight: what a search works on."""
 
-_FARTHEST = 1e12
+FARTHEST = 1e12
 """No frame reaches this far, in metres; from 1e154 on the squares of distances are no numbers any more."""
 
-_LIMITS: Mapping[str, float] = {"latitude": 90.0, "longitude": 360.0}
+LIMITS: Mapping[str, float] = {"latitude": 90.0, "longitude": 360.0}
 """Degrees; some write longitudes from 0 to 360."""
 
 
@@ -57,7 +57,7 @@ class Positions:
         """Where the client is, by the newest sample; None where that is not known or makes no sense."""
         lane = self._buffer.lane(client, position.stream)
         sample = None if lane is None else lane.newest
-        if sample is None or not is_fresh(client, position.stream, self._limit(position), self._buffer, now):
+        if sample is None or not is_fresh(client, position.stream, self.limit(position), self._buffer, now):
             counters.unknowns += self._possible(position.stream, client)
             return None
         if counters.ages is not None and lane is not None:
@@ -69,14 +69,14 @@ class Positions:
 
         That is `now` where positions have no age: what was said last holds. All have a place now.
         """
-        if self._limit(position) is None:
+        if self.limit(position) is None:
             return now
         lanes = (self._buffer.lane(client, position.stream) for client in clients)
         return min(lane.newest.time for lane in lanes if lane is not None and lane.newest is not None)
 
     def sample(self, position: CompiledPosition, client: str, then: int, now: int) -> Sample | None:
         """The newest sample up to a past time; None where there is none, or it was too old then."""
-        lane, limit = self._buffer.lane(client, position.stream), self._limit(position)
+        lane, limit = self._buffer.lane(client, position.stream), self.limit(position)
         sample = None if lane is None else next(lane.newest_first(self._floor, then, now), None)
         return None if sample is None or (limit is not None and then - sample.time > limit) else sample
 
@@ -89,7 +89,8 @@ class Positions:
             return None
         return self._place(position, client, sample, counters)
 
-    def _limit(self, position: CompiledPosition) -> int | None:
+    def limit(self, position: CompiledPosition) -> int | None:
+        """Of samples older than this the position is unknown, in nanoseconds; None: of none."""
         stale, oldest = self._stale_after[position.stream], position.max_age_ns
         return oldest if stale is None or (oldest is not None and oldest < stale) else stale
 
@@ -100,7 +101,7 @@ class Positions:
             if not isinstance(value, int | float):
                 counters.misplace(f"{axis} of {client} is absent, NaN, no number, or cannot be read")
                 return None
-            if not abs(value) <= _LIMITS.get(axis, _FARTHEST):
+            if not abs(value) <= LIMITS.get(axis, FARTHEST):
                 counters.unknowns += 1
                 unit = "degrees" if position.geographic else "m"
                 counters.misplace(f"{axis} of {client} is {value:g} {unit}, where nobody is")

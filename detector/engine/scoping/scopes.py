@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.buffering.clients import Clients, fresh_streams
@@ -26,8 +25,7 @@ CLOSING_NS = 1_000_000_000
 """Over so long the closing speed is measured, in nanoseconds."""
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
+class Candidate(NamedTuple):
     """A subject to evaluate the rule for."""
 
     subject: Subject

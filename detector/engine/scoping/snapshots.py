@@ -8,6 +8,8 @@ from typing import Any
 from detector.engine.scoping.scopes import Candidate
 from wayside.rules import CompiledRule, FleetSubject, PairSubject
 
+_PLAIN = frozenset({float, bool, str})
+
 _MEMBERS = 100
 """So many members of the fleet go into an event; `count` says how many there are."""
 
@@ -15,8 +17,11 @@ _MEMBERS = 100
 def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
     """Signals, positions, distance and closing speed, where known; of a fleet its first members and their number."""
     variables = candidate.variables
-    of_the_subject = {plugin.name: variables[plugin.name] for plugin in rule.plugins if plugin.name in variables}
-    return {**_of_the_scope(rule, variables), **of_the_subject}
+    values = _of_the_scope(rule, variables)
+    for plugin in rule.plugins:
+        if plugin.name in variables:
+            values[plugin.name] = variables[plugin.name]
+    return values
 
 
 def _of_the_scope(rule: CompiledRule, variables: Mapping[str, Any]) -> dict[str, Any]:
@@ -43,8 +48,12 @@ def _member(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
-    names = [*(signal.name for signal in rule.signals), *(model.name for model in rule.models)]
-    return {name: _without_bytes(view[name]) for name in names if name in view}
+    names = [signal.name for signal in rule.signals]
+    if rule.models:
+        names += [model.name for model in rule.models]
+    return {
+        name: value if type(value := view[name]) in _PLAIN else _without_bytes(value) for name in names if name in view
+    }
 
 
 def _without_bytes(value: Any) -> Any:

@@ -91,7 +91,7 @@ class Signals:
             at_most=_ENOUGH.get(aggregate),
             oldest_first=aggregate is Aggregate.FIRST,
         )
-        value = _aggregated(signal, client, window, counters)
+        value = aggregated(signal, client, window, counters)
         return self._no_value(counters) if value is UNKNOWN else value
 
     def window(
@@ -208,7 +208,7 @@ _ALWAYS_KNOWN: Final[Mapping[Aggregate, Value]] = {Aggregate.COUNT: 0.0, Aggrega
 """The aggregates that a client without samples, or with a stale stream, has as well: what they are of nothing."""
 
 
-def _aggregated(
+def aggregated(
     signal: CompiledSignal, client: str, window: Sequence[tuple[Sample, Value | Unknown]], counters: RuleCounters
 ) -> Value | Unknown:
     """The window's value; the window is given from the newest on."""

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from detector.engine.buffering.buffer import Buffer, Lane
-from detector.engine.episodes.demands import plain
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.plain import plain, to_text
 from detector.engine.samples.sample import Sample, Stamped
 from wayside.rules import CompiledRule, episode_stream
 
@@ -89,6 +89,11 @@ class Starts:
             sample = Stamped(event.start_time, self._number, payload, event.start_time, event.key)
             self.buffer.grew(lane.insert(sample))
 
+    @property
+    def needed(self) -> bool:
+        """Whether any rule looks at episodes of another."""
+        return bool(self._durations)
+
     def is_evaluated(self, stream: str) -> bool:
         """Whether the rule whose starts these are is there and enabled; else nothing can be said of its episodes."""
         return stream in self._evaluated
@@ -129,4 +134,4 @@ def _payload(event: Event) -> bytes:
         "startTime": event.start_time / 10**9,
         "values": plain(event.values),
     }
-    return json.dumps(message, separators=(",", ":"), ensure_ascii=False).encode()
+    return to_text(message).encode()

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any
 
-import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.serde import SerdeError
 
-from detector.engine.samples.sample import DecodeError
-from detector.streams.codecs.doubles import EXACT, number
+from detector.engine.samples.sample import DecodeError, FieldReader
+from detector.streams.codecs.cdr_fields import cdr_fields
+from detector.streams.codecs.cdr_values import PADDING, Convert, array, scalar
+from detector.streams.codecs.paths import Path
 from detector.streams.codecs.ros import RosTypes, UnknownTypeError, standard
-
-Convert = Callable[[Any], Any]
 
 _STAMPS = {b"\x00\x01": struct.Struct("<iI").unpack_from, b"\x00\x00": struct.Struct(">iI").unpack_from}
 """How to read seconds and nanoseconds, by the encapsulation's representation."""
@@ -37,6 +36,7 @@ class CdrDecoder:
         if not types.known(type_name):
             raise UnknownTypeError(type_name, types)
         self.type_name = type_name
+        self._types = types
         self._convert = _converter(types, type_name)
         self._read = types.store.deserialize_cdr
         self._stamp_first = types.stamp_first(type_name)
@@ -66,6 +66,10 @@ class CdrDecoder:
             raise DecodeError(f"no CDR of {self.type_name} ({len(payload)} bytes): no header")
         return self._time(*unpack(payload, 4))
 
+    def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
+        """A reader of just these paths; None for types with wide texts, empty arrays or an unusual size."""
+        return cdr_fields(self._types, self.type_name, paths, self.decode)
+
     def _stamp_inside(self, payload: bytes) -> int:
         """header.stamp where other fields come before the header."""
         stamp = self.decode(payload)["header"]["stamp"]
@@ -84,8 +88,8 @@ def _converter(types: RosTypes, type_name: str) -> Convert:
     fields = [
         (name, attribute, desc)
         for (name, desc), (attribute, _) in zip(types.fields(type_name), definition.fields, strict=True)
-        if name != "structure_needs_at_least_one_member"
-    ]  # what an empty message holds on the wire
+        if name != PADDING
+    ]
     if not fields:
         return lambda _: {}
     names = [name for name, _, _ in fields]
@@ -110,55 +114,9 @@ def _field(types: RosTypes, desc: FieldDesc) -> Convert | None:
     if kind is Nodetype.NAME:
         return _converter(types, str(detail))
     if kind is Nodetype.BASE:
-        return _SCALARS.get(str(detail[0]), float)
+        return scalar(str(detail[0]))
     element: FieldDesc = detail[0]  # type: ignore[assignment]
     if element[0] is Nodetype.NAME:
         convert = _converter(types, str(element[1]))
         return lambda values: [convert(value) for value in values]
-    return _ARRAYS.get(str(element[1][0]), _small_integers)
-
-
-def _octet(value: int) -> float:
-    return float(value & 0xFF)  # rosbags reads a byte as signed, ROS means an octet
-
-
-def _floats(values: np.ndarray[Any, Any]) -> list[float]:
-    plain: list[float] = values.tolist()
-    return plain
-
-
-def _small_integers(values: np.ndarray[Any, Any]) -> list[float]:
-    plain: list[float] = values.astype(np.float64).tolist()
-    return plain
-
-
-def _large_integers(values: np.ndarray[Any, Any]) -> list[float | int]:
-    if values.size and (int(values.max()) > EXACT or int(values.min()) < -EXACT):
-        return [number(int(value)) for value in values]
-    return list(_small_integers(values))
-
-
-def _octets(values: np.ndarray[Any, Any]) -> bytes:
-    return values.tobytes()
-
-
-_SCALARS: dict[str, Convert | None] = {
-    "bool": None,
-    "float32": None,
-    "float64": None,
-    "string": None,
-    "byte": _octet,
-    "int64": number,
-    "uint64": number,
-}
-_ARRAYS: dict[str, Convert | None] = {
-    "string": None,
-    "bool": _floats,  # tolist() also makes numpy's booleans plain
-    "float32": _floats,
-    "float64": _floats,
-    "uint8": _octets,
-    "char": _octets,
-    "byte": _octets,
-    "int64": _large_integers,
-    "uint64": _large_integers,
-}
+    return array(str(element[1][0]))

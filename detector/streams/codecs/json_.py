@@ -5,12 +5,15 @@ What JSON does not know (NaN, Infinity, trailing commas) is refused. Of a key th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
-from detector.engine.samples.sample import DecodeError
+from detector.engine.samples.sample import DecodeError, FieldReader
 from detector.streams.codecs.doubles import number
+from detector.streams.codecs.json_fields import json_fields
+from detector.streams.codecs.paths import Path
 
 MAX_DEPTH = 64
 """How deeply maps and lists may be nested: no real message comes near, and a hostile one must not exhaust the stack."""
@@ -35,6 +38,11 @@ class JsonDecoder:
     def stamp(self, payload: bytes) -> int | None:
         """None: which field is the stamp is for the stream to say."""
         return None
+
+    def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
+        """A reader of just these paths; None for an index at the beginning of a path, and for names with control
+        characters, quotes or backslashes."""
+        return json_fields(paths, self.decode, lambda value: _with_doubles(value, MAX_DEPTH), MAX_DEPTH)
 
 
 def _with_doubles(value: Any, depth: int) -> Any:

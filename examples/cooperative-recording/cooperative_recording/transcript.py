@@ -36,7 +36,7 @@ class Uniform:
             self._names[name] = f"{name[:-16]}{self._letters(about, 16)}"
 
     def note_time(self, time: str, seconds: int = 0) -> None:
-        """Know a time as one of this step, so many seconds after its minute."""
+        """Know a time as one of this step, `seconds` after the start of its minute."""
         self._times.setdefault(time, f"2026-05-04T10:{self.step:02}:{seconds:02}Z")
 
     def text(self, text: str) -> str:

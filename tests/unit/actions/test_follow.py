@@ -96,7 +96,7 @@ def test_an_action_begins_to_follow_when_its_rule_says_so() -> None:
 
 def test_a_replays_tasks_have_the_parameters_that_they_had_last() -> None:
     arrivals = [speed(0.5, 20), speed(1.5, 30), speed(2.5, 40), speed(3.5, 5), speed(4.5, 5)]
-    outcome = replay_arrivals(arrivals, a_detector(), [following(v="${speed}")])
+    outcome = replay_arrivals([arrivals], a_detector(), [following(v="${speed}")])
     (task,) = outcome.tasks.values()
     assert task.spec.parameters == {"v": 40}
     assert task.spec.end_time is not None

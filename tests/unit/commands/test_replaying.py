@@ -19,7 +19,7 @@ BRIEF = [arrival(0.5, "a", {"v": 20}), arrival(2.5, "a", {"v": 0}), arrival(9.0,
 
 
 def test_an_episode_that_starts_and_ends_between_two_looks_has_its_task_too() -> None:
-    outcome = replay_arrivals(BRIEF, a_detector(), [FAST])
+    outcome = replay_arrivals([BRIEF], a_detector(), [FAST])
     (task,) = outcome.tasks.values()
     assert [event.started for event in outcome.events] == [True, False]
     assert task.spec.parameters == {"who": "a"}
@@ -33,20 +33,20 @@ def test_with_clock_data_the_tasks_are_the_same() -> None:
         arrival(9.0 + n, "a", {"v": v, "t": (START + t) / 1e9})
         for n, (t, v) in enumerate([(5 * 10**8, 20), (25 * 10**8, 0), (9 * 10**9, 0)])
     ]
-    plain = replay_arrivals(BRIEF, detector, [FAST])
-    assert {*replay_arrivals(stamped, data, [FAST]).tasks} == {*plain.tasks}
+    plain = replay_arrivals([BRIEF], detector, [FAST])
+    assert {*replay_arrivals([stamped], data, [FAST]).tasks} == {*plain.tasks}
 
 
 def test_a_pause_of_hours_is_a_gap_over_which_an_open_episode_holds() -> None:
     detector = a_detector(clientTimeout="1h")
-    outcome = replay_arrivals([arrival(0.5, "a", {"v": 20}), arrival(8000, "a", {"v": 20})], detector, [FAST])
+    outcome = replay_arrivals([[arrival(0.5, "a", {"v": 20}), arrival(8000, "a", {"v": 20})]], detector, [FAST])
     assert [event.started for event in outcome.events] == [True]
     assert any(note.startswith("the recording pauses after 2026-01-01T00:00:00.5") for note in outcome.notes)
 
 
 def test_a_misspelt_field_is_told_after_the_replay() -> None:
     rule = a_rule("fast", signals=[{"name": "v", "stream": "speed", "value": "msg.w"}], when="v > 10")
-    outcome = replay_arrivals(BRIEF, a_detector(), [rule])
+    outcome = replay_arrivals([BRIEF], a_detector(), [rule])
     (note,) = outcome.notes
     assert "unknown values" in note
     assert "EventRule fast" in note

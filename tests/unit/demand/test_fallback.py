@@ -98,7 +98,7 @@ def test_what_is_suspended_has_all_the_time_and_so_has_what_has_no_timeout() -> 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 100)), min_size=1, max_size=12))
 def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[tuple[bool, int]]) -> None:
-    """Ready or not for so many seconds, one after the other; looked at each second, by a new manager each time."""
+    """Each pair says whether the app is ready, and for how many seconds; a new manager looks each second."""
     of, app, status = template(**FULL), runs(), ApplicationInstanceStatus()
     now, ready_since, previous = NOW, NOW, False
     timed_out: list[Condition] = []

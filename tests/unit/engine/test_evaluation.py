@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from detector.assembly import inlets, make_engine
 from detector.engine.engine import NoAnswerError
-from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.events import Event
-from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.load import highest_level, thinning
 from detector.evaluator import Evaluator
 from detector.overload import CALM, LONG, Overload
 from detector.replay.intake_file import Control
 from detector.replay.replaying import replay_intake
-from detector.restoring import Restored
-from detector.rules.selection import RuleSet
 from tests.driving import (
     POSITION,
     SECOND,
@@ -39,6 +32,8 @@ from tests.driving import (
     place,
     speed,
 )
+from tests.networks import wait_for
+from tests.unit.engine.live import Live
 
 
 def fast(name: str = "r", **spec: Any) -> Any:
@@ -228,63 +223,25 @@ def test_the_level_rises_with_each_long_look_and_falls_in_calm() -> None:
     assert overload.level == 0
 
 
-class Recording:
-    """Keeps what the engine consumes and says: recorder and outlet in one."""
-
-    def __init__(self) -> None:
-        self.records: list[Arrival | Control] = []
-        self.said: list[Event] = []
-
-    def arrivals(self, arrivals: Sequence[Arrival]) -> None:
-        self.records += arrivals
-
-    def follow(self, streams_or_rules: Any, types_or_surroundings: Any) -> None:
-        pass
-
-    def consequences(self, consequences: Any) -> None:
-        pass
-
-    def control(self, time: int, document: Mapping[str, Any]) -> None:
-        self.records.append(Control(time, dict(document)))
-
-    def events(self, events: Sequence[Event]) -> None:
-        self.said += events
-
-    def open_episodes(self, episodes: Any) -> None:
-        pass
-
-    def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
-        pass
-
-
 def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_events() -> None:
-    detector, clock = a_detector(), [START]
     rules = [fast(), fast("q", evaluation={"onDemand": True}), fast("p", evaluation={"every": "1s"})]
-    failures: list[BaseException] = []
-    engine = make_engine(detector, inlets(detector), holder="h", start=START)
-    intake, recording = Intake(lambda: clock[0]), Recording()
-    evaluator = Evaluator(
-        engine, intake, recording, now=lambda: clock[0], recorder=recording, on_failure=failures.append
-    )
-    put = intake.putter("speed")
-    evaluator.start(RuleSet(detector, tuple(rules)), Restored())
+    live = Live(a_detector(), rules)
     slow = itertools.count(0, SECOND)
     for n in range(80):
-        engine.stopwatch = partial(next, slow) if 10 < n < 20 else lambda: 0
-        clock[0] += SECOND // 4
+        live.engine.stopwatch = partial(next, slow) if 10 < n < 20 else lambda: 0
+        live.now += SECOND // 4
         payload = b'{"v": %d}' % (20 if (n // 3) % 2 else 5)
-        put([(f"vehicles/{client}/speed", payload) for client in ("a", "b")])
+        live.put([(f"vehicles/{client}/speed", payload) for client in ("a", "b")])
         if n in (10, 20):
-            evaluator.pause_rule("p", n == 10).result(10)
-        assert [each.subject for each in evaluator.ask("q").result(10)] == ["a", "b"]
-    evaluator.stop()
-    assert failures == []
+            live.evaluator.pause_rule("p", n == 10).result(10)
+        assert [each.subject for each in live.evaluator.ask("q").result(10)] == ["a", "b"]
+    recording = live.stop()
     assert {event.rule for event in recording.said} == {"r", "q", "p"}
     levels = [
         each.document["level"] for each in recording.records if isinstance(each, Control) and each.kind == "level"
     ]
     assert levels == [1, 2, 3, 2]  # three at once while it was slow; one taken back after ten seconds of calm
-    assert engine.counters.rule("r").skipped > 0
+    assert live.engine.counters.rule("r").skipped > 0
     assert lines(replay_intake(recording.records, None, None).events) == lines(recording.said)
 
 
@@ -306,3 +263,12 @@ def test_on_sample_names_a_stream_of_the_detector() -> None:
         Exception, match=r"spec\.evaluation\.onSample: Detector d has no stream sped; did you mean speed"
     ):
         compiled(a_detector(), fast(evaluation={"onSample": "sped"}))
+
+
+def test_a_sample_that_rules_are_evaluated_with_is_looked_at_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Evaluator, "pause", lambda _: 3600.0)
+    live = Live(a_detector(), [fast(evaluation={"onSample": "speed"})])
+    live.now += SECOND // 4
+    live.put([("vehicles/a/speed", b'{"v": 20}')])
+    wait_for(lambda: bool(live.recording.said))
+    assert [event.subject for event in live.stop().said] == ["a"]

@@ -12,18 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.assembly import inlets, make_engine
 from detector.engine.episodes.events import Event
-from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
-from detector.evaluator import Evaluator
-from detector.replay import replaying
+from detector.replay import parts, replaying
 from detector.replay.intake_file import Control
 from detector.replay.latched import recorded_arrivals
 from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
 from detector.replay.routing import Router
-from detector.restoring import Restored
-from detector.rules.selection import RuleSet
 from tests.driving import (
     POSITION,
     SECOND,
@@ -37,6 +32,7 @@ from tests.driving import (
     lines,
     told,
 )
+from tests.unit.engine.live import Live, Recording
 from wayside.api import Detector
 
 STEP = SECOND // 10
@@ -134,6 +130,8 @@ def test_what_has_one_time_is_taken_in_together_however_much_it_is(
     monkeypatch: pytest.MonkeyPatch, by_intake: bool
 ) -> None:
     monkeypatch.setattr(replaying, "_BATCH", 4)
+    monkeypatch.setattr(parts, "_ARRIVALS", 4)
+    monkeypatch.setattr(parts, "_STEP", 4)
     count = {"name": "n", "stream": "speed", "aggregate": "Count", "over": "1s"}
     rule = a_rule(signals=[count], when="n >= 1", evaluation={"onSample": "speed"})
     arrivals = [arrival(0.9 + n // 10, "car", {"n": n}) for n in range(20)]
@@ -142,7 +140,7 @@ def test_what_has_one_time_is_taken_in_together_however_much_it_is(
         end = Control(at(1.9), {"kind": "end"})
         outcome = replay_intake([Control(START, start), *arrivals, end], None, None)
     else:
-        outcome = replay_arrivals(arrivals, a_detector(), [rule])
+        outcome = replay_arrivals([arrivals], a_detector(), [rule])
     assert [event.values for event in outcome.events] == [{"n": 10.0}]
 
 
@@ -165,31 +163,6 @@ def test_what_came_during_a_stall_is_not_evaluated_and_time_does_not_go_back() -
 # The end
 
 
-class Recording:
-    """Keeps what a live engine consumes and says: recorder and outlet in one."""
-
-    def __init__(self) -> None:
-        self.records: list[Arrival | Control] = []
-        self.said: list[Event] = []
-
-    def arrivals(self, arrivals: Sequence[Arrival]) -> None:
-        self.records += arrivals
-
-    def follow(self, *_: Any) -> None: ...
-
-    def consequences(self, *_: Any) -> None: ...
-
-    def open_episodes(self, *_: Any) -> None: ...
-
-    def demands(self, *_: Any) -> None: ...
-
-    def control(self, time: int, document: Mapping[str, Any]) -> None:
-        self.records.append(Control(time, dict(document)))
-
-    def events(self, events: Sequence[Event]) -> None:
-        self.said += events
-
-
 V = {"name": "v", "stream": "speed", "value": "msg.v"}
 LATE = {"clock": "Data", "lateness": "1s"}
 BRIEF = (
@@ -202,29 +175,20 @@ SENT = [(1, 5), (11, 5), (14, 20), (14, 20), (17, 5), (18, 5)]
 EXPECTED = ["sample car started 1.4", "tick car started 1.4", "sample car Until 1.7", "tick car Until 1.7"]
 
 
-def live(detector: Detector, rules: Sequence[Any], sent: Sequence[tuple[int, int]]) -> Recording:
-    """A detector that receives this, on its own thread, and is stopped."""
-    clock, failures = [START], []
-    engine = make_engine(detector, inlets(detector), holder="d", start=START)
-    intake, recording = Intake(lambda: clock[0]), Recording()
-    evaluator = Evaluator(
-        engine, intake, recording, now=lambda: clock[0], recorder=recording, on_failure=failures.append
-    )
-    put = intake.putter("speed")
-    evaluator.start(RuleSet(detector, tuple(rules)), Restored())
+def received(detector: Detector, rules: Sequence[Any], sent: Sequence[tuple[int, int]]) -> Recording:
+    """What a live engine that receives this has consumed and said when it is stopped."""
+    live = Live(detector, rules)
     for step, value in sent:
-        clock[0] = START + step * STEP
+        live.now = START + step * STEP
         payload = json.dumps({"t": (START + step * STEP) / SECOND, "v": value}).encode()
-        evaluator.call(lambda payload=payload: put([("vehicles/car/speed", payload)])).result(10)
-        evaluator.call(lambda: None).result(10)
-    evaluator.stop()
-    assert failures == []
-    return recording
+        live.evaluator.call(lambda payload=payload: live.put([("vehicles/car/speed", payload)])).result(10)
+        live.evaluator.call(lambda: None).result(10)
+    return live.stop()
 
 
 def test_with_clock_data_the_last_lateness_is_evaluated_at_the_end_live_as_in_a_replay(tmp_path: Path) -> None:
     detector = detector_of(LATE)
-    recording = live(detector, BRIEF, SENT)
+    recording = received(detector, BRIEF, SENT)
     assert told(recording.said) == EXPECTED
     assert lines(replay_intake(recording.records, None, None).events) == lines(recording.said)
     recorded = [line(step, "car", "speed", v=value) for step, value in SENT]
@@ -304,7 +268,7 @@ def test_an_intake_file_that_does_not_say_its_order_has_closing_speeds_that_end_
         if client == "a" or n <= 4
     ]
     assert recorded_before(a_detector(), [rule], *arrivals) == ["r a+b started 3"]
-    assert replay_arrivals(arrivals, a_detector(), [rule]).events == []
+    assert replay_arrivals([arrivals], a_detector(), [rule]).events == []
 
 
 def test_an_intake_file_that_does_not_say_its_order_has_the_distances_of_then_to_the_last_digit() -> None:
@@ -315,7 +279,7 @@ def test_an_intake_file_that_does_not_say_its_order_has_the_distances_of_then_to
     ]
     (event,) = replayed_before(a_detector(), [rule], *arrivals)
     assert (event.values["distance"], str(event.values["closingSpeed"])) == (math.dist(a, b), "-0.0")
-    (event,) = replay_arrivals(arrivals, a_detector(), [rule]).events
+    (event,) = replay_arrivals([arrivals], a_detector(), [rule]).events
     dx, dy = a[0] - b[0], a[1] - b[1]
     assert event.values["distance"] == math.sqrt(dx * dx + dy * dy) != math.dist(a, b)
     assert str(event.values["closingSpeed"]) == "0.0"

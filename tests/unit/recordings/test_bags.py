@@ -13,12 +13,12 @@ from detector.assembly import inlets
 from detector.replay.errors import RecordingError
 from detector.replay.message import Cut
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.recordings import open_recordings
 from detector.sources.supervision import SourceThread, State
 from detector.streams.codecs import CdrDecoder
 from detector.streams.tally import Tally
 from tests.driving import a_detector
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
+from tests.recorded import messages_in
 from wayside.api.source import DataSource
 from wayside.api.stream import Encoding, Stream
 
@@ -56,7 +56,7 @@ def bag(tmp_path: Path, noetic: Typestore) -> Path:
 
 
 def test_messages_of_a_ros_1_bag_read_as_those_of_ros_2(bag: Path) -> None:
-    messages = list(open_recordings([bag], lambda key: key.startswith("vehicles/")))
+    messages = list(messages_in([bag], lambda key: key.startswith("vehicles/")))
     assert [(m.time, m.key, m.encoding, m.type) for m in messages] == [
         ((100 + n) * SECOND // 10, f"vehicles/car{n % 2 + 1}/pose", "cdr", POSE) for n in range(10)
     ]
@@ -74,7 +74,7 @@ def test_messages_of_equal_times_come_in_the_order_in_which_the_bag_has_them(tmp
         connections = {n: writer.add_connection(f"/vehicles/car{n}/pose", POSE, typestore=noetic) for n in (1, 2)}
         for number, car in enumerate(cars):
             writer.write(connections[car], number // 4 * SECOND, pose(noetic, float(number), number))
-    messages = list(open_recordings([path]))
+    messages = list(messages_in([path]))
     assert [int(CdrDecoder(POSE).decode(each.payload)["pose"]["position"]["x"]) for each in messages] == [*range(8)]
     assert [each.key for each in messages] == [f"vehicles/car{car}/pose" for car in cars]
 
@@ -88,7 +88,7 @@ def test_a_type_of_ones_own_comes_with_the_bag(tmp_path: Path, noetic: Typestore
     with Writer(path) as writer:
         connection = writer.add_connection("/thing", "own_msgs/msg/Thing", typestore=noetic)
         writer.write(connection, 1, noetic.serialize_ros1(thing, "own_msgs/msg/Thing"))
-    (message,) = open_recordings([path])
+    (message,) = messages_in([path])
     ros2 = get_typestore(Stores.ROS2_JAZZY)
     ros2.register(own)
     read = ros2.deserialize_cdr(message.payload, "own_msgs/msg/Thing")
@@ -110,7 +110,7 @@ def test_a_bag_of_common_types_leaves_the_detector_as_it_is(bag: Path) -> None:
 
 def test_a_type_that_ros_2_defines_otherwise_is_refused_if_it_is_asked_for(bag: Path) -> None:
     with pytest.raises(RecordingError, match="/other is recorded as sensor_msgs/msg/Range, which has other fields"):
-        list(open_recordings([bag]))
+        list(messages_in([bag]))
 
 
 def vehicles(key: str) -> bool:
@@ -130,14 +130,14 @@ def test_a_bag_that_is_cut_is_read_up_to_there(
         connection = writer.add_connection("/vehicles/car/pose", POSE, typestore=noetic)
         for number in range(100):
             writer.write(connection, number * SECOND, pose(noetic, float(number), number))
-    whole, raw = list(open_recordings([path])), path.read_bytes()
+    whole, raw = list(messages_in([path])), path.read_bytes()
     assert len(whole) == 100
     counts = []
     for size in range(100, len(raw), len(raw) // 40):
         cut = tmp_path / "cut.bag"
         cut.write_bytes(raw[:size])
         told: list[Cut] = []
-        read = list(open_recordings([cut], on_cut=told.append))
+        read = list(messages_in([cut], on_cut=told.append))
         assert read == whole[: len(read)]
         assert [(each.path, each.messages) for each in told] == [(cut, len(read))]
         counts.append(len(read))
@@ -153,11 +153,11 @@ def test_a_damaged_bag_is_told(bag: Path, tmp_path: Path) -> None:
     place = whole.index(b"compression=")
     damaged.write_bytes(whole[:place] + b"compressiom=" + whole[place + 12 :])
     with pytest.raises(RecordingError, match=r"damaged\.bag.*rosbag reindex"):
-        list(open_recordings([damaged], vehicles))
+        list(messages_in([damaged], vehicles))
     renamed = tmp_path / "drive.ros"
     renamed.write_bytes(whole)
     with pytest.raises(RecordingError, match=r"ends in \.bag"):
-        open_recordings([renamed])
+        messages_in([renamed])
 
 
 def playing(arrivals: Arrivals, tally: Tally, *, of: Stream | None = None, **parameters: object) -> SourceThread:

@@ -15,10 +15,10 @@ from detector.engine.samples.sample import Arrival
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.latched import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.recordings import open_recordings
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import Router
 from tests.driving import a_detector, a_rule, at, told
+from tests.recorded import messages_in
 from tests.ros_messages import cdr, odometry
 
 OBSTACLES = "lab_msgs/msg/Obstacles"
@@ -82,7 +82,7 @@ def recording(tmp_path: Path) -> Path:
 def test_messages_of_another_encoder_read_as_they_were_written(recording: Path) -> None:
     completed = with_recorded_types(a_detector(STREAM), [recording])
     decoder = inlets(completed).decoders["obstacles"]
-    messages = [message.payload for message in open_recordings([recording])]
+    messages = [message.payload for message in messages_in([recording])]
     assert [decoder.decode(raw) for raw in messages] == [obstacles(second, second) for second in range(5)]
     assert [decoder.stamp(raw) for raw in messages] == [at(second) + 1 for second in range(5)]
 

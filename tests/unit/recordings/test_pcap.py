@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import random
 import struct
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from detector.cli import app
 from detector.replay.errors import RecordingError
 from detector.replay.message import Cut, Message
-from detector.replay.recordings import open_recordings
 from detector.streams.codecs.etsi.times import its_ms
+from tests.driving import a_detector, a_rule, a_stream
+from tests.recorded import messages_in
 from tests.unit.encodings.its_messages import a_cam, random_message
 from tests.unit.encodings.test_etsi_packets import EXTENDED, LONG_POSITION, btp, common, packet, signed, single_hop
+from tests.unit.recordings.desk import Desk
 
 SECOND = 10**9
 START = 1_767_225_600 * SECOND
@@ -71,7 +70,7 @@ def pcapng(frames: list[tuple[int, bytes]], link: int = 1, order: str = "<") -> 
 
 def read(path: Path, raw: bytes) -> list[Message]:
     path.write_bytes(raw)
-    return list(open_recordings([path]))
+    return list(messages_in([path]))
 
 
 @pytest.mark.parametrize("name", FRAMES)
@@ -117,7 +116,7 @@ def test_a_capture_that_is_cut_is_read_up_to_there(write: object, tmp_path: Path
     for size in range(30, len(raw)):
         path.write_bytes(raw[:size])
         told: list[Cut] = []
-        messages = list(open_recordings([path], on_cut=told.append))
+        messages = list(messages_in([path], on_cut=told.append))
         assert messages == whole[: len(messages)]
         assert all(cut.messages == len(messages) for cut in told)
         counts.add((len(messages), len(told)))
@@ -132,42 +131,26 @@ def test_a_capture_that_is_damaged_is_told(tmp_path: Path) -> None:
         read(tmp_path / "capture", bytes(raw))
 
 
-DETECTOR = """
-apiVersion: wayside.dev/v1alpha1
-kind: Detector
-metadata: {name: d}
-spec:
-  streams:
-    - {name: cam, key: etsi/cam, encoding: uper, type: etsi/cam, client: 'its-${msg.header.stationId}'}
-"""
-
-RULE = """
-apiVersion: wayside.dev/v1alpha1
-kind: EventRule
-metadata: {name: fast}
-spec:
-  evaluation: {every: 1s}
-  signals:
-    - name: speed
-      stream: cam
-      value: msg.cam.camParameters.highFrequencyContainer.basicVehicleContainerHighFrequency.speed.speedValue
-  when: speed > 10
-"""
+CAM_STREAM = a_stream("cam", key="etsi/cam", encoding="uper", type="etsi/cam", client="its-${msg.header.stationId}")
+SPEED = "msg.cam.camParameters.highFrequencyContainer.basicVehicleContainerHighFrequency.speed.speedValue"
+FAST = a_rule(
+    "fast",
+    signals=[{"name": "speed", "stream": "cam", "value": SPEED}],
+    when="speed > 10",
+    evaluation={"every": "1s"},
+)
 
 
 @pytest.mark.parametrize(("clock", "start"), [("Wall", 1), ("Data", 0)])  # captured 3 ms after they were made
-def test_a_capture_is_replayed(clock: str, start: int, tmp_path: Path) -> None:
+def test_a_capture_is_replayed(clock: str, start: int, desk: Desk) -> None:
     frames = []
     for index in range(12):
         time = START + index * SECOND // 2
         frames.append((time + 3_000_000, ethernet(packet(single_hop(a_cam(station=7, milliseconds=its_ms(time)))))))
-    (tmp_path / "capture.pcapng").write_bytes(pcapng(frames))
-    (tmp_path / "detector.yaml").write_text(DETECTOR + f"  clock: {clock}\n")
-    (tmp_path / "rules.yaml").write_text(RULE)
-    arguments = ["replay", "capture.pcapng", "--detector", "detector.yaml", "--rules", "rules.yaml", "--output", "out"]
-    arguments = [str(tmp_path / word) if "." in word or word == "out" else word for word in arguments]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    (event,) = [json.loads(line) for line in (tmp_path / "out" / "events.jsonl").read_text().splitlines()]
+    (desk.folder / "capture.pcapng").write_bytes(pcapng(frames))
+    desk.write(a_detector(CAM_STREAM, clock=clock), FAST)
+    ran = desk.replay("capture.pcapng")
+    assert ran.code == 0, ran.said
+    (event,) = ran.events
     assert event["subject"] == "its-7"
     assert event["data"]["startTime"] == f"2026-01-01T00:00:0{start}.000000000Z"

@@ -14,10 +14,10 @@ from mcap.writer import Writer as PlainWriter
 from mcap_protobuf.writer import Writer
 
 from detector.replay.errors import RecordingError
-from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from detector.testing import run
 from tests.driving import a_detector, a_rule, a_stream, at
+from tests.recorded import arrivals_of, messages_in
 from wayside.api.stream import Encoding, Stream
 
 F = descriptor_pb2.FieldDescriptorProto
@@ -83,7 +83,7 @@ def recording(tmp_path: Path) -> Path:
 
 def first(recording: Path, encoding: Encoding) -> bytes:
     stream = Stream(name="track", key="vehicles/${client:*}/track", encoding=encoding)
-    return next(Router([stream]).arrivals(open_recordings([recording]))).payload
+    return next(arrivals_of(Router([stream]), messages_in([recording]))).payload
 
 
 def test_protobuf_messages_are_plain_values_in_json_and_cbor(recording: Path) -> None:
@@ -118,9 +118,9 @@ def test_a_recording_with_protobuf_replays(recording: Path, tmp_path: Path, enco
 
 
 def test_a_cut_recording_with_protobuf_is_read_up_to_there(recording: Path) -> None:
-    whole = list(open_recordings([recording]))
+    whole = list(messages_in([recording]))
     recording.write_bytes(recording.read_bytes()[:-40])
-    read = list(open_recordings([recording]))
+    read = list(messages_in([recording]))
     assert [message.payload for message in read] == [message.payload for message in whole]
     assert read[0].decode is not None
     assert read[0].decode(read[0].payload)["kind"] == "BIKE"  # type: ignore[index]
@@ -131,16 +131,16 @@ def test_another_encoding_than_replay_can_give_is_said_with_those_it_can(recordi
     with pytest.raises(
         RecordingError, match=r"track is recorded as protobuf.*streams\[t\].encoding is cdr: write json"
     ):
-        next(Router([stream]).arrivals(open_recordings([recording])))
+        next(arrivals_of(Router([stream]), messages_in([recording])))
 
 
 def test_a_payload_that_is_no_message_is_counted_by_its_stream(recording: Path) -> None:
-    (message, *_) = open_recordings([recording])
+    (message, *_) = messages_in([recording])
     assert message.decode is not None
     with pytest.raises(ValueError, match=r"no lab\.Track"):
         message.decode(b"\xff")
     stream = Stream(name="track", key="vehicles/${client:*}/track", encoding=Encoding.JSON)
-    (arrival,) = Router([stream]).arrivals([message._replace(payload=b"\xff")])
+    (arrival,) = arrivals_of(Router([stream]), [message._replace(payload=b"\xff")])
     assert arrival.payload == b"\xff"
 
 
@@ -155,10 +155,10 @@ def test_a_file_that_does_not_define_its_messages_is_an_error(tmp_path: Path) ->
             writer.add_message(channel, 1, b"", 1)
             writer.finish()  # type: ignore[no-untyped-call]
         with pytest.raises(RecordingError, match=said):
-            list(open_recordings([path]))
+            list(messages_in([path]))
 
 
 def test_without_the_extra_the_error_says_how_to_install_it(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mcap_protobuf.decoder", None)
     with pytest.raises(RecordingError, match=r"pip install 'wayside\[protobuf\]'"):
-        list(open_recordings([recording]))
+        list(messages_in([recording]))

@@ -8,9 +8,10 @@ import pytest
 
 from detector.checking import check_documents
 from detector.replay.errors import RecordingError
-from detector.replay.recordings import open_recordings, types_of
+from detector.replay.recordings import types_of
 from detector.testing import run
 from tests.driving import at
+from tests.recorded import messages_in
 from tests.recording_bench import STREAMS, Bench, an_episode, mcap_files, pose, speed, tf_static
 from wayside.api.documents import load_documents
 
@@ -42,7 +43,7 @@ def test_a_replay_finds_the_messages_at_their_times_and_what_is_latched_once(tmp
     given = [tf_static(1.0), *(each for k in range(30) for each in (pose(1 + k / 10, k), speed(1.05 + k / 10, k)))]
     folder = bench.record(an_episode(), given)
     assert len(mcap_files(folder)) == 3
-    found = list(open_recordings([folder]))
+    found = list(messages_in([folder]))
     assert [(each.time, f"vehicles/{each.key.split('/', 1)[1]}", each.payload) for each in found] == [
         (each.time, each.key, each.payload) for each in given
     ]
@@ -69,7 +70,7 @@ def test_a_file_that_is_gone_is_said(tmp_path: Path) -> None:
     (file,) = mcap_files(folder)
     file.unlink()
     with pytest.raises(RecordingError, match=f"{file.name} is missing"):
-        list(open_recordings([folder]))
+        list(messages_in([folder]))
 
 
 def problems(tmp_path: Path, detector: str, rule: str) -> list[str]:

@@ -14,9 +14,9 @@ from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.message import Cut, Message
-from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from detector.streams.codecs.ros import standard
+from tests.recorded import arrivals_of, messages_in
 from tests.ros_messages import cdr, odometry, pose_stamped
 from wayside.api.stream import Encoding, Stream
 
@@ -75,20 +75,20 @@ def write_lines(path: Path, *lines: object) -> Path:
 )
 def test_mcap_files_are_read(tmp_path: Path, options: dict[str, Any]) -> None:
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES, **options)
-    assert list(open_recordings([path])) == MESSAGES
+    assert list(messages_in([path])) == MESSAGES
 
 
 def test_mcap_files_are_read_in_the_order_of_their_times(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES[::-1], chunk_size=500)
-    assert list(open_recordings([path])) == MESSAGES
+    assert list(messages_in([path])) == MESSAGES
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_rosbag2_folders_are_read(tmp_path: Path, storage: StoragePlugin) -> None:
     path = write_bag(tmp_path / "bag", MESSAGES, storage)
-    assert list(open_recordings([path])) == MESSAGES
+    assert list(messages_in([path])) == MESSAGES
     (file,) = [entry for entry in path.iterdir() if entry.name != "metadata.yaml"]
-    assert list(open_recordings([file])) == MESSAGES
+    assert list(messages_in([file])) == MESSAGES
 
 
 def test_json_lines_are_read_with_their_values_as_they_stand(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_json_lines_are_read_with_their_values_as_they_stand(tmp_path: Path) -> 
         "",
         '{"key": "/b", "value": [1], "t": 5}',
     )
-    assert list(open_recordings([path])) == [
+    assert list(messages_in([path])) == [
         Message(5, "vehicles/car7/pose", b'{"x": 1.50}', "json", None),
         Message(5, "b", b"[1]", "json", None),
     ]
@@ -110,7 +110,7 @@ def test_an_intake_file_is_read_like_any_mcap_file(tmp_path: Path) -> None:
     writer.control(1, {"kind": "start"})
     writer.arrivals([Arrival(message.time, "pose", message.key, message.payload) for message in MESSAGES[:3]])
     writer.close()
-    assert list(open_recordings([tmp_path / "intake.mcap"], Router([stream]).wanted)) == MESSAGES[:3]
+    assert list(messages_in([tmp_path / "intake.mcap"], Router([stream]).wanted)) == MESSAGES[:3]
 
 
 def test_several_recordings_are_merged_by_time(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_several_recordings_are_merged_by_time(tmp_path: Path) -> None:
         write_bag(tmp_path / "bag", MESSAGES[1::2]),
         write_lines(tmp_path / "c.jsonl", {"t": 200, "key": "c", "value": 1}),
     ]
-    merged = list(open_recordings(paths))
+    merged = list(messages_in(paths))
     assert [message for message in merged if message.encoding == "cdr"] == MESSAGES
     assert [message.key for message in merged if message.time == 200] == ["car1/pose", "c"]
 
@@ -130,8 +130,8 @@ def test_only_wanted_keys_are_read(tmp_path: Path) -> None:
         write_bag(tmp_path / "bag", MESSAGES),
         write_lines(tmp_path / "c.jsonl", {"t": 1, "key": "odom", "value": 1}, {"t": 2, "key": "x", "value": 1}),
     ]
-    assert [message.key for message in open_recordings(paths, lambda key: key == "odom")] == ["odom"] * 3
-    assert list(open_recordings(paths, lambda key: False)) == []
+    assert [message.key for message in messages_in(paths, lambda key: key == "odom")] == ["odom"] * 3
+    assert list(messages_in(paths, lambda key: False)) == []
 
 
 GOOD = '{"t": 5, "key": "a", "value": {}}'
@@ -154,7 +154,7 @@ GOOD = '{"t": 5, "key": "a", "value": {}}'
 def test_a_broken_line_is_said_with_file_and_line(tmp_path: Path, lines: list[str], where: int, words: str) -> None:
     path = write_lines(tmp_path / "drive.jsonl", *lines)
     with pytest.raises(RecordingError) as caught:
-        list(open_recordings([path]))
+        list(messages_in([path]))
     assert str(caught.value).startswith(f"{path}:{where}: ")
     assert words in str(caught.value)
 
@@ -162,7 +162,7 @@ def test_a_broken_line_is_said_with_file_and_line(tmp_path: Path, lines: list[st
 def test_what_is_no_recording_is_refused_at_once(tmp_path: Path) -> None:
     def refused(path: Path) -> str:
         with pytest.raises(RecordingError) as caught:
-            open_recordings([path])
+            messages_in([path])
         assert str(path) in str(caught.value)
         return str(caught.value)
 
@@ -194,13 +194,13 @@ def test_a_cut_sqlite_bag_is_an_error_that_names_it(tmp_path: Path, share: float
     for file in path.glob("*.db3"):
         damage(file, share)
     with pytest.raises(RecordingError, match=rf"{tmp_path}.*sqlite3 {path}/drive.db3 \.recover"):
-        list(open_recordings([path]))
+        list(messages_in([path]))
 
 
 def read_up_to_a_cut(path: Path, written: list[Message]) -> int:
     """How many messages are read: those written first, in the order of their times."""
     told: list[Cut] = []
-    read = list(open_recordings([path], on_cut=told.append))
+    read = list(messages_in([path], on_cut=told.append))
     assert read == sorted(written[: len(read)], key=lambda message: message.time)
     assert told or len(read) == len(written)  # where only the index is missing, nothing is
     for cut in told:
@@ -243,7 +243,7 @@ def test_an_mcap_file_without_an_index_that_was_closed_is_whole(tmp_path: Path) 
     none = IndexType.NONE
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES, chunk_size=500, index_types=none, use_statistics=False)
     told: list[Cut] = []
-    assert list(open_recordings([path], on_cut=told.append)) == MESSAGES
+    assert list(messages_in([path], on_cut=told.append)) == MESSAGES
     assert told == []
 
 
@@ -254,7 +254,7 @@ def test_an_mcap_file_that_is_damaged_inside_is_an_error_with_the_remedy(tmp_pat
         whole[place] ^= 0xFF
     path.write_bytes(whole)
     with pytest.raises(RecordingError, match=r"drive\.mcap: the MCAP file is damaged .*mcap recover"):
-        list(open_recordings([path]))
+        list(messages_in([path]))
 
 
 @pytest.mark.parametrize("share", SHARES[1:-1])
@@ -263,11 +263,11 @@ def test_a_rosbag2_whose_recorder_was_killed_is_read_up_to_there(tmp_path: Path,
     (file,) = path.glob("*.mcap")
     damage(file, share)
     told: list[Cut] = []
-    read = list(open_recordings([path], on_cut=told.append))
+    read = list(messages_in([path], on_cut=told.append))
     assert [(cut.path, cut.messages) for cut in told] == [(file, len(read))]
     (path / "metadata.yaml").unlink()  # it is written when the recorder ends
     assert recordings_of([path]) == [(file,)]
-    assert list(open_recordings([file])) == read
+    assert list(messages_in([file])) == read
 
 
 def test_a_last_line_that_was_not_written_to_its_end_is_a_cut(tmp_path: Path) -> None:
@@ -276,7 +276,7 @@ def test_a_last_line_that_was_not_written_to_its_end_is_a_cut(tmp_path: Path) ->
     for size in range(len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])
         told: list[Cut] = []
-        read = list(open_recordings([path], on_cut=told.append))
+        read = list(messages_in([path], on_cut=told.append))
         lines, rest = whole[:size].count(b"\n"), whole[:size].rpartition(b"\n")[2]
         complete = rest.endswith(b"}") or not rest
         assert [message.time for message in read] == list(range(lines + (bool(rest) and complete)))
@@ -293,7 +293,7 @@ def test_messages_go_to_every_stream_of_their_key_at_their_time_which_never_goes
     assert router.route("car1/pose") == ("pose", "all")
     assert router.route("odom") == ()
     assert router.unrouted == ["odom"]
-    arrivals = list(router.arrivals([MESSAGES[1], MESSAGES[1], MESSAGES[-1], MESSAGES[2]]))
+    arrivals = list(arrivals_of(router, [MESSAGES[1], MESSAGES[1], MESSAGES[-1], MESSAGES[2]]))
     assert [(arrival.received, arrival.stream) for arrival in arrivals] == [
         (100, "pose"),
         (100, "all"),
@@ -316,6 +316,6 @@ def test_a_message_of_another_type_than_its_streams_is_an_error_that_names_both(
     declared: Stream, words: list[str]
 ) -> None:
     with pytest.raises(RecordingError) as caught:
-        list(Router([declared]).arrivals(MESSAGES))
+        list(arrivals_of(Router([declared]), MESSAGES))
     for word in words:
         assert word in str(caught.value)

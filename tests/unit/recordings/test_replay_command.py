@@ -131,7 +131,7 @@ def test_what_a_client_can_never_have_is_not_counted_as_unknown(desk: Desk) -> N
 
 
 def stamped(stream: str, delay: float, count: int = 40, **fields: Any) -> list[dict[str, Any]]:
-    """A sample every tenth of a second, stamped so many seconds before it was recorded."""
+    """A sample every tenth of a second, recorded `delay` seconds after its stamp."""
     return [
         {
             "t": at(time / 10),

@@ -1,0 +1,22 @@
+package dev.wayside.peer;
+
+/** Asks who is near a client. Esper wants a public class with getters. */
+public final class Look {
+    private final Place place;
+
+    public Look(Place place) {
+        this.place = place;
+    }
+
+    public int getClient() {
+        return place.getClient();
+    }
+
+    public double getX() {
+        return place.getX();
+    }
+
+    public double getY() {
+        return place.getY();
+    }
+}

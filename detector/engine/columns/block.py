@@ -1,0 +1,133 @@
+"""A block: some ticks and some clients, and what rules see at each point of them.
+
+A point is a tick and a client; in all arrays of a block, clients come first and ticks change fastest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from detector.engine.buffering.clients import Clients
+from detector.engine.buffering.possible import Possible
+from detector.engine.columns.table import Integers, Truths
+from detector.engine.columns.tables import Tables
+from detector.engine.counters import RuleCounters
+from detector.engine.episodes.subjects import Subject
+from detector.engine.scoping.positions import Positions
+from wayside.expressions import UNKNOWN
+from wayside.expressions.columns.values import Column, value_at
+from wayside.rules import CompiledElement, CompiledRule
+
+_SUBJECTS = 100_000
+"""So many subjects of a rule are remembered."""
+
+
+class Context(NamedTuple):
+    """What rules look at."""
+
+    tables: Tables
+    clients: Clients
+    stale_after: Mapping[str, int | None]
+    possible: Possible
+    positions: Positions
+    exact: bool
+    """See `timeline.ORDER`; False is order 1."""
+
+
+class Track:
+    """A rule for one element of its `each`."""
+
+    def __init__(self, rule: CompiledRule, element: CompiledElement, counters: RuleCounters, place: Mapping[str, str]):
+        """`place` has, by condition, what errors say that it reads."""
+        self.rule = rule
+        self.element = element
+        self.counters = counters
+        self.place = place
+        self.signals: dict[str, int] = {}
+        """Places of the rule's signals in the group, by name, in the order of the rule."""
+        self._subjects: dict[str, Subject] = {}
+
+    def subject(self, client: str) -> Subject:
+        """The subject that the client is."""
+        subject = self._subjects.get(client)
+        if subject is None:
+            if len(self._subjects) > _SUBJECTS:
+                self._subjects.clear()
+            subject = self._subjects[client] = Subject((client,), self.element.name)
+        return subject
+
+
+class Block:
+    """What the rules of a group see at some ticks, of some clients."""
+
+    def __init__(
+        self, context: Context, ticks: Sequence[int], clients: Sequence[str], numbers: Integers | None = None
+    ) -> None:
+        """`numbers` are the clients', where the caller knows them."""
+        self.ticks = ticks
+        self.times: Integers = np.array(ticks, np.int64)
+        self.clients = clients
+        if numbers is None:
+            numbers = np.array([context.tables.number(client) for client in clients], np.int64)
+        self.numbers: Integers = numbers
+        self.signals: list[Column] = []
+        self.fresh: dict[str, Truths] = {}
+        """By stream: whether it is, at each point; shape (clients, ticks)."""
+        self.latest: dict[str, Integers] = {}
+        """By stream: the time of the newest sample, or NEVER."""
+        self.present: Truths | None = None
+        """Which points there are; None: all. Shape (clients, ticks)."""
+        self.looked: Truths | None = None
+        """Which rule looks at which client; None: all at all. Shape (tracks, clients)."""
+        self._context = context
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Clients and ticks."""
+        return len(self.clients), len(self.ticks)
+
+    def points(self, row: int) -> Truths | None:
+        """The points that a track looks at, flat; None: all."""
+        if self.looked is None:
+            return None if self.present is None else self.present.ravel()
+        looked = np.repeat(self.looked[row], len(self.ticks))
+        return looked if self.present is None else looked & self.present.ravel()
+
+    def count(self, row: int, points: Truths) -> int:
+        """How many of the points a track looks at."""
+        own = self.points(row)
+        return int(points.sum()) if own is None else int((points & own).sum())
+
+    def variables(self, track: Track, point: int) -> dict[str, Any]:
+        """What expressions see at a point, as in `scopes`."""
+        return {**self.view(track, point), **track.element.variables}
+
+    def view(self, track: Track, point: int) -> dict[str, Any]:
+        """The same without the element."""
+        client = self.clients[point // len(self.ticks)]
+        return {
+            "client": client,
+            "labels": self._context.clients.labels(client),
+            "streams": [stream for stream, fresh in self.fresh.items() if fresh.flat[point]],
+            "parameters": track.rule.parameters.of(client),
+            **self.values(track, point),
+        }
+
+    def values(self, track: Track, point: int) -> dict[str, Any]:
+        """The rule's signals at a point, those that are known."""
+        found: dict[str, Any] = {}
+        for name, at in track.signals.items():
+            column = self.signals[at]
+            if column.tags is None:
+                found[name] = float(column.values[point])
+            elif (value := value_at(column, point, self._context.tables.texts)) is not UNKNOWN:
+                found[name] = value
+        return found
+
+    def last(self, points: Integers) -> int:
+        """Of some points the one that comes last: by tick, then by client."""
+        ticks = points % len(self.ticks)
+        return int(points[np.flatnonzero(ticks == ticks.max())[-1]])

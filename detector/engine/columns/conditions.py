@@ -1,0 +1,299 @@
+"""The conditions of rules that are evaluated together, as one program over the points of a block.
+
+What the columns cannot take or decide is left to CEL, once for each run of ticks in which its inputs do not change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.reading import constant
+from detector.engine.columns.table import Truths
+from detector.engine.episodes.episodes import FALSE, OUTSIDE, TRUE, UNSURE, UNTIL, UNTIL_UNSURE
+from wayside.expressions import Expression, Path, Reason
+from wayside.expressions.columns.graph import Graph
+from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.program import Program
+from wayside.expressions.columns.values import MISSING, Column, Tag, column_of
+from wayside.rules import ClientSubject
+
+Codes = NDArray[np.uint8]
+
+_OF_CLIENTS = frozenset({"client", "labels", "parameters"})
+"""Variables that differ from client to client."""
+
+_REMEMBERED = 100_000
+"""Of so many clients the last result of CEL is remembered."""
+
+
+class Condition(NamedTuple):
+    """One of a rule's conditions, for one element."""
+
+    field: str
+    expression: Expression
+    node: int | None
+    """Its truth in the program; None: it is CEL's."""
+    signals: tuple[int, ...]
+    """The signals that it reads, by their places in the group."""
+    streams: bool
+    """Whether it reads which streams are fresh."""
+    by_client: bool
+    """Whether it reads what differs from client to client."""
+
+
+class Conditions:
+    """What the rules of a group say at the points of a block."""
+
+    def __init__(self, context: Context, tracks: Sequence[Track]) -> None:
+        """The tracks know the places of their signals."""
+        self._context = context
+        self._tracks = tracks
+        self._graph = Graph()
+        self._of: list[dict[str, Condition]] = [self._conditions(track) for track in tracks]
+        """By track and field."""
+        roots = [each.node for conditions in self._of for each in conditions.values() if each.node is not None]
+        self._program = Program(self._graph, roots, context.tables.texts)
+        self._cache: dict[tuple[int, str], dict[str, tuple[Hashable, int, tuple[Reason, str] | None]]] = {}
+
+    def _conditions(self, track: Track) -> dict[str, Condition]:
+        rule, found = track.rule, dict[str, Condition]()
+        where = rule.subject.where if isinstance(rule.subject, ClientSubject) else None
+        for field, expression in (("where", where), ("when", rule.when), ("until", rule.until)):
+            if expression is None:
+                continue
+            node = self._graph.add(expression, lambda path: self._leaf(track, path))
+            found[field] = Condition(
+                field,
+                expression,
+                None if node is None else self._graph.truth(node),
+                tuple(at for name, at in track.signals.items() if name in expression.names),
+                "streams" in expression.names,
+                not _OF_CLIENTS.isdisjoint(expression.names),
+            )
+        return found
+
+    def _leaf(self, track: Track, path: Path) -> Hashable | Constant | None:
+        name = str(path[0])
+        if name in track.signals:
+            return ("signal", track.signals[name]) if len(path) == 1 else None
+        if name in track.element.variables:
+            return constant(track.element.variables, path)
+        if name == "client":
+            return ("client",)
+        if name == "parameters":
+            if not track.rule.parameters.overridden:
+                return constant({"parameters": track.rule.parameters.own}, path)
+            return ("parameters", track.rule.name, *path[1:])
+        if name == "labels":
+            return path if len(path) == 2 else None
+        return None
+
+    def observed(self, block: Block) -> Codes:
+        """The rules' observations (see SubjectState.run), shape (tracks, clients, ticks). Counts what is unknown."""
+        shape = (len(self._tracks), len(block.clients) * len(block.ticks))
+        true: dict[str, Truths] = {}
+        false: dict[str, Truths] = {}
+        values, tags = self._leaves(block)
+        results = self._program.run(values, tags)
+        strange = tags is not None and bool((tags > Tag.NUMBER).any())
+        for field in ("where", "when", "until"):
+            chosen = [(row, self._of[row][field]) for row, track in enumerate(self._tracks) if field in self._of[row]]
+            if not chosen:
+                continue
+            true[field], false[field] = np.zeros(shape, bool), np.zeros(shape, bool)
+            ours = [(row, each.node) for row, each in chosen if each.node is not None]
+            if ours:
+                rows = [row for row, _ in ours]
+                true[field][rows], false[field][rows] = results.truths([node for _, node in ours])
+            for row, condition in chosen:
+                foreign: Truths | None = None
+                if condition.node is None:
+                    self._ask_cel(block, row, condition, true[field][row], false[field][row])
+                    continue
+                if strange and (foreign := results.foreign(condition.node)) is not None and foreign.any():
+                    own = block.points(row)
+                    foreign = foreign if own is None else foreign & own
+                    for point in np.flatnonzero(foreign).tolist():
+                        self._ask_point(block, row, condition, point, true[field][row], false[field][row])
+            unknown = ~(true[field] | false[field])
+            if unknown.any():
+                for row, condition in chosen:
+                    if condition.node is not None and unknown[row].any():
+                        self._note_unknown(block, row, condition, unknown[row], tags)
+        return self._coded(block, true, false, shape)
+
+    def _coded(
+        self, block: Block, true: Mapping[str, Truths], false: Mapping[str, Truths], shape: tuple[int, int]
+    ) -> Codes:
+        when_true, when_false = true["when"], false["when"]
+        if "until" in true:
+            has = np.array(["until" in each for each in self._of])[:, None]
+            until_true = np.where(has, true["until"], when_false)
+            until_false = np.where(has, false["until"], when_true)
+        else:
+            until_true, until_false = when_false, when_true
+        may, not_ = when_true & until_false, when_false | until_true
+        outside: Truths | None = None
+        if "where" in true:
+            has = np.array(["where" in each for each in self._of])[:, None]
+            may = may & (true["where"] | ~has)
+            outside = false["where"]
+            not_ = not_ | outside
+        codes = np.where(not_, np.uint8(FALSE), np.where(may, np.uint8(TRUE), np.uint8(UNSURE)))
+        codes |= np.where(until_true, np.uint8(UNTIL), np.where(until_false, np.uint8(0), np.uint8(UNTIL_UNSURE)))
+        if outside is not None:
+            codes[outside] = FALSE | OUTSIDE
+        codes = codes.reshape(shape[0], len(block.clients), len(block.ticks))
+        if block.present is not None:
+            codes[:, ~block.present] = FALSE
+        return codes
+
+    def _leaves(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+        """What the program's leaves are at the points."""
+        columns = [self._leaf_column(block, name) for name in self._program.leaves]
+        points = len(block.clients) * len(block.ticks)
+        values = np.empty((len(columns), points))
+        for at, column in enumerate(columns):
+            values[at] = column.values
+        if all(column.tags is None for column in columns):
+            return values, None
+        tags = np.full(values.shape, Tag.NUMBER, np.uint8)
+        for at, column in enumerate(columns):
+            if column.tags is not None:
+                tags[at] = column.tags
+        return values, tags
+
+    def _leaf_column(self, block: Block, name: Any) -> Column:
+        if name[0] == "signal":
+            column: Column = block.signals[name[1]]
+            return column
+        texts = self._context.tables.texts
+        if name[0] == "client":
+            codes = np.array([texts.code(client) for client in block.clients], float)
+            column = Column(codes, np.full(len(codes), Tag.TEXT, np.uint8), None)
+        else:
+            column = column_of([*self._of_clients(block, name)], texts)
+        times = len(block.ticks)
+        return Column(
+            np.repeat(column.values, times),
+            None if column.tags is None else np.repeat(column.tags, times),
+            None if column.others is None else np.repeat(column.others, times),
+        )
+
+    def _of_clients(self, block: Block, name: tuple[Any, ...]) -> Iterator[Any]:
+        """A label or a parameter of each client."""
+        rule = next((track.rule for track in self._tracks if track.rule.name == name[1]), None)
+        for client in block.clients:
+            if name[0] == "labels":
+                yield self._context.clients.labels(client).get(name[1], MISSING)
+                continue
+            assert rule is not None  # noqa: S101  the leaf is of one of the rules
+            value: Any = rule.parameters.of(client)
+            for step in name[2:]:
+                value = value.get(step, MISSING) if isinstance(value, Mapping) else MISSING
+            yield value
+
+    # CEL
+
+    def _ask_cel(self, block: Block, row: int, condition: Condition, true: Truths, false: Truths) -> None:
+        """Evaluate a condition by CEL, at the points where anything changes that it reads."""
+        count = len(block.ticks)
+        changed = np.zeros(block.shape, bool)
+        changed[:, 0] = True
+        for at in condition.signals:
+            column = block.signals[at]
+            values = column.values.reshape(block.shape).view(np.int64)  # so that the sign of zero counts
+            changed[:, 1:] |= values[:, 1:] != values[:, :-1]
+            if column.tags is not None:
+                tags = column.tags.reshape(block.shape)
+                changed[:, 1:] |= (tags[:, 1:] != tags[:, :-1]) | (tags[:, 1:] == Tag.OTHER)
+        if condition.streams:
+            for fresh in block.fresh.values():
+                changed[:, 1:] |= fresh[:, 1:] != fresh[:, :-1]
+        if block.present is not None:
+            changed &= block.present
+            changed[:, 1:] |= block.present[:, 1:] & ~block.present[:, :-1]
+        if block.looked is not None:
+            changed &= block.looked[row][:, None]
+        points = np.flatnonzero(changed).tolist()
+        if not points:
+            return
+        for point, following in zip(points, [*points[1:], block.shape[0] * count], strict=True):
+            end = min(following, (point // count + 1) * count)
+            self._ask_point(block, row, condition, point, true, false, end - point)
+
+    def _ask_point(
+        self, block: Block, row: int, condition: Condition, point: int, true: Truths, false: Truths, times: int = 1
+    ) -> None:
+        """Evaluate a condition by CEL at a point, and take the result for so many points from there on."""
+        track, client = self._tracks[row], block.clients[point // len(block.ticks)]
+        cache = self._cache.setdefault((row, condition.field), {})
+        key = self._inputs(block, condition, point)
+        known = cache.get(client)
+        if key is None or known is None or known[0] != key:
+            value, note = condition.expression.explained(block.variables(track, point))
+            known = (key, TRUE if value is True else FALSE if value is False else UNSURE, note)
+            if len(cache) > _REMEMBERED:
+                cache.clear()
+            cache[client] = known
+        _, result, note = known
+        true[point : point + times] = result == TRUE
+        false[point : point + times] = result == FALSE
+        if note is not None:
+            self._note(block, row, condition, point, note, times)
+
+    def _inputs(self, block: Block, condition: Condition, point: int) -> Hashable | None:
+        """What tells whether a condition may have changed; None: it may always have."""
+        inputs: list[Hashable] = []
+        for at in condition.signals:
+            column = block.signals[at]
+            tag = int(Tag.NUMBER if column.tags is None else column.tags[point])
+            if tag == Tag.OTHER:
+                return None
+            value = float(column.values[point])
+            inputs.append((tag, value, math.copysign(1, value)))
+        if condition.streams:
+            inputs.append(tuple(bool(fresh.flat[point]) for fresh in block.fresh.values()))
+        return tuple(inputs)
+
+    def _note_unknown(
+        self, block: Block, row: int, condition: Condition, unknown: Truths, tags: NDArray[np.uint8] | None
+    ) -> None:
+        """Count a condition's unknown results. Points that look alike have one reason, which CEL gives for the last."""
+        own = block.points(row)
+        points = np.flatnonzero(unknown if own is None else unknown & own)
+        if not len(points):
+            return
+        alike = np.zeros(len(points), np.int64)
+        for at in condition.signals:
+            column = block.signals[at]
+            alike = alike * 8 + (Tag.NUMBER if column.tags is None else column.tags[points].astype(np.int64))
+        if condition.by_client or self._context.possible.limited:
+            alike = alike * len(block.clients) + points // len(block.ticks)
+        kinds, inverse, counts = np.unique(alike, return_inverse=True, return_counts=True)
+        for kind in range(len(kinds)):
+            point = block.last(points[inverse == kind])
+            _, note = condition.expression.explained(block.variables(self._tracks[row], point))
+            if note is not None:
+                self._note(block, row, condition, point, note, int(counts[kind]))
+
+    def _note(
+        self, block: Block, row: int, condition: Condition, point: int, note: tuple[Reason, str], times: int
+    ) -> None:
+        track, client = self._tracks[row], block.clients[point // len(block.ticks)]
+        reason, message = note
+        possible = self._context.possible
+        if reason is Reason.ABSENT and possible.limited:
+            never = {signal.name for signal in track.rule.signals if not possible(signal.stream, client)}
+            if any(path[0] in never for path in condition.expression.paths):
+                return
+        name = client if condition.field == "where" else track.subject(client).text
+        track.counters.note(
+            reason, message, f"{condition.field} of {name}{track.place.get(condition.field, '')}", times
+        )

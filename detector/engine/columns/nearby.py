@@ -1,0 +1,101 @@
+"""Which pairs of clients are within reach of each other, in columns: see `detector.engine.scoping.nearness`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from detector.engine.columns.table import Integers, Truths
+from detector.engine.scoping.nearness import FEW, ROOM, Search, near_pairs, reach
+from detector.engine.scoping.positions import Point
+from wayside.expressions.columns.values import Doubles
+from wayside.rules import PairSubject
+
+
+class Nearby(NamedTuple):
+    """Pairs, in order of the names of their first and second clients."""
+
+    first: Integers
+    second: Integers
+    """The clients' indices."""
+    distance: Doubles
+    left_out: int
+    """How many pairs within reach were left out."""
+
+
+class Crowd(NamedTuple):
+    """Clients, in order of their names."""
+
+    names: Sequence[str]
+    points: Callable[[Integers], Doubles]
+    """The points of clients whose place is known: see `Search`."""
+    distances: Callable[[Integers, Integers], Doubles]
+    first: Truths
+    """Who can be the first of a pair; its place is known."""
+    second: Truths
+
+
+def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
+    """The pairs within reach; if there are more than the subject takes, the nearest, then by names."""
+    first, second = np.flatnonzero(crowd.first), np.flatnonzero(crowd.second)
+    if len(first) * len(second) <= FEW:
+        i, j = np.repeat(first, len(second)), np.tile(second, len(first))
+        found = None
+    else:
+        # Not at the top: it takes half a second to import, which a detector of few clients does not owe.
+        from scipy.spatial import cKDTree  # noqa: PLC0415
+
+        radius, same = reach(subject.within), np.array_equal(first, second)
+        one = cKDTree(crowd.points(first))
+        other = one if same else cKDTree(crowd.points(second))
+        themselves = int((crowd.first & crowd.second).sum())
+        found = (int(one.count_neighbors(other, radius)) - themselves) // (1 if subject.ordered else 2)
+        if found > subject.maximum * ROOM:
+            return _crowded(crowd, subject, first, second)
+        if not subject.ordered:
+            pairs = one.query_pairs(radius, output_type="ndarray")
+            i, j = first[pairs[:, 0]], first[pairs[:, 1]]
+        elif same:
+            pairs = one.query_pairs(radius, output_type="ndarray")
+            i, j = first[np.concatenate((pairs[:, 0], pairs[:, 1]))], first[np.concatenate((pairs[:, 1], pairs[:, 0]))]
+        else:
+            matrix = one.sparse_distance_matrix(other, radius, output_type="ndarray")
+            i, j = first[matrix["i"]], second[matrix["j"]]
+    distance = crowd.distances(i, j)
+    near = (distance <= subject.within) & (i != j if subject.ordered else i < j)
+    i, j, distance = i[near], j[near], distance[near]
+    found = len(i) if found is None else found
+    if len(i) > subject.maximum:
+        nearest = np.lexsort((j, i, distance))[: subject.maximum]
+        i, j, distance = i[nearest], j[nearest], distance[nearest]
+    return _in_order(i, j, distance, found - len(i))
+
+
+def _crowded(crowd: Crowd, subject: PairSubject, first: Integers, second: Integers) -> Nearby:
+    """Far more pairs than the subject takes: they are not made."""
+    names = crowd.names
+    index = {names[at]: at for at in np.union1d(first, second).tolist()}
+
+    def between(a: str, b: str) -> float:
+        return float(crowd.distances(np.array([index[a]]), np.array([index[b]]))[0])
+
+    everybody = np.array([*index.values()], np.int64)
+    points = {name: _point(*each) for name, each in zip(index, crowd.points(everybody).tolist(), strict=True)}
+    roles = ([names[at] for at in first.tolist()], [names[at] for at in second.tolist()])
+    found = near_pairs(
+        Search(points, between, *(roles if subject.ordered else (None, None))), subject.within, subject.maximum
+    )
+    i = np.array([index[a] for a, _ in found.pairs], np.int64)
+    j = np.array([index[b] for _, b in found.pairs], np.int64)
+    return _in_order(i, j, crowd.distances(i, j), found.left_out)
+
+
+def _point(x: float, y: float, z: float = 0.0) -> Point:
+    return (x, y, z)
+
+
+def _in_order(i: Integers, j: Integers, distance: Doubles, left_out: int) -> Nearby:
+    order = np.lexsort((j, i))
+    return Nearby(i[order], j[order], distance[order], left_out)

@@ -1,0 +1,339 @@
+"""A rule about pairs at one tick, in columns: from places to an observation of each pair that matters."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.conditions import Codes
+from detector.engine.columns.formulas import Formulas, Rows, Verdict
+from detector.engine.columns.group import fit_signals
+from detector.engine.columns.nearby import Crowd, Nearby, nearby
+from detector.engine.columns.places import Places, Whereabouts
+from detector.engine.columns.reading import constant
+from detector.engine.columns.signals import Signals
+from detector.engine.columns.table import Integers, Truths
+from detector.engine.columns.tables import Tables
+from detector.engine.episodes.episodes import FALSE, OUTSIDE, TRUE, UNSURE, UNTIL, UNTIL_UNSURE
+from detector.engine.episodes.subjects import Subject
+from detector.engine.scoping.positions import described
+from detector.engine.scoping.scopes import CLOSING_NS
+from wayside.expressions import Path, Reason
+from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.values import MISSING, Column, Doubles, Tag, column_of
+from wayside.rules import CompiledRule, PairSubject
+
+_ROLES = ("a", "b")
+
+
+def fits_pairs(rule: CompiledRule, context: Context) -> bool:
+    """Whether a rule about pairs can be evaluated in columns."""
+    return (
+        isinstance(rule.subject, PairSubject)
+        and context.exact
+        and len(rule.elements) == 1
+        and _takes(rule.subject.position.stream, context.tables)
+        and fit_signals(rule, context.tables)
+    )
+
+
+def _takes(stream: str, tables: Tables) -> bool:
+    return any(each.name == stream and tables.takes(each) for each in tables.streams)
+
+
+@dataclass
+class Sight:
+    """What a rule sees at one tick: the pairs that matter, in order of their names, and what it says of them."""
+
+    block: Block
+    """The clients, in order of their names, at the tick."""
+    places: Places
+    seen: Block
+    """The clients whose signals are known, and where they are in it."""
+    at: Integers
+    first: Integers
+    second: Integers
+    """The pairs' clients, by their indices in the block."""
+    distance: Doubles
+    placed: Truths
+    closing: Doubles | None = None
+    closing_known: Truths | None = None
+    codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint8))
+    """Of each pair its observation (see SubjectState.run)."""
+
+
+class PairColumns:
+    """Evaluates one rule about pairs."""
+
+    def __init__(self, track: Track, context: Context) -> None:
+        """The rule fits (see `fits_pairs`)."""
+        rule = track.rule
+        assert isinstance(rule.subject, PairSubject)  # noqa: S101  it fits
+        self._subject = rule.subject
+        self._track = track
+        self._context = context
+        self._signals = Signals(context, [track], shared=False)
+        if _reads_streams(rule):
+            self._signals.watch_all_streams()
+        self._reads_streams = bool(rule.signals) or _reads_streams(rule)
+        self._where_abouts = Whereabouts(rule.subject.position, context, track.counters, self._signals.ages)
+        texts = context.tables.texts
+        self._roles = {
+            role: Formulas({"where": where}, self._leaf_of_client, texts)
+            for role, where in zip(_ROLES, (rule.subject.a, rule.subject.b), strict=True)
+        }
+        conditions = {"where": rule.subject.where, "when": rule.when, "until": rule.until}
+        self._conditions = Formulas(conditions, self._leaf, texts)
+
+    def evaluate(self, block: Block, floor: int | None, more: tuple[Integers, Integers]) -> Sight:
+        """Look at the pairs within reach and at `more`, at the block's only tick; its clients are in order.
+
+        `more` are indices of clients. No look goes back to `floor` or beyond. Counts what is unknown or fails.
+        """
+        clients = block.clients
+        places, newest = self._where_abouts.now(block)
+        seen, at = block, np.arange(len(clients))
+        roles: Mapping[str, Verdict] = {}
+        if any(self._roles.values()):
+            self._signals.look(block, floor)
+            roles = {role: self._role(role, block) for role in _ROLES}
+        near = self._near(block, places, roles)
+        self._track.counters.crowded_pairs += near.left_out
+        count = len(clients)
+        keys = near.first * count + near.second
+        added = np.setdiff1d(more[0] * count + more[1], keys)
+        order = np.argsort(np.concatenate((keys, added)), kind="stable")
+        is_near = (order < len(keys)).astype(bool)
+        first, second = np.divmod(np.concatenate((keys, added))[order], count)
+        if not roles and self._reads_streams:
+            looked = np.flatnonzero(np.bincount(np.concatenate((first, second)), minlength=count))
+            at = np.full(count, -1)
+            at[looked] = np.arange(len(looked))
+            names = [clients[each] for each in looked.tolist()]
+            seen = Block(self._context, block.ticks, names, block.numbers[looked])
+            self._signals.look(seen, floor)
+        distance = np.concatenate((near.distance, self._distances(places, added // count, added % count)))[order]
+        sight = Sight(block, places, seen, at, first, second, distance, places.known[first] & places.known[second])
+        if self._subject.closing_speed:
+            self._measure_closing(sight, newest, floor)
+        self._track.counters.evaluations += len(first)
+        sight.codes = self._observed(sight, is_near, roles)
+        return sight
+
+    def variables(self, sight: Sight, row: int) -> dict[str, Any]:
+        """What expressions see of a pair, as in `scopes`."""
+        found: dict[str, Any] = {
+            "a": self._member(sight, int(sight.first[row])),
+            "b": self._member(sight, int(sight.second[row])),
+            "parameters": self._track.rule.parameters.own,
+            **self._track.element.variables,
+        }
+        if sight.placed[row]:
+            found["distance"] = float(sight.distance[row])
+        if sight.closing is not None and sight.closing_known is not None and sight.closing_known[row]:
+            found["closingSpeed"] = float(sight.closing[row])
+        return found
+
+    def _member(self, sight: Sight, index: int) -> dict[str, Any]:
+        view = sight.seen.view(self._track, int(sight.at[index]))
+        if sight.places.known[index]:
+            view["position"] = described(self._subject.position, sight.places.place(index))
+        return view
+
+    def _distances(self, places: Places, one: Integers, other: Integers) -> Doubles:
+        return self._where_abouts.distances(places.of(one), places.of(other))
+
+    def _near(self, block: Block, places: Places, roles: Mapping[str, Verdict]) -> Nearby:
+        possible = [places.known & ~roles[role].false if role in roles else places.known for role in _ROLES]
+        crowd = Crowd(
+            block.clients,
+            lambda at: self._where_abouts.points(places, at),
+            lambda one, other: self._distances(places, one, other),
+            *possible,
+        )
+        return nearby(crowd, self._subject)
+
+    def _measure_closing(self, sight: Sight, newest: Integers, floor: int | None) -> None:
+        """By how much distances shrank in the last second for which both have sent places: see `Views`."""
+        at = np.flatnonzero(sight.placed)
+        one, other = sight.first[at], sight.second[at]
+        now, abouts = int(sight.block.times[0]), self._where_abouts
+        if self._context.positions.limit(self._subject.position) is None:
+            end = np.full(len(at), now)
+        else:
+            end = np.minimum(abouts.times(newest[one]), abouts.times(newest[other]))
+        before = end != now
+        times = np.concatenate((end[before], end[before], end - CLOSING_NS, end - CLOSING_NS))
+        whose = np.concatenate((one[before], other[before], one, other))
+        places = abouts.then(sight.block, newest, whose, times, floor)
+        parts = np.cumsum([before.sum(), before.sum(), len(at)])
+        a_end, b_end, a_begin, b_begin = (places.of(each) for each in np.split(np.arange(len(times)), parts))
+        after, known = sight.distance[at].copy(), a_begin.known & b_begin.known
+        after[before] = abouts.distances(a_end, b_end)
+        known[before] &= a_end.known & b_end.known
+        sight.closing, sight.closing_known = np.zeros(len(sight.placed)), np.zeros(len(sight.placed), bool)
+        sight.closing[at] = (abouts.distances(a_begin, b_begin) - after) / (CLOSING_NS / 1e9)
+        sight.closing_known[at] = known
+
+    # Conditions
+
+    def _role(self, role: str, block: Block) -> Verdict:
+        """Which clients can have the role."""
+
+        def note(_: str, row: int, reason: Reason, message: str, times: int) -> None:
+            client = block.clients[row]
+            condition = getattr(self._subject, role)
+            if reason is Reason.ERROR or not self._never(client) & {str(path[0]) for path in condition.paths}:
+                self._track.counters.note(reason, message, f"where of a role, of {client}", times)
+
+        rows = Rows(
+            len(block.clients),
+            lambda leaf: self._column(block, leaf),
+            lambda row: {**block.view(self._track, row), **self._track.element.variables},
+            note,
+            not self._context.possible.limited,
+        )
+        everybody = Verdict(np.ones(rows.size, bool), np.zeros(rows.size, bool))
+        return self._roles[role].evaluate(rows).get("where", everybody)
+
+    def _observed(self, sight: Sight, near: Truths, roles: Mapping[str, Verdict]) -> Codes:
+        conditions = {"where": self._subject.where, "when": self._track.rule.when, "until": self._track.rule.until}
+
+        def note(field: str, row: int, reason: Reason, message: str, times: int) -> None:
+            a, b = self._names(sight, row)
+            if reason is Reason.ABSENT and self._context.possible.limited:
+                never = {("a", name) for name in self._never(a)} | {("b", name) for name in self._never(b)}
+                condition = conditions[field]
+                if condition is not None and any(path[:2] in never for path in condition.paths):
+                    return
+            text = Subject((a, b), self._track.element.name).text
+            place = f"{field} of {text}{self._track.place.get(field, '')}"
+            self._track.counters.note(reason, message, place, times)
+
+        rows = Rows(
+            len(sight.first),
+            lambda leaf: self._pair_column(sight, leaf),
+            lambda row: self.variables(sight, row),
+            note,
+            not self._context.possible.limited,
+        )
+        found = self._conditions.evaluate(rows)
+        when = found["when"]
+        until = found.get("until", Verdict(when.false, when.true))
+        inside, outside = np.ones(rows.size, bool), np.zeros(rows.size, bool)
+        scope = [found["where"]] if "where" in found else []
+        for role, at in zip(_ROLES, (sight.first, sight.second), strict=True):
+            if role in roles:
+                scope.append(Verdict(roles[role].true[at], roles[role].false[at]))
+        for each in scope:
+            inside &= each.true
+            outside |= each.false
+        may = inside & near & when.true & until.false
+        never = outside | (sight.placed & ~near) | when.false | until.true
+        codes = np.where(never, np.uint8(FALSE), np.where(may, np.uint8(TRUE), np.uint8(UNSURE)))
+        codes |= np.where(until.true, np.uint8(UNTIL), np.where(until.false, np.uint8(0), np.uint8(UNTIL_UNSURE)))
+        codes[outside] = FALSE | OUTSIDE
+        return codes
+
+    def _names(self, sight: Sight, row: int) -> tuple[str, str]:
+        return sight.block.clients[int(sight.first[row])], sight.block.clients[int(sight.second[row])]
+
+    def _never(self, client: str) -> set[str]:
+        """The signals that the client can never have."""
+        possible = self._context.possible
+        return {signal.name for signal in self._track.rule.signals if not possible(signal.stream, client)}
+
+    # Leaves
+
+    def _leaf(self, path: Path) -> Hashable | Constant | None:
+        """The leaf of a path of a condition about pairs."""
+        name, below = str(path[0]), path[1:]
+        if name in self._track.element.variables:
+            return constant(self._track.element.variables, path)
+        if name in ("distance", "closingSpeed"):
+            return None if below else (name,)
+        if name == "parameters":
+            return constant({"parameters": self._track.rule.parameters.own}, path)
+        if name not in _ROLES or not below:
+            return None
+        if below[0] == "position":
+            return path if len(below) == 2 and below[1] in (*self._subject.position.axes, "z") else None
+        found = self._leaf_below(below)
+        return found if found is None or isinstance(found, Constant) else (name, found)
+
+    def _leaf_of_client(self, path: Path) -> Hashable | Constant | None:
+        """The leaf of a path of a role's condition."""
+        if str(path[0]) in self._track.element.variables:
+            return constant(self._track.element.variables, path)
+        return self._leaf_below(path)
+
+    def _leaf_below(self, path: Path) -> Hashable | Constant | None:
+        name = str(path[0])
+        if name in self._track.signals or name == "client":
+            return path if len(path) == 1 else None
+        if name == "labels":
+            return path if len(path) == 2 else None
+        if name == "parameters" and len(path) > 1:
+            if not self._track.rule.parameters.overridden:
+                return constant({"parameters": self._track.rule.parameters.own}, path)
+            return path
+        return None
+
+    def _pair_column(self, sight: Sight, leaf: Any) -> Column:
+        if leaf == ("distance",):
+            return _where(sight.distance, sight.placed)
+        if leaf == ("closingSpeed",):
+            assert sight.closing is not None  # noqa: S101  an expression asks for it
+            assert sight.closing_known is not None  # noqa: S101
+            return _where(sight.closing, sight.closing_known)
+        at = sight.first if leaf[0] == "a" else sight.second
+        if leaf[1] == "position":
+            places = sight.places.of(at)
+            axes = [*self._subject.position.axes]
+            values = places.axes[axes.index(leaf[2])] if leaf[2] in axes else np.zeros(len(at))
+            return Column(values, np.where(places.known, np.uint8(Tag.NUMBER), np.uint8(Tag.UNREACHABLE)))
+        whole, rows = self._column(sight.seen, leaf[1]), sight.at[at]
+        return Column(
+            whole.values[rows],
+            None if whole.tags is None else whole.tags[rows],
+            None if whole.others is None else whole.others[rows],
+        )
+
+    def _column(self, block: Block, leaf: Any) -> Column:
+        """What a leaf is for each client of a block."""
+        name = leaf[0]
+        if name in self._track.signals:
+            return block.signals[self._track.signals[name]]
+        values: list[Any] = []
+        for client in block.clients:
+            value: Any = {
+                "client": client,
+                "labels": self._context.clients.labels(client),
+                "parameters": self._track.rule.parameters.of(client),
+            }
+            for step in leaf:
+                value = value.get(step, MISSING) if isinstance(value, Mapping) else MISSING
+            values.append(value)
+        return column_of(values, self._context.tables.texts)
+
+
+def _where(values: Doubles, known: Truths) -> Column:
+    tags = None if known.all() else np.where(known, np.uint8(Tag.NUMBER), np.uint8(Tag.ABSENT))
+    return Column(values, tags)
+
+
+def _reads_streams(rule: CompiledRule) -> bool:
+    """Whether any expression of the rule may read which streams are fresh."""
+    subject = rule.subject
+    assert isinstance(subject, PairSubject)  # noqa: S101  the rule fits
+    roles = {path for each in (subject.a, subject.b) if each is not None for path in each.paths}
+    read = {path for each in (subject.where, rule.when, rule.until) if each is not None for path in each.paths}
+    read |= {path for deploy in rule.deploys for path in deploy.parameters.paths}
+    read |= {path for action in rule.actions for template in action.templates.values() for path in template.paths}
+    return any(path[0] == "streams" for path in roles) or any(
+        path[0] in _ROLES and (len(path) == 1 or path[1] == "streams") for path in read
+    )

@@ -1,0 +1,370 @@
+"""What rules read of each sample of a stream, as columns of its table: read when first needed, and once.
+
+The fields of all expressions are read together. What the columns of an expression cannot decide, and every expression
+that they cannot take, is left to CEL, row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.engine.buffering.messages import Messages
+from detector.engine.columns.table import Integers, StoredColumn, Table
+from detector.engine.counters import Counters
+from detector.engine.samples.sample import (
+    MISSING,
+    DecodeError,
+    Decoder,
+    FieldDecoder,
+    FieldReader,
+    Fields,
+    Sample,
+)
+from wayside.expressions import UNKNOWN, Expression, Path, Reason, Unknown, Value
+from wayside.expressions.columns.graph import Graph
+from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.program import Program
+from wayside.expressions.columns.values import Column, Tag, Texts, column_of
+from wayside.rules import CompiledElement
+from wayside.rules.parameters import Parameters
+
+_PAYLOAD = attrgetter("payload")
+
+_CONSTANTS = (bool, float, str)
+
+
+class Reading(NamedTuple):
+    """An expression over one sample, as a rule has it."""
+
+    expression: Expression
+    parameters: Parameters
+    element: CompiledElement | None
+
+
+class Failure(NamedTuple):
+    """Samples of a client for which an expression has no value."""
+
+    client: int
+    reason: Reason | None
+    """None: the samples cannot be read at all."""
+    message: str
+    samples: int
+
+
+class Used(NamedTuple):
+    """What a signal takes from a table: the columns of its `value` and its `where`; None: it has none."""
+
+    value: int | None
+    where: int | None
+
+
+class Reader:
+    """Fills the columns of one stream's table."""
+
+    def __init__(
+        self,
+        stream: str,
+        decoder: Decoder,
+        texts: Texts,
+        messages: Messages,
+        counters: Counters,
+        names: Sequence[str],
+    ) -> None:
+        """`names` has the clients' names by their numbers."""
+        self._stream = stream
+        self._decoder = decoder
+        self._texts = texts
+        self._messages = messages
+        self._counters = counters
+        self._names = names
+        self._graph = Graph()
+        self._index: dict[Hashable, int] = {}
+        self._readings: list[Reading] = []
+        """By column; of equal ones, the first."""
+        self._nodes: list[int | None] = []
+        self._used: dict[Used, None] = {}
+        self._paths: list[Path] = []
+        self._fields_at: dict[int, int] = {}
+        """Of the nodes that are a field as it is, its place among the paths."""
+        self._program: Program | None = None
+        self._fields: FieldReader | None = None
+
+    @property
+    def count(self) -> int:
+        """How many columns there are."""
+        return len(self._readings)
+
+    def use(self, value: Reading | None, where: Reading | None) -> Used:
+        """The columns that a signal needs."""
+        used = Used(None if value is None else self._column(value), None if where is None else self._column(where))
+        self._used.setdefault(used)
+        return used
+
+    def read(self, table: Table, rows: Integers) -> Mapping[Used, Sequence[Failure]]:
+        """Fill these rows of the table, which are not filled yet. Returns what has no value, for each use."""
+        if self._program is None:
+            self._prepare()
+        samples: list[Sample] = table.samples[rows].tolist()
+        table.filled[rows] = True
+        clients = table.clients_of(rows)
+        batch = _Batch(samples, clients, self._leaves(samples))
+        done: dict[int, tuple[Column, dict[int, tuple[Reason, str]]]] = {}
+        for at, node in enumerate(self._nodes):
+            done[at] = self._evaluated(batch, at, node)
+            _store(table.columns[at], rows, done[at][0])
+        return {used: found for used in self._used if (found := [*self._failures(batch, used, done)])}
+
+    def failures(self, table: Table, rows: Integers, used: Used) -> Iterator[Failure]:
+        """Which of these rows, all filled, have no value for a use, and why."""
+        for at in (used.where, used.value):
+            if at is None:
+                continue
+            tags, values = table.columns[at].tags[rows], table.columns[at].values[rows]
+            missing = rows[tags == Tag.ABSENT]
+            if len(missing):
+                batch = _Batch(table.samples[missing].tolist(), table.clients_of(missing), _Leaves([], None, {}, ()))
+                for row in range(len(missing)):
+                    why: tuple[Reason | None, str] = self._ask(at, batch, row)[1] or (None, "")
+                    yield Failure(int(batch.clients[row]), *why, 1)
+            if at == used.where:
+                rows = rows[(tags == Tag.BOOLEAN) & (values == 1)]
+
+    def _column(self, reading: Reading) -> int:
+        node = self._graph.add(reading.expression, lambda path: _leaf(path, reading))
+        key: Hashable = node
+        if node is None:
+            names = reading.expression.names
+            key = (
+                reading.expression.source,
+                id(reading.parameters) if "parameters" in names else None,
+                None
+                if reading.element is None or not names & reading.element.variables.keys()
+                else id(reading.element),
+            )
+        if key not in self._index:
+            self._index[key] = len(self._readings)
+            self._readings.append(reading)
+            self._nodes.append(node)
+            self._program = None
+        return self._index[key]
+
+    def _prepare(self) -> None:
+        nodes = [node for node in self._nodes if node is not None]
+        self._program = Program(self._graph, nodes, self._texts)
+        self._paths = [path for path in self._program.leaves if isinstance(path, tuple)]
+        self._fields_at = {self._graph.leaf(path): at for at, path in enumerate(self._paths)}
+        read = (
+            self._decoder.field_reader(self._paths) if isinstance(self._decoder, FieldDecoder) and self._paths else None
+        )
+        self._fields = read or whole(self._decoder, self._paths)
+
+    def _leaves(self, samples: Sequence[Sample]) -> _Leaves:
+        """The fields of the samples, and what the program makes of them."""
+        assert self._program is not None  # noqa: S101  the caller prepared it
+        assert self._fields is not None  # noqa: S101
+        if not self._paths:
+            return _Leaves([], None, {}, ())
+        fields = self._fields([*map(_PAYLOAD, samples)])
+        for at, error in fields.errors.items():
+            self._messages.unreadable(self._stream, samples[at], error)
+        columns = [column_of(values, self._texts) for values in fields.columns]
+        tags = None
+        if any(column.tags is not None for column in columns):
+            tags = np.stack(
+                [np.full(len(samples), Tag.NUMBER, np.uint8) if each.tags is None else each.tags for each in columns]
+            )
+        results = self._program.run(np.stack([column.values for column in columns]), tags)
+        return _Leaves(columns, results, dict(fields.errors), fields.odd)
+
+    def _evaluated(self, batch: _Batch, at: int, node: int | None) -> tuple[Column, dict[int, tuple[Reason, str]]]:
+        """A column's values for the batch, and why CEL has none, by row."""
+        count, leaves = len(batch.samples), batch.leaves
+        failed: dict[int, tuple[Reason, str]] = {}
+        if node is None or leaves.results is None:
+            return self._by_cel(at, batch, range(count), failed), failed
+        odd = set(leaves.odd)
+        if node in self._fields_at:
+            column = leaves.columns[self._fields_at[node]]
+            if column.others is not None and column.tags is not None:  # as CEL gives lists and maps
+                odd.update(np.flatnonzero(column.tags == Tag.OTHER).tolist())
+        else:
+            column = leaves.results.column(node)
+        if leaves.errors:
+            nothing = Column(np.zeros(len(leaves.errors)), np.zeros(len(leaves.errors), np.uint8), None)
+            column = _replaced(column, np.array([*leaves.errors]), nothing)
+        foreign = leaves.results.foreign(node)
+        if foreign is not None:
+            odd.update(np.flatnonzero(foreign).tolist())
+        odd.difference_update(leaves.errors)
+        if odd:
+            ordered = sorted(odd)
+            some = self._by_cel(at, batch, ordered, failed)
+            column = _replaced(column, np.array(ordered), some)
+        return column, failed
+
+    def _by_cel(self, at: int, batch: _Batch, rows: Sequence[int], failed: dict[int, tuple[Reason, str]]) -> Column:
+        values = []
+        for row in rows:
+            value, why = self._ask(at, batch, row)
+            values.append(value)
+            if why is not None:
+                failed[row] = why
+        return column_of(values, self._texts)
+
+    def _ask(self, at: int, batch: _Batch, row: int) -> tuple[Value | Unknown, tuple[Reason, str] | None]:
+        """The value of a row by CEL, and why it has none; None where the sample cannot be read."""
+        reading, sample = self._readings[at], batch.samples[row]
+        parameters = reading.parameters.of(self._names[batch.clients[row]])
+        if "msg" in reading.expression.names and row in batch.leaves.errors:
+            return UNKNOWN, None
+        values = self._messages.values(self._stream, sample, reading.expression.names, parameters)
+        if values is None:
+            batch.leaves.errors[row] = DecodeError()  # counted already
+            return UNKNOWN, None
+        if reading.element is not None:
+            values.update(reading.element.variables)
+        return reading.expression.explained(values)
+
+    def _failures(
+        self,
+        batch: _Batch,
+        used: Used,
+        done: Mapping[int, tuple[Column, Mapping[int, tuple[Reason, str]]]],
+    ) -> Iterator[Failure]:
+        """The samples for which a use has no value: those without a `where`, and of those that it takes, the rest."""
+        taken: NDArray[np.bool_] | None = None
+        for at in (used.where, used.value):
+            if at is None:
+                continue
+            column, failed = done[at]
+            if column.tags is not None:
+                missing = column.tags == Tag.ABSENT
+                if taken is not None:
+                    missing &= taken
+                if missing.any():
+                    yield from self._explained(batch, at, np.flatnonzero(missing).tolist(), failed)
+            if at == used.where and at is not None:
+                true = column.values == 1
+                taken = true & (column.tags == Tag.BOOLEAN) if column.tags is not None else np.zeros(len(true), bool)
+
+    def _explained(
+        self, batch: _Batch, at: int, rows: Sequence[int], failed: Mapping[int, tuple[Reason, str]]
+    ) -> Iterator[Failure]:
+        """Rows that look alike to the columns have one explanation, which CEL gives for the first."""
+        known: dict[Hashable, tuple[Reason | None, str]] = {}
+        counts: dict[tuple[int, Reason | None, str], int] = {}
+        kinds = [None if each.tags is None else each.tags for each in batch.leaves.columns]
+        for row in rows:
+            why: tuple[Reason | None, str]
+            if row in batch.leaves.errors:
+                why = (None, "")
+            elif row in failed:
+                why = failed[row]
+            else:
+                alike = tuple([Tag.NUMBER if each is None else int(each[row]) for each in kinds])
+                if alike not in known:
+                    known[alike] = self._ask(at, batch, row)[1] or (None, "")
+                why = known[alike]
+            which = (int(batch.clients[row]), *why)
+            counts[which] = counts.get(which, 0) + 1
+        for (client, reason, message), count in counts.items():
+            yield Failure(client, reason, message, count)
+
+
+class _Leaves(NamedTuple):
+    """The fields of some samples."""
+
+    columns: list[Column]
+    results: Any
+    errors: dict[int, DecodeError]
+    odd: Sequence[int]
+
+
+class _Batch(NamedTuple):
+    """The samples that are read at one go."""
+
+    samples: Sequence[Sample]
+    clients: Integers
+    leaves: _Leaves
+
+
+def _leaf(path: Path, reading: Reading) -> Hashable | Constant | None:
+    """What a path of an expression over one sample is in columns: a field, or the same for all samples."""
+    name, below = path[0], path[1:]
+    if name == "msg":
+        return below or None
+    variables: Mapping[str, Any] = {} if reading.element is None else reading.element.variables
+    if name == "parameters" and not reading.parameters.overridden:
+        variables = {"parameters": reading.parameters.own}
+    return constant(variables, path)
+
+
+def constant(variables: Mapping[str, Any], path: Path) -> Constant | None:
+    """What a path leads to, if it is a number, a text or a boolean."""
+    value: Any = variables
+    for step in path:
+        if not isinstance(value, Mapping) or step not in value:
+            return None
+        value = value[step]
+    return Constant(value) if type(value) in _CONSTANTS and value == value else None  # noqa: PLR0124 (no NaN)
+
+
+def whole(decoder: Decoder, paths: Sequence[Path]) -> FieldReader:
+    """Reads fields by decoding each message as a whole."""
+
+    def read(payloads: Sequence[bytes]) -> Fields:
+        columns: list[list[Any]] = [[MISSING] * len(payloads) for _ in paths]
+        errors: dict[int, DecodeError] = {}
+        odd: list[int] = []
+        for at, payload in enumerate(payloads):
+            try:
+                message = decoder.decode(payload)
+            except DecodeError as error:
+                errors[at] = error
+                continue
+            for column, path in zip(columns, paths, strict=True):
+                value = message
+                for step in path:
+                    if isinstance(value, dict):
+                        value = value.get(step, MISSING)
+                    elif isinstance(value, list) and isinstance(step, int):
+                        value = value[step] if 0 <= step < len(value) else MISSING
+                    elif value is not MISSING:
+                        value = MISSING
+                        if not odd or odd[-1] != at:
+                            odd.append(at)
+                column[at] = value
+        return Fields(columns, errors, odd)
+
+    return read
+
+
+def _store(stored: StoredColumn, rows: Integers, column: Column) -> None:
+    stored.values[rows] = column.values
+    if column.tags is None:
+        stored.tags[rows] = Tag.NUMBER
+        return
+    stored.tags[rows] = column.tags
+    stored.odd = stored.odd or bool((column.tags != Tag.NUMBER).any())
+    if column.others is not None:
+        if stored.others is None:
+            stored.others = np.empty(len(stored.values), object)
+        stored.others[rows] = column.others
+
+
+def _replaced(column: Column, rows: Integers, by: Column) -> Column:
+    """The column with other values in some rows."""
+    values = column.values.copy()
+    tags = np.full(len(values), Tag.NUMBER, np.uint8) if column.tags is None else column.tags.copy()
+    others = None if column.others is None else column.others.copy()
+    values[rows] = by.values
+    tags[rows] = Tag.NUMBER if by.tags is None else by.tags
+    if by.others is not None:
+        others = np.empty(len(values), object) if others is None else others
+        others[rows] = by.others
+    return Column(values, tags, others)

@@ -1,0 +1,286 @@
+"""The signals of rules that are evaluated together, in columns: equal ones are computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.reading import Reading, Used
+from detector.engine.columns.table import NEVER, Integers, Truths, rows_between
+from detector.engine.columns.watching import Ages
+from detector.engine.columns.windows import Ranges, aggregated, misfits
+from wayside.api.eventrule import OF_A_SAMPLE, Aggregate
+from wayside.expressions.columns.values import Column, Tag, value_at
+from wayside.rules import CompiledSignal
+
+_ALWAYS_KNOWN: Final = frozenset({Aggregate.COUNT, Aggregate.ANY})
+"""Aggregates that a client with a stale stream has as well."""
+
+
+class Key(NamedTuple):
+    """What a signal is, whatever it is called: equal ones are computed once."""
+
+    stream: str
+    used: Used
+    over: int | None
+    aggregate: Aggregate
+
+
+class Signals:
+    """The signals of all rules of a group."""
+
+    def __init__(self, context: Context, tracks: Sequence[Track], *, shared: bool = True) -> None:
+        """`shared`: samples without a value are counted when they are read; else when a window first holds them.
+
+        The first is for rules that look at all clients, the second for those that look at some.
+        """
+        self._context = context
+        self._tracks = tracks
+        self._keys: dict[Key, int] = {}
+        self._users: list[list[tuple[int, CompiledSignal]]] = []
+        """By signal: which tracks have it, and under which name."""
+        self._marks: dict[str, int] = {}
+        """By stream, where the rows begin that no window of ours has seen: one of its table's marks."""
+        self._shared = shared
+        self._new: dict[int, int] = {}
+        """By signal, where the rows begin that were in no window of it: one of its table's marks; unless shared."""
+        self._version = -1
+        self.ages = Ages()
+        self._all_streams = False
+        for row, track in enumerate(tracks):
+            own = {signal.name: signal for signal in track.element.signals}
+            for signal in track.rule.signals:
+                track.signals[signal.name] = self._place(row, own.get(signal.name, signal))
+
+    def watch_all_streams(self) -> None:
+        """Know of every stream whether it is fresh: some rule reads it."""
+        self._all_streams = True
+        for stream in self._context.stale_after:
+            self._context.tables.add(stream)
+
+    @property
+    def streams(self) -> frozenset[str]:
+        """The streams that the rules read."""
+        return frozenset(key.stream for key in self._keys)
+
+    def _place(self, row: int, signal: CompiledSignal) -> int:
+        reader = self._context.tables.add(signal.stream)
+        element = signal.element
+        used = reader.use(
+            None if signal.value is None else Reading(signal.value, signal.parameters, element),
+            None if signal.where is None else Reading(signal.where, signal.parameters, element),
+        )
+        at = self._keys.setdefault(Key(signal.stream, used, signal.over_ns, signal.aggregate), len(self._keys))
+        if at == len(self._users):
+            self._users.append([])
+        self._users[at].append((row, signal))
+        if self._shared:
+            self._context.tables.users.setdefault((signal.stream, used), []).append(
+                (self._tracks[row].counters, signal)
+            )
+        return at
+
+    def look(self, block: Block, floor: int | None) -> None:
+        """Compute all signals."""
+        tables = self._context.tables
+        if self._version != tables.version:
+            self._version = tables.version
+            self._marks = {stream: tables.table(stream).mark() for stream in self.streams}
+            if not self._shared:
+                rule = self._tracks[0].rule.name
+                self._new = {at: tables.mark(key.stream, (rule, key)) for key, at in self._keys.items()}
+        by_stream: dict[str, list[tuple[int, Key]]] = {stream: [] for stream in self.streams}
+        for key, at in self._keys.items():
+            by_stream[key.stream].append((at, key))
+        found: dict[int, Column] = {}
+        for stream in self._context.stale_after if self._all_streams else by_stream:
+            keys = by_stream.get(stream, [])
+            high, lows = self._ranges(block, stream, {key.over for _, key in keys}, floor)
+            if keys:
+                self._fill(stream, block, high, [(key, lows[key.over]) for _, key in keys])
+            for at, key in keys:
+                if not self._shared:
+                    self._note_new(block, at, key, high[:, -1], lows[key.over][:, -1])
+                found[at] = self._computed(block, at, key, high, lows)
+            self._watch(block, stream, high, keys)
+        block.signals = [found[at] for at in range(len(self._keys))]
+
+    def _ranges(
+        self, block: Block, stream: str, overs: Iterable[int | None], floor: int | None
+    ) -> tuple[Integers, dict[int | None, Integers]]:
+        """Up to which row each point sees, and from which row on for each length of window."""
+        table, duration = self._context.tables.table(stream), self._context.tables.duration(stream)
+        lengths = [*overs]
+        after = [block.times]
+        for over in lengths:
+            if over is None:
+                after.append(block.times - duration)
+            else:
+                after.append(block.times - over if floor is None else np.maximum(block.times - over, floor))
+        count = len(block.ticks)
+        found = table.find(np.concatenate(after), block.numbers)
+        high = found[:, :count]
+        first = table.first[block.numbers][:, None]
+        lows: dict[int | None, Integers] = {}
+        for at, over in enumerate(lengths, start=1):
+            low = found[:, at * count : (at + 1) * count]
+            lows[over] = np.minimum(low, np.maximum(high - 1, first)) if over is None else low
+        some = high > first
+        dropped = table.dropped[block.numbers][:, None]  # a cap may have pushed out all that there was
+        before = np.where(dropped <= block.times, dropped, NEVER)
+        latest = np.where(some, table.times[np.where(some, high - 1, 0)], before) if len(table.times) else before
+        block.latest[stream] = latest
+        limit = self._context.stale_after[stream]
+        there = latest != NEVER
+        block.fresh[stream] = there if limit is None else there & (block.times - np.where(there, latest, 0) <= limit)
+        return high, lows
+
+    def _fill(self, stream: str, block: Block, high: Integers, windows: Sequence[tuple[Key, Integers]]) -> None:
+        """Read the samples that the windows need."""
+        tables = self._context.tables
+        table, reader = tables.table(stream), tables.readers[stream]
+        if not reader.count or not len(table.keys):
+            return
+        rows: list[Integers] = []
+        whole = [low for key, low in windows if _needs_all(key)]
+        if whole:
+            low = whole[0] if len(whole) == 1 else np.minimum.reduce(whole)
+            mark = table.marks[self._marks[stream]]
+            before = np.concatenate((mark[block.numbers][:, None], high[:, :-1]), axis=1)
+            rows.append(rows_between(np.maximum(low, before).ravel(), high.ravel()))
+            mark[block.numbers] = high[:, -1]
+        for key, low in windows:
+            if not _needs_all(key) and key.used.value is not None:
+                at, some = _row(key.aggregate, low, high)
+                rows.append(np.unique(at[some]))
+                if key.aggregate is Aggregate.PREVIOUS:
+                    rows.append(np.unique(high[high > low] - 1))
+        wanted = rows[0] if len(rows) == 1 else np.unique(np.concatenate(rows)) if rows else np.zeros(0, np.int64)
+        wanted = wanted[~table.filled[wanted]]
+        if len(wanted):
+            tables.note_failures(stream, reader.read(table, wanted))
+
+    def _note_new(self, block: Block, at: int, key: Key, high: Integers, low: Integers) -> None:
+        """Count what samples have no value that are new in a window; high and low are those of the last tick."""
+        tables = self._context.tables
+        table = tables.table(key.stream)
+        if key.used == Used(None, None) or not len(table.keys):
+            return
+        if not _needs_all(key):
+            if key.aggregate is Aggregate.FIRST:
+                high = np.minimum(high, low + 1)
+            else:
+                low = np.maximum(low, high - (1 if key.aggregate is Aggregate.LAST else 2))
+        if key.aggregate not in _ALWAYS_KNOWN:
+            high = np.where(block.fresh[key.stream][:, -1], high, low)
+        mark = table.marks[self._new[at]]
+        rows = rows_between(np.maximum(low, mark[block.numbers]), high)
+        mark[block.numbers] = np.maximum(mark[block.numbers], high)
+        failures = [*tables.readers[key.stream].failures(table, rows, key.used)]
+        for row, signal in self._users[at] if failures else ():
+            tables.note(self._tracks[row].counters, signal, failures)
+
+    def _computed(self, block: Block, at: int, key: Key, high: Integers, lows: Mapping[int | None, Integers]) -> Column:
+        if key.aggregate is Aggregate.AGE:
+            return self._age(block, key)
+        table, low = self._context.tables.table(key.stream), lows[key.over]
+        if key.used.value is None and key.used.where is None:  # Count
+            column = Column((high - low).ravel().astype(float), None, None)
+        else:
+            value = None if key.used.value is None else table.columns[key.used.value]
+            rows = Ranges(
+                np.zeros(len(table.times)) if value is None else value.values,
+                None if value is None or not value.odd else value.tags,
+                None if value is None else value.others,
+                table.times,
+                low,
+                high,
+            )
+            if key.used.where is not None:
+                where, begin = table.columns[key.used.where], rows.begin
+                part = slice(begin, begin + len(rows.values))
+                rows.picked((where.tags[part] == Tag.BOOLEAN) & (where.values[part] == 1))
+            found = misfits(key.aggregate, rows)
+            if found is not None:
+                self._note_misfits(block, at, key, rows, *found)
+            column = aggregated(key.aggregate, rows, self._context.tables.texts)
+        if key.aggregate in _ALWAYS_KNOWN:
+            return column
+        fresh = block.fresh[key.stream].ravel()
+        if not fresh.all():
+            tags = Tag.NUMBER if column.tags is None else column.tags
+            column = Column(column.values, np.where(fresh, tags, Tag.ABSENT).astype(np.uint8), column.others)
+        self._note_unknown_signal(block, at, key, column, fresh)
+        return column
+
+    def _age(self, block: Block, key: Key) -> Column:
+        clients = self._context.clients
+        since = np.array([clients.since(client) for client in block.clients], np.int64)
+        latest = block.latest[key.stream]
+        begin = np.where(latest == NEVER, since[:, None], latest)
+        return Column(((block.times - begin) / 1e9).ravel(), None, None)
+
+    def _note_misfits(self, block: Block, at: int, key: Key, rows: Ranges, counts: Integers, odd: Truths) -> None:
+        """Values of the wrong kind are errors, at each evaluation that meets them."""
+        fresh = block.fresh[key.stream].ravel() if key.aggregate not in _ALWAYS_KNOWN else np.ones(len(counts), bool)
+        counts = np.where(fresh, counts, 0)
+        if block.present is not None:
+            counts = np.where(block.present.ravel(), counts, 0)
+        if not counts.any():
+            return
+        point = block.last(np.flatnonzero(counts))
+        window = slice(int(rows.low.flat[point]), int(rows.high.flat[point]))
+        worst = window.start + int(np.flatnonzero(odd[window])[-1])
+        value = value_at(Column(rows.values, rows.tags, rows.others), worst, self._context.tables.texts)
+        wanted = "booleans" if key.aggregate in (Aggregate.ANY, Aggregate.ALL) else "numbers"
+        for row, signal in self._users[at]:
+            own, counters = block.points(row), self._tracks[row].counters
+            counters.errors += int(counts.sum() if own is None else counts[own].sum())
+            place = f"signal {signal.name} of {block.clients[point // len(block.ticks)]}, stream {key.stream}"
+            counters.last_error = f"{place}: {key.aggregate} needs {wanted}, is {value!r:.80}"
+
+    def _note_unknown_signal(self, block: Block, at: int, key: Key, column: Column, fresh: Truths) -> None:
+        if column.tags is None:
+            return
+        unknown = column.tags == Tag.ABSENT
+        possible = self._context.possible
+        if possible.limited:
+            never = np.array([not possible(key.stream, client) for client in block.clients], bool)
+            unknown &= fresh | ~np.repeat(never, len(block.ticks))
+        if unknown.any():
+            for row, _ in self._users[at]:
+                self._tracks[row].counters.unknowns += block.count(row, unknown)
+
+    def _watch(self, block: Block, stream: str, high: Integers, keys: Sequence[tuple[int, Key]]) -> None:
+        """Note how old the newest samples are, where somebody wants to know."""
+        watching = [
+            ages
+            for at, key in keys
+            if key.aggregate is not Aggregate.AGE
+            for row, _ in self._users[at]
+            if (ages := self._tracks[row].counters.ages) is not None
+        ]
+        if watching:
+            fresh, tables = block.fresh[stream], self._context.tables
+            seen = fresh if block.present is None else fresh & block.present
+            self.ages.used(
+                watching, stream, tables.table(stream), tables.duration(stream), block, high, block.latest[stream], seen
+            )
+
+
+def _needs_all(key: Key) -> bool:
+    """Whether a signal looks at all samples of its windows."""
+    if key.used.where is not None:
+        return True
+    return key.used.value is not None and key.aggregate not in OF_A_SAMPLE
+
+
+def _row(aggregate: Aggregate, low: Integers, high: Integers) -> tuple[Integers, Truths]:
+    """The one row of each range that counts, and where there is one."""
+    if aggregate is Aggregate.FIRST:
+        return low, high > low
+    back = 1 if aggregate is Aggregate.LAST else 2
+    return high - back, high - low >= back

@@ -1,0 +1,243 @@
+"""The tables of all streams that rules read, kept in step with the buffer.
+
+What enters the buffer is added before rules are evaluated. What the buffer pushes out early, by a cap or with a client
+that is forgotten, leaves the tables as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from operator import itemgetter
+
+import numpy as np
+
+from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.buffering.messages import Messages
+from detector.engine.columns.reading import Failure, Reader, Used
+from detector.engine.columns.table import LONGEST, MAXIMUM_CLIENTS, NEVER, Integers, Table
+from detector.engine.counters import Counters, RuleCounters
+from detector.engine.samples.sample import Decoder, Sample
+from wayside.api import Detector
+from wayside.api.stream import Stream
+from wayside.expressions.columns.values import Texts
+from wayside.rules import CompiledSignal
+
+_TIME = itemgetter(0)
+
+_MAXIMUM_TEXTS = 1_000_000
+"""Beyond so many different texts, tables are built anew: texts are never forgotten one by one."""
+
+_SPARE_COLUMNS = 16
+"""So many columns of rules that are gone do no harm."""
+
+
+class Tables:
+    """Tables by stream, and numbers by client."""
+
+    def __init__(self, buffer: Buffer) -> None:
+        self._buffer = buffer
+        self._numbers: dict[str, int] = {}
+        self.names: list[str] = []
+        """The clients' names, by their numbers."""
+        self.texts = Texts()
+        self._tables: dict[str, Table] = {}
+        self.readers: dict[str, Reader] = {}
+        self._durations: dict[str, int] = {}
+        self._evictions = buffer.evictions
+        self._stale = True
+        self._asked: set[tuple[str, Hashable]] = set()
+        """The names of the marks that were asked for since the rules were set."""
+        self._marks: dict[tuple[str, Hashable], int] = {}
+        self.users: dict[tuple[str, Used], list[tuple[RuleCounters, CompiledSignal]]] = {}
+        """Who uses which columns of a stream."""
+        self.version = 0
+        """Changes when tables are built anew: places and numbers from before mean nothing then."""
+
+    def configure(
+        self, detector: Detector, decoders: Mapping[str, Decoder], messages: Messages, counters: Counters
+    ) -> None:
+        """Follow the Detector. Tables are made when they are asked for."""
+        self._detector, self._decoders, self._messages, self._counters = detector, decoders, messages, counters
+        self._tables, self.readers = {}, {}
+        self._durations = {stream.name: detector.spec.buffer_duration_ns(stream) for stream in detector.spec.streams}
+        self.forget()
+
+    def follow(self, other: Tables) -> None:
+        """Take over what the other ones follow."""
+        self.configure(other._detector, other._decoders, other._messages, other._counters)
+
+    def forget_users(self) -> None:
+        """Nobody uses any column or mark from before, but marks of owners that asked for theirs since the last time."""
+        self.users.clear()
+        kept = {name: self._tables[name[0]].marks[at] for name, at in self._marks.items() if name in self._asked}
+        self._marks.clear()
+        self._asked.clear()
+        for table in self._tables.values():
+            table.marks.clear()
+        for (stream, owner), mark in kept.items():
+            self._marks[stream, owner] = len(self._tables[stream].marks)
+            self._tables[stream].marks.append(mark)
+
+    def forget(self) -> None:
+        """Build all tables anew from the buffer, when they are needed next."""
+        self._stale = True
+
+    def add(self, stream: str) -> Reader:
+        """Have a table of the stream from now on; returns what reads its columns."""
+        if stream not in self._tables:
+            self._tables[stream] = Table()
+            self.readers[stream] = Reader(
+                stream, self._decoders[stream], self.texts, self._messages, self._counters, self.names
+            )
+            self._stale = True
+        return self.readers[stream]
+
+    def table(self, stream: str) -> Table:
+        """The stream's table."""
+        return self._tables[stream]
+
+    def mark(self, stream: str, owner: Hashable) -> int:
+        """The owner's mark in the stream's table: the same one each time, until tables are built anew."""
+        self._asked.add((stream, owner))
+        if (stream, owner) not in self._marks:
+            self._marks[stream, owner] = self._tables[stream].mark()
+        return self._marks[stream, owner]
+
+    def number(self, client: str) -> int:
+        """The client's number."""
+        number = self._numbers.get(client)
+        if number is None:
+            number = self._numbers[client] = len(self.names)
+            self.names.append(client)
+            for table in self._tables.values():
+                table.grow(len(self.names))
+        return number
+
+    @property
+    def full(self) -> bool:
+        """Whether numbers or texts run out: make new tables then."""
+        return len(self.names) >= MAXIMUM_CLIENTS - 1 or len(self.texts) > _MAXIMUM_TEXTS
+
+    @property
+    def wasteful(self) -> bool:
+        """Whether most columns are read for rules that are gone: make new tables then."""
+        used = {(stream, at) for stream, each in self.users for at in each if at is not None}
+        return sum(reader.count for reader in self.readers.values()) > 2 * len(used) + _SPARE_COLUMNS
+
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """The Detector's."""
+        return self._detector.spec.streams
+
+    @property
+    def empty(self) -> bool:
+        """Whether no rule reads any column."""
+        return not self._tables
+
+    def takes(self, stream: Stream) -> bool:
+        """Whether windows over the stream can be ranges of a table."""
+        capped = stream.buffer.bytes is not None or stream.buffer.count is not None
+        return not stream.latched and not capped and self._durations[stream.name] <= LONGEST
+
+    def duration(self, stream: str) -> int:
+        """How long the stream's samples are kept, in nanoseconds."""
+        return self._durations[stream]
+
+    @property
+    def behind(self) -> bool:
+        """Whether the buffer has dropped samples that are still here."""
+        return self._stale or self._evictions != self._buffer.evictions
+
+    def settle(self, samples: list[Sample], lanes: list[Lane | None]) -> None:
+        """Take in what entered the buffer since the last time: samples, and the lane of each (None: it was dropped)."""
+        for table, reader in zip(self._tables.values(), self.readers.values(), strict=True):
+            if len(table.columns) != reader.count:
+                table.set_columns(reader.count)
+        if self._stale:
+            self._rebuild()
+            return
+        if samples:
+            self._append(samples, lanes)
+        if self.behind:
+            self._follow_evictions()
+
+    def expire(self, now: int) -> None:
+        """Forget what the buffer keeps no longer; nanoseconds."""
+        if not self._stale:
+            for stream, table in self._tables.items():
+                table.expire(now - self._durations[stream])
+
+    def note_failures(self, stream: str, failures: Mapping[Used, Sequence[Failure]]) -> None:
+        """Count what samples have no value, for every rule that has the signal."""
+        for used, found in failures.items():
+            for counters, signal in self.users.get((stream, used), ()):
+                self.note(counters, signal, found)
+
+    def note(self, counters: RuleCounters, signal: CompiledSignal, failures: Sequence[Failure]) -> None:
+        """Count what samples have no value for a signal."""
+        for failure in failures:
+            if failure.reason is None:
+                counters.unknowns += failure.samples
+            else:
+                place = f"signal {signal.name} of {self.names[failure.client]}, stream {signal.stream}"
+                counters.note(failure.reason, failure.message, place, failure.samples)
+
+    def _append(self, samples: list[Sample], lanes: list[Lane | None]) -> None:
+        if None in lanes:
+            kept = [(sample, lane) for sample, lane in zip(samples, lanes, strict=True) if lane is not None]
+            samples, lanes = [sample for sample, _ in kept], [lane for _, lane in kept]
+            if not samples:
+                return
+        numbers = np.array([lane.number for lane in lanes])  # type: ignore[union-attr]
+        if numbers.min() < 0:
+            for lane in dict.fromkeys(lanes):
+                assert lane is not None  # noqa: S101  left out above
+                lane.number = self.number(lane.client)
+            numbers = np.array([lane.number for lane in lanes])  # type: ignore[union-attr]
+        if len(self.names) < 2**15:
+            numbers = numbers.astype(np.int16)  # sorted faster
+        times = np.fromiter(map(_TIME, samples), np.int64, len(samples))
+        streams = {lane.stream for lane in set(lanes)}  # type: ignore[union-attr]
+        for stream in streams & self._tables.keys():
+            if len(streams) == 1:
+                self._tables[stream].append(numbers, times, samples)
+            else:
+                of = np.array([lane.stream == stream for lane in lanes])  # type: ignore[union-attr]
+                at = np.flatnonzero(of)
+                self._tables[stream].append(numbers[at], times[at], [samples[each] for each in at.tolist()])
+
+    def _rebuild(self) -> None:
+        self._stale = False
+        self._numbers.clear()
+        self.names.clear()
+        self._marks.clear()
+        for stream, reader in self.readers.items():
+            table = self._tables[stream] = Table()
+            table.set_columns(reader.count)
+        by_stream: dict[str, list[Lane]] = {stream: [] for stream in self._tables}
+        for lane in self._buffer:
+            lane.number = self.number(lane.client)
+            if lane.stream in by_stream:
+                by_stream[lane.stream].append(lane)
+        for stream, lanes in by_stream.items():
+            table = self._tables[stream]
+            table.grow(len(self.names))
+            samples = [sample for lane in lanes for sample in lane.samples]
+            numbers = np.array([lane.number for lane in lanes for _ in lane.samples], np.int64)
+            table.append(numbers, np.fromiter(map(_TIME, samples), np.int64, len(samples)), samples)
+            for lane in lanes:
+                table.dropped[lane.number] = NEVER if lane.samples else lane.latest
+        self._evictions = self._buffer.evictions
+        self.version += 1
+
+    def _follow_evictions(self) -> None:
+        """Drop the rows that the buffer has no longer."""
+        self._evictions = self._buffer.evictions
+        for stream, table in self._tables.items():
+            kept: Integers = np.zeros(table.clients, np.int64)
+            there = np.zeros(table.clients, bool)
+            for lane in self._buffer:
+                if lane.stream == stream and lane.number >= 0:
+                    kept[lane.number], there[lane.number] = len(lane.samples), True
+            table.drop(np.maximum(table.end - table.first - kept, 0))
+            table.dropped[~there] = NEVER

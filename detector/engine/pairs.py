@@ -1,0 +1,198 @@
+"""A rule about pairs in columns: its pairs' states, brought forward only where an observation changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.pairs import PairColumns, Sight
+from detector.engine.columns.table import Integers, Truths
+from detector.engine.episodes.episodes import TRUE
+from detector.engine.episodes.subjects import Subject
+from detector.engine.evaluation import RuleRun
+from detector.engine.happened import Happened
+from detector.engine.scoping.scopes import Candidate
+from detector.engine.timing.schedule import Only
+
+_AGAIN = 255
+"""In place of the observation before: the pair has to be looked at."""
+
+_NEVER = np.iinfo(np.int64).max
+
+_SHIFT = 32
+
+
+class Watched(NamedTuple):
+    """The pairs with a state of their own, in any order."""
+
+    keys: Integers
+    """The numbers of both clients in one integer."""
+    last: NDArray[np.uint8]
+    """The observation before."""
+    wakes: Integers
+    """When to look again although nothing changes; nanoseconds."""
+    in_progress: Truths
+    """Whether an episode is open or pending; the others rest."""
+    matters: NDArray[np.uint8]
+    """The bits of an observation that count: those that end an open episode, else those that start one."""
+
+    def of(self, at: Integers | Truths) -> Watched:
+        """These of them."""
+        return Watched(self.keys[at], self.last[at], self.wakes[at], self.in_progress[at], self.matters[at])
+
+
+Entry = tuple[int, int, int, bool, int]
+"""One pair of `Watched`."""
+
+_NOBODY = Watched(
+    np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0, np.uint8)
+)
+
+_STARTS, _ENDS = 3, 12
+
+
+class PairGroup:
+    """One rule about pairs. It is driven like a `RuleGroup`."""
+
+    width = 1
+    may_wait = False  # what cannot be read is counted at each tick at which somebody asks for it
+
+    def __init__(self, run: RuleRun, order: int, context: Context, every: int, period: int) -> None:
+        """`order` is the rule's place among the rules; for the rest see `RuleGroup`."""
+        self.every = every
+        self.period = period
+        self.runs: Sequence[RuleRun] = (run,)
+        self.waiting: list[int] = []
+        self._run = run
+        self._order = order
+        self._context = context
+        self._element = run.rule.elements[0]
+        self._columns = PairColumns(Track(run.rule, self._element, run.counters, run.read), context)
+        self._watched = _NOBODY
+        self._version = -1
+        self._clients: Sequence[str] = ()
+        self._numbers: Integers = np.zeros(0, np.int64)
+        """Those of the clients, at this version of the tables."""
+        self._numbered = -1
+
+    def evaluate(
+        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
+    ) -> Iterator[Happened]:
+        """What happens at these ticks; such a rule looks at all pairs."""
+        assert only is None  # noqa: S101  it is not evaluated with samples
+        for tick in ticks:
+            yield from self._tick(tick, clients, floor)
+        self._run.tidy_starts(ticks[-1])
+
+    def _tick(self, tick: int, clients: Sequence[str], floor: int | None) -> Iterator[Happened]:
+        block = self._block(tick, clients)
+        self._follow()
+        watched, count = self._watched, len(block.clients)
+        index = np.full(len(self._context.tables.names), -1)
+        index[block.numbers] = np.arange(count)
+        first, second = index[watched.keys >> _SHIFT], index[watched.keys & (1 << _SHIFT) - 1]
+        there = (first >= 0) & (second >= 0)
+        look = watched.in_progress & there
+        sight = self._columns.evaluate(block, floor, (first[look], second[look]))
+        # Where each watched pair is among those that were looked at; -1: it was not.
+        pairs = sight.first * count + sight.second
+        rows = np.searchsorted(pairs, first * count + second)
+        rows[rows == len(pairs)] = 0
+        seen = there & (pairs[rows] == first * count + second) if len(pairs) else np.zeros(len(rows), bool)
+        rows = rows[seen]
+        changed = sight.codes & 3 == TRUE
+        differs = (sight.codes[rows] ^ watched.last[seen]) & watched.matters[seen] != 0
+        changed[rows] = differs | (watched.wakes[seen] <= tick)
+        changed[rows] |= self._followed(sight, rows, watched.in_progress[seen])
+        stale = seen.copy()
+        stale[seen] = changed[rows]
+        over = ~seen & ~watched.in_progress & (watched.wakes <= tick)
+        for key in watched.keys[over].tolist():
+            self._run.drop_state(self._subject(key))
+        kept: list[Entry] = []
+        for row in np.flatnonzero(changed).tolist():
+            yield from self._step(tick, sight, row, kept)
+        self._watched = _joined(watched.of(~stale & ~over), kept)
+
+    def _block(self, tick: int, clients: Sequence[str]) -> Block:
+        """The clients that are known at the tick."""
+        known, tables = self._context.clients, self._context.tables
+        if known.newest > tick:
+            clients = [client for client in clients if known.since(client) <= tick]
+        if self._numbered != tables.version or clients != self._clients:
+            self._clients, self._numbered = clients, tables.version
+            self._numbers = np.array([tables.number(client) for client in clients], np.int64)
+        return Block(self._context, (tick,), clients, self._numbers)
+
+    def _follow(self) -> None:
+        """Know the states that changed otherwise."""
+        run, tables = self._run, self._context.tables
+        if self._version == tables.version and not run.disturbed:
+            return
+        self._version, run.disturbed = tables.version, False
+        found = []
+        for subject in run.subjects:
+            a, b = (tables.number(client) for client in subject.clients)
+            state = run.state(subject)
+            assert state is not None  # noqa: S101  it has one
+            in_progress = state.is_open or state.onset is not None
+            wake = 0 if in_progress else state.rests_until
+            found.append((a << _SHIFT | b, _AGAIN, wake, in_progress, _ENDS if state.is_open else _STARTS))
+        self._watched = _joined(_NOBODY, found)
+
+    def _subject(self, key: int) -> Subject:
+        names = self._context.tables.names
+        return Subject((names[key >> _SHIFT], names[key & (1 << _SHIFT) - 1]), self._element.name)
+
+    def _key(self, sight: Sight, row: int) -> int:
+        numbers = sight.block.numbers
+        return int(numbers[sight.first[row]]) << _SHIFT | int(numbers[sight.second[row]])
+
+    def _followed(self, sight: Sight, rows: Integers, in_progress: Truths) -> Truths:
+        """Which of these pairs have demands that an evaluation may change although the observation is the same."""
+        run = self._run
+        if not run.has_deploys or not run.open_episodes:
+            return np.zeros(len(rows), bool)
+        needed = [
+            progress and run.needs_every_tick(self._subject(self._key(sight, row)))
+            for row, progress in zip(rows.tolist(), in_progress.tolist(), strict=True)
+        ]
+        return np.array(needed, bool)
+
+    def _step(self, tick: int, sight: Sight, row: int, kept: list[Entry]) -> Iterator[Happened]:
+        """Bring one pair's state forward, and add it to those that are kept where it is still needed."""
+        run, key, code = self._run, self._key(sight, row), int(sight.codes[row])
+        subject = self._subject(key)
+        state = run.state(subject) or run.new_state(subject)
+        stays = state.is_open and run.needs_every_tick(subject)
+        ran = state.run((tick,), 0, 1, run.timing, code)
+        if ran.what is not None or stays:
+            candidate = Candidate(subject, self._columns.variables(sight, row), in_scope=True, near=True)
+            if ran.what is None:
+                run.stays(tick, candidate)
+            elif (event := run.happened(tick, ran.what, candidate)) is not None:
+                yield Happened(tick, self._order, event)
+        if state.idle_at(tick):
+            run.drop_state(subject)
+            return
+        in_progress = state.is_open or state.onset is not None
+        wake = ran.wake if in_progress else state.rests_until
+        matters = _ENDS if state.is_open else _STARTS
+        kept.append((key, code, _NEVER if wake is None else wake, in_progress, matters))
+
+
+def _joined(watched: Watched, more: Sequence[Entry]) -> Watched:
+    if not more:
+        return watched
+    keys, last, wakes, in_progress, matters = zip(*more, strict=True)
+    return Watched(
+        np.append(watched.keys, np.array(keys, np.int64)),
+        np.append(watched.last, np.array(last, np.uint8)),
+        np.append(watched.wakes, np.array(wakes, np.int64)),
+        np.append(watched.in_progress, np.array(in_progress, bool)),
+        np.append(watched.matters, np.array(matters, np.uint8)),
+    )

@@ -1,0 +1,122 @@
+"""Recorded messages in batches: what is the same for many messages is looked at once.
+
+Every reader yields batches. Readers of formats that come message by message are wrapped by `batched`.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from detector.replay.message import Message
+
+MAXIMUM_MESSAGES = 4096
+MAXIMUM_BYTES = 8 << 20
+"""Bytes of payload in a batch, to within one message."""
+_ONE_BY_ONE = 256
+"""Messages that are read one by one make short batches: who plays them live waits while a batch is read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """What messages of one key have in common; two channels are equal only if they are the same object."""
+
+    key: str
+    """As in `Message`, and so are the others."""
+    encoding: str
+    type: str | None
+    decode: Callable[[bytes], object] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Messages in the order of their times, which never go back inside a batch; lists of equal length, not empty.
+
+    A time that does go back, in a recording that is out of order, begins a new batch.
+    """
+
+    times: list[int]
+    """Nanoseconds since the epoch."""
+    channels: list[Channel]
+    payloads: list[bytes]
+
+    def part(self, begin: int, end: int) -> Batch:
+        """The messages from position `begin` to before `end`."""
+        return Batch(self.times[begin:end], self.channels[begin:end], self.payloads[begin:end])
+
+    def picked(self, positions: Sequence[int]) -> Batch:
+        """The messages at these positions."""
+        return Batch(
+            [self.times[at] for at in positions],
+            [self.channels[at] for at in positions],
+            [self.payloads[at] for at in positions],
+        )
+
+
+def messages_of(batches: Iterable[Batch]) -> Iterator[Message]:
+    """The messages one by one."""
+    for batch in batches:
+        for time, channel, payload in zip(batch.times, batch.channels, batch.payloads, strict=True):
+            yield Message(time, channel.key, payload, channel.encoding, channel.type, channel.decode)
+
+
+def batched(messages: Iterable[Message]) -> Iterator[Batch]:
+    """The messages in batches. Where `messages` raises an error, what came before it is yielded first."""
+    channels: dict[tuple[object, ...], Channel] = {}
+    batch, size = Batch([], [], []), 0
+    try:
+        for message in messages:
+            full = len(batch.times) >= _ONE_BY_ONE or size >= MAXIMUM_BYTES
+            if batch.times and (full or message.time < batch.times[-1]):
+                yield batch
+                batch, size = Batch([], [], []), 0
+            common = message.key, message.encoding, message.type, message.decode
+            channel = channels.get(common)
+            if channel is None:
+                channel = channels[common] = Channel(*common)
+            batch.times.append(message.time)
+            batch.channels.append(channel)
+            batch.payloads.append(message.payload)
+            size += len(message.payload)
+    except Exception:
+        if batch.times:
+            yield batch
+        raise
+    if batch.times:
+        yield batch
+
+
+def merged(recordings: Sequence[Iterator[Batch]]) -> Iterator[Batch]:
+    """The messages of all recordings by time; of equal times, those of the recording given first.
+
+    Where the times of a recording go back, its messages wait for earlier ones of the others, as in `heapq.merge`.
+    """
+    if len(recordings) == 1:
+        yield from recordings[0]
+        return
+    heads = [(batch, rest) for rest in recordings if (batch := next(rest, None)) is not None]
+    while heads:
+        # All up to the earliest end of a batch is known: only this batch's recording may go on with an equal time.
+        ending = min(range(len(heads)), key=lambda at: heads[at][0].times[-1])
+        limit = heads[ending][0].times[-1]
+        cuts = [
+            (bisect_right if at <= ending else bisect_left)(batch.times, limit) for at, (batch, _) in enumerate(heads)
+        ]
+        yield _sorted([batch.part(0, cut) for (batch, _), cut in zip(heads, cuts, strict=True) if cut])
+        heads = [
+            (left, rest)
+            for (batch, rest), cut in zip(heads, cuts, strict=True)
+            if (left := batch.part(cut, len(batch.times)) if cut < len(batch.times) else next(rest, None)) is not None
+        ]
+
+
+def _sorted(parts: Sequence[Batch]) -> Batch:
+    if len(parts) == 1:
+        return parts[0]
+    together = Batch(
+        [time for part in parts for time in part.times],
+        [channel for part in parts for channel in part.channels],
+        [payload for part in parts for payload in part.payloads],
+    )
+    return together.picked(sorted(range(len(together.times)), key=together.times.__getitem__))  # stable

@@ -1,0 +1,71 @@
+"""CDR: the numbers, texts and arrays of ROS 2 messages, made plain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from detector.streams.codecs.doubles import EXACT, number
+
+Convert = Callable[[Any], Any]
+
+PADDING = "structure_needs_at_least_one_member"
+"""What an empty message holds on the wire; no field of it."""
+
+
+def scalar(kind: str) -> Convert | None:
+    """What makes a value of this ROS type plain; None where it already is."""
+    return _SCALARS.get(kind, float)
+
+
+def array(kind: str) -> Convert | None:
+    """What makes an array of this ROS type plain, as numpy has it; None where it already is."""
+    return _ARRAYS.get(kind, _small_integers)
+
+
+def _octet(value: int) -> float:
+    return float(value & 0xFF)  # rosbags reads a byte as signed, ROS means an octet
+
+
+def _floats(values: np.ndarray[Any, Any]) -> list[float]:
+    plain: list[float] = values.tolist()
+    return plain
+
+
+def _small_integers(values: np.ndarray[Any, Any]) -> list[float]:
+    plain: list[float] = values.astype(np.float64).tolist()
+    return plain
+
+
+def _large_integers(values: np.ndarray[Any, Any]) -> list[float | int]:
+    if values.size and (int(values.max()) > EXACT or int(values.min()) < -EXACT):
+        return [number(int(value)) for value in values]
+    return list(_small_integers(values))
+
+
+def _octets(values: np.ndarray[Any, Any]) -> bytes:
+    return values.tobytes()
+
+
+_SCALARS: dict[str, Convert | None] = {
+    "bool": None,
+    "float32": None,
+    "float64": None,
+    "string": None,
+    "byte": _octet,
+    "int64": number,
+    "uint64": number,
+}
+_ARRAYS: dict[str, Convert | None] = {
+    "string": None,
+    "bool": _floats,  # tolist() also makes numpy's booleans plain
+    "float32": _floats,
+    "float64": _floats,
+    "uint8": _octets,
+    "char": _octets,
+    "byte": _octets,
+    "int64": _large_integers,
+    "uint64": _large_integers,
+}

@@ -1,0 +1,143 @@
+"""JSON: reads a few fields, by structs of msgspec that have just these.
+
+msgspec skips what a struct does not have, and looks at it less closely than when it decodes it: neither at UTF-8, nor
+at how large a number is, nor at our bound on the depth. What may fail there is decoded whole, and so is every message
+that does not fit the structs, so that the decoder says what is read and what is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from typing import Any
+
+import msgspec
+
+from detector.engine.samples.sample import MISSING, FieldReader, Fields
+from detector.streams.codecs.doubles import number
+from detector.streams.codecs.paths import Path, complete, shortest, spread
+
+_SLICE = 64
+"""How many payloads are looked at together: one that is unlike the rest costs the others only this far."""
+_PLAIN = frozenset((float, str, bool, type(None), type(MISSING)))
+
+_SHAPE = bytes.maketrans(b"0123456789E", b"0000000000e")
+_LARGE = b"0e000"
+"""Any exponent of three digits, once the digits are zeros; a number without one needs many digits to be too large."""
+_MANY = b"0" * 200
+
+_BRACKETS = bytes.maketrans(b"{}", b"[]")
+_NO_BRACKETS = bytes(set(range(256)) - set(b'[]{}"'))
+
+
+def json_fields(
+    paths: Sequence[Path], decode: Callable[[bytes], Any], plain: Callable[[Any], Any], max_depth: int
+) -> FieldReader | None:
+    """Reads the paths; None where no struct can have them: an index at the beginning, or an unusual name.
+
+    `decode` reads a whole payload and refuses what is nested more than `max_depth` deep; `plain` makes a value of
+    msgspec what `decode` makes of it.
+    """
+    names = [path[: next((at for at, step in enumerate(path) if type(step) is int), len(path))] for path in paths]
+    if () in names:
+        return None
+    whole = shortest(names)
+    try:
+        root = _struct(whole)
+    except (ValueError, UnicodeEncodeError):  # a name with a quote, a control character or half a surrogate pair
+        return None
+    getters = [attrgetter(_attributes(path, whole)) for path in whole]
+    read = msgspec.json.Decoder(root).decode
+
+    def messages_of(part: Sequence[bytes]) -> list[Any] | None:
+        try:
+            messages = list(map(read, part))
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return None
+        return messages if _sure(part, max_depth) else None
+
+    def read_fields(payloads: Sequence[bytes]) -> Fields:
+        messages: list[Any] = []
+        left: list[int] = []
+        for first in range(0, len(payloads), _SLICE):
+            part = payloads[first : first + _SLICE]
+            found = messages_of(part)
+            if found is not None:
+                messages += found
+                continue
+            for place, payload in enumerate(part, start=first):
+                found = messages_of((payload,))
+                if found is None:
+                    left.append(place)
+                else:
+                    messages += found
+        columns = [_converted(list(map(get, messages)), plain) for get in getters]
+        return spread(complete(payloads, columns, whole, left, decode), whole, paths)
+
+    return read_fields
+
+
+def _struct(paths: Sequence[Path]) -> type[msgspec.Struct]:
+    """A struct that has the paths. Raises ValueError for names that no struct can have."""
+    fields: list[tuple[str, Any, Any]] = []
+    for at, (name, below) in enumerate(_members(paths).items()):
+        kind: Any = object if below == [()] else _struct(below)
+        default = MISSING if kind is object else kind()
+        fields.append((f"f{at}", kind, msgspec.field(default=default, name=str(name))))
+    return msgspec.defstruct("Message", fields, frozen=True, gc=False)
+
+
+def _attributes(path: Path, paths: Sequence[Path]) -> str:
+    """Where the struct of the paths has this path."""
+    members = _members(paths)
+    attribute = f"f{list(members).index(path[0])}"
+    return f"{attribute}.{_attributes(path[1:], members[path[0]])}" if path[1:] else attribute
+
+
+def _members(paths: Sequence[Path]) -> dict[str | int, list[Path]]:
+    """What lies below each first step."""
+    members: dict[str | int, list[Path]] = {}
+    for path in paths:
+        members.setdefault(path[0], []).append(path[1:])
+    return members
+
+
+def _converted(column: list[Any], plain: Callable[[Any], Any]) -> list[Any]:
+    """The column as the decoder gives it."""
+    kinds = set(map(type, column))
+    if kinds <= _PLAIN:
+        return column
+    if dict in kinds or list in kinds:
+        return [plain(value) for value in column]
+    return [number(value) if type(value) is int else value for value in column]
+
+
+def _sure(payloads: Sequence[bytes], max_depth: int) -> bool:
+    """Whether nothing in the payloads, which have been read as structs, can make the decoder refuse them."""
+    joined = b"".join(payloads)
+    if not joined.isascii():
+        try:
+            for payload in payloads:
+                payload.decode()
+        except UnicodeDecodeError:
+            return False
+    shape = joined.translate(_SHAPE, b"+")
+    if _LARGE in shape:
+        return False
+    longest = max(map(len, payloads))
+    if longest >= len(_MANY) and _MANY in shape:
+        return False
+    return longest <= 2 * max_depth or all(_depth_is_within(max_depth, payload) for payload in payloads)
+
+
+def _depth_is_within(bound: int, payload: bytes) -> bool:
+    """Whether a valid payload is surely nested at most that deep."""
+    if payload.count(b"[") + payload.count(b"{") <= bound:
+        return True
+    if b"\\" in payload:
+        payload = payload.replace(b"\\\\", b"").replace(b'\\"', b"")
+    # Texts without brackets leave nothing but their two quotes.
+    brackets = payload.translate(_BRACKETS, _NO_BRACKETS).replace(b'""', b"")
+    for _ in range(bound):
+        brackets = brackets.replace(b"[]", b"")  # of each branch, the deepest
+    return not brackets

@@ -1,0 +1,181 @@
+"""The database action while its server is away, hangs or refuses: it counts each loss and writes nothing twice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from detector.actions import OutcomeState
+from tests.mongodb.way import Way
+from tests.process.database_desk import (
+    SPEEDS,
+    MakeDesk,
+    numbers,
+    scenario,
+    scenario_or_none,
+    speeds,
+    spooled,
+    wait_until,
+)
+
+
+def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_each_once(
+    desk: MakeDesk, database: Any, way: Way, tmp_path: Path
+) -> None:
+    keep = desk(spool=2**26)
+    first, second = keep.begin("e1"), keep.begin("e2")
+    keep.take(first, speeds(1500))
+    wait_until(lambda: len(numbers(database)) >= 1000)
+    way.cut()
+    keep.take(first, speeds(3000, first=1500))
+    keep.finish(first)
+    keep.take(second, speeds(100))
+    keep.finish(second)
+    wait_until(lambda: spooled(tmp_path / "spool") > 100_000)
+    assert scenario(database)["complete"] is False
+    way.restore()
+    assert [keep.outcome(name).state for name in ("e1", "e2")] == [OutcomeState.DONE] * 2
+    assert numbers(database) == list(range(4500))
+    assert numbers(database, "e2.keep") == list(range(100))
+    assert not keep.losses
+    wait_until(lambda: not list((tmp_path / "spool").glob("*.spool")))
+
+
+def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_whole(
+    desk: MakeDesk, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("detector.actions.database.queue.MEMORY", 100_000)
+    keep = desk(spool=400_000)
+    way.cut()
+    early, late = keep.begin("e1"), keep.begin("e2")
+    keep.take(early, speeds(500))
+    keep.finish(early)
+    for number in range(10):
+        keep.take(late, speeds(1000, first=1000 * number))
+    keep.finish(late)
+    assert keep.losses.total() > 0
+    way.restore()
+    assert keep.outcome("e1").state is OutcomeState.DONE
+    outcome = keep.outcome("e2")
+    assert outcome.state is OutcomeState.FAILED
+    assert outcome.missing == keep.losses.total()
+    there = numbers(database, "e2.keep")
+    assert len(there) + keep.losses.total() == 10_000
+    assert len(set(there)) == len(there)
+    assert numbers(database) == list(range(500))
+    told = scenario(database, "e2.keep")
+    assert (told["complete"], told["missing"]) == (False, outcome.missing)
+
+
+def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
+    desk: MakeDesk, database: Any, way: Way
+) -> None:
+    way.cut()
+    before = desk(spool=2**26)
+    episode, open_one = before.begin("e1"), before.begin("e2")
+    before.take(episode, speeds(1200))
+    before.take(open_one, speeds(10))
+    before.finish(episode)
+    before.close()
+    assert "waits in the spool" in before.outcome("e1").message
+    way.restore()
+    after = desk(spool=2**26)
+    wait_until(lambda: scenario_or_none(database, "e2.keep").get("state") == "Interrupted")
+    assert numbers(database) == list(range(1200))
+    assert scenario(database)["complete"] is True
+    assert scenario(database, "e2.keep")["complete"] is False
+    assert not after.losses
+
+
+def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and_no_other(
+    desk: MakeDesk, database: Any, way: Way
+) -> None:
+    keep = desk()
+    good, bad = keep.begin("e1"), keep.begin("e2")
+    samples = speeds(40)
+    way.poison = b"a poisoned text"
+    poisoned = samples[20]._replace(payload=b'{"v": 20, "text": "a poisoned text"}')
+    keep.take(good, samples)
+    keep.take(bad, [*samples[:20], poisoned, *samples[21:]])
+    keep.finish(bad)
+    keep.finish(good)
+    assert keep.outcome("e1").state is OutcomeState.DONE
+    outcome = keep.outcome("e2")
+    assert outcome.state is OutcomeState.FAILED
+    assert numbers(database) == list(range(40))
+    assert numbers(database, "e2.keep") == [each for each in range(40) if each != 20]
+    assert keep.losses.total() == 1
+    told = scenario(database, "e2.keep")
+    assert (told["complete"], told["rejected"]) == (False, True)
+
+
+def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
+    desk: MakeDesk, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("detector.actions.database.server._SECONDS", 4.0)
+    keep = desk(spool=2**26)
+    episode = keep.begin()
+    way.hang()
+    keep.take(episode, speeds(2000))
+    keep.finish(episode)
+    wait_until(lambda: (keep.action._store is not None) and keep.action._store.away != "")
+    way.restore()
+    assert keep.outcome().state is OutcomeState.DONE
+    assert numbers(database) == list(range(2000))
+
+
+def test_with_write_concern_one_a_scenario_that_lost_documents_afterwards_is_not_called_complete(
+    desk: MakeDesk, database: Any
+) -> None:
+    keep = desk(concern="One")
+    episode = keep.begin()
+    keep.take(episode, speeds(1000))
+    wait_until(lambda: len(numbers(database)) == 1000)
+    database[SPEEDS].delete_one({"msg.v": 7})
+    keep.finish(episode)
+    outcome = keep.outcome()
+    assert outcome.state is OutcomeState.FAILED
+    assert "only 999 of 1000 documents in json/speed" in outcome.message
+    assert scenario(database)["complete"] is False
+
+
+def test_what_somebody_removed_from_the_spool_costs_its_scenario_and_no_other(
+    desk: MakeDesk, database: Any, way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("detector.actions.database.spool.SEGMENT", 1000)
+    keep = desk(spool=2**26)
+    way.cut()
+    first, second = keep.begin("e1"), keep.begin("e2")
+    keep.take(first, speeds(2000))
+
+    def of_a_thousand() -> list[Path]:
+        return sorted(each for each in (tmp_path / "spool").glob("*.spool") if each.stat().st_size > 100_000)
+
+    wait_until(lambda: len(of_a_thousand()) == 2)
+    doomed = of_a_thousand()[0]  # the first thousand of the first episode, while nothing else is there
+    keep.take(second, speeds(1000))
+    keep.finish(second)
+    keep.finish(first)
+    doomed.unlink()
+    way.restore()
+    assert keep.outcome("e2").state is OutcomeState.DONE
+    assert keep.outcome("e1").state is OutcomeState.FAILED
+    assert scenario(database)["complete"] is False
+    assert keep.losses.total() > 0
+
+
+def test_open_episodes_say_that_the_database_is_away(desk: MakeDesk, way: Way) -> None:
+    keep = desk(spool=2**26)
+    episode = keep.begin()
+    way.cut()
+
+    def told(away: bool) -> bool:
+        keep.take(episode, speeds(1000))
+        last = keep.last()
+        return last is not None and last.message.startswith("the database is away") is away
+
+    wait_until(lambda: told(True))
+    way.restore()
+    wait_until(lambda: told(False))

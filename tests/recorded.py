@@ -1,0 +1,27 @@
+"""What recordings hold, message by message."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+from detector.engine.samples.sample import Arrival
+from detector.replay.batches import batched, messages_of
+from detector.replay.message import Cut, Message, ignore
+from detector.replay.recordings import open_recordings
+from detector.replay.routing import Router
+
+
+def messages_in(
+    paths: Sequence[Path],
+    wanted: Callable[[str], bool] = lambda key: True,
+    on_cut: Callable[[Cut], None] = ignore,
+) -> Iterator[Message]:
+    """The messages of the recordings. Raises RecordingError at once where one is missing or of no known kind."""
+    return messages_of(open_recordings(paths, wanted, on_cut))
+
+
+def arrivals_of(router: Router, messages: Iterable[Message]) -> Iterator[Arrival]:
+    """The arrivals that the router makes of the messages."""
+    return chain.from_iterable(router.arrivals(batched(messages)))

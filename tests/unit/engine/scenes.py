@@ -1,0 +1,275 @@
+"""Random scenes for rules about clients: rules of every kind, what comes in, and what is done to the engine meanwhile.
+
+A scene follows from its seed. It is driven in cuts: each is one call of `Engine.advance`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+from typing import Any, NamedTuple
+
+from detector.assembly import RuleBook, inlets, make_engine
+from detector.engine.counters import RuleCounters
+from detector.engine.engine import NoAnswerError
+from detector.engine.samples.sample import Arrival
+from tests.driving import SECOND, START, a_detector, a_rule, a_stream
+from wayside.api import Detector, EventRule
+
+_SIGNALS: list[tuple[str, dict[str, Any]]] = [
+    *(
+        ("number", {"stream": "s", "value": "msg.v", "over": over, "aggregate": aggregate})
+        for aggregate, over in (("Max", "1s"), ("Min", "700ms"), ("Mean", "1500ms"), ("Sum", "3s"), ("Delta", "1s"),
+                                ("First", "1s"), ("Rate", "1s"), ("StdDev", "1s"))
+    ),
+    ("number", {"stream": "s", "value": "msg.v"}),
+    ("number", {"stream": "s", "over": "1s", "aggregate": "Count"}),
+    ("number", {"stream": "s", "value": "msg.v", "aggregate": "Previous"}),
+    ("number", {"stream": "s", "value": "msg.v * parameters.f"}),
+    ("number", {"stream": "s", "value": "msg.big", "over": "1s", "aggregate": "Max"}),
+    ("truth", {"stream": "s", "value": "msg.v > 3", "over": "1s", "aggregate": "Any"}),
+    ("truth", {"stream": "s", "value": "msg.v > 1", "over": "1s", "aggregate": "All"}),
+    ("truth", {"stream": "s", "value": "has(msg.w)"}),
+    ("list", {"stream": "s", "value": "msg.v", "over": "1s", "aggregate": "Distinct"}),
+    ("number", {"stream": "p", "value": "msg.q.w * 2", "over": "1s", "aggregate": "Max", "where": "msg.gear == 'D'"}),
+    ("number", {"stream": "p", "value": "msg.q.w / msg.q.z"}),
+    ("number", {"stream": "p", "value": "msg.q.w", "where": "msg.on", "aggregate": "Previous"}),
+    ("number", {"stream": "p", "value": "msg.q.w", "over": "900ms", "aggregate": "First", "where": "msg.q.w > 1"}),
+    ("number", {"stream": "p", "over": "2s", "aggregate": "Count", "where": "msg.q.w > 2"}),
+    ("number", {"stream": "p", "aggregate": "Age"}),
+    ("number", {"stream": "p", "value": "sample.size * 0.05"}),
+    ("truth", {"stream": "p", "value": "msg.on"}),
+    ("text", {"stream": "p", "value": "msg.gear"}),
+    ("list", {"stream": "p", "value": "msg.q"}),
+]  # fmt: skip
+
+_FORMS = {
+    "number": ["{} > 1", "{} < 2", "{} * 2 >= 5", "{} > parameters.f", "({0} > 1 ? {0} : 0 - {0}) > 2",
+               "{} in [1, 2, 3]",
+               "{} > (labels.kind == 'bus' ? 1 : 2)", "client == 'c1' || {} > 2", "[{}, 2.0].exists(x, x > 3)",
+               "size(streams) > 1 && {} > 1", "[{}].exists(x, 1.0 / x < 0.0)"],
+    "truth": ["{}", "!{}"],
+    "text": ["{} == 'D'", "{} != 'R'", "{} + 'x' == 'Dx'"],
+    "list": ["size({}) > 1", "{}[0] > 1"],
+}  # fmt: skip
+
+_VALUES: list[dict[str, Any]] = [
+    {}, {"v": None}, {"v": "x"}, {"v": True}, {"w": 1}, {"v": 1, "w": 2}, {"v": 0.0}, {"v": -0.0}, {"v": 0.1},
+    {"v": [1]},
+    {"v": 2**60, "big": 2**60 + 1}, {"v": 1e308, "big": -(2**62)}, {"v": 1e-7},
+]  # fmt: skip
+
+
+class Operation(NamedTuple):
+    """What is done to the engine."""
+
+    kind: str
+    what: Any
+    until: int = 0
+    """Of an advance, how far time comes; nanoseconds."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    detector: Detector
+    operations: list[Operation]
+
+
+def _condition(random: Random, names: list[tuple[str, str]], each: bool) -> str:
+    def simple() -> str:
+        name, kind = random.choice(names)
+        if each and kind == "number" and random.random() < 0.4:
+            return f"{name} > e.limit"
+        return random.choice(_FORMS[kind]).format(name)
+
+    text = simple()
+    for _ in range(random.choice([0, 0, 1, 2])):
+        text = f"{random.choice(['!(', '('])}{text}) {random.choice(['&&', '||'])} ({simple()})"
+    return text
+
+
+def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
+    signals, names = [], []
+    for at in range(random.choice([1, 1, 2])):
+        what, signal = random.choice(_SIGNALS)
+        signals.append({"name": f"g{at}", **signal})
+        names.append((f"g{at}", what))
+    each = kind == "client" and random.random() < 0.2
+    spec: dict[str, Any] = {"signals": signals, "parameters": {"f": 1.5}}
+    spec["evaluation"] = random.choice([{"every": every} for every in ("100ms", "100ms", "300ms", "1s")])
+    if each:
+        spec["each"] = {"as": "e", "of": [{"name": "a", "limit": 1.0}, {"name": "b", "limit": 2.5}]}
+        signals.append({"name": "ge", "stream": "s", "value": "msg.v - e.limit", "over": "500ms", "aggregate": "Max"})
+        names.append(("ge", "number"))
+    spec["when"] = _condition(random, names, each)
+    if kind == "over":
+        signals.append({"name": "over", "rule": "r0", "aggregate": "Active"})
+        spec["when"] = f"over && ({spec['when']})"
+    if kind == "fleet":
+        return a_rule(f"r{number}", **spec | {"scope": {"fleet": {"members": "true"}}, "when": "size(members) > 1"})
+    if random.random() < 0.1:
+        spec["evaluation"] = random.choice([{"onSample": "s"}, {"onSample": "p"}, {"onDemand": True}])
+    if random.random() < 0.3:
+        spec["evaluation"] = {**spec["evaluation"], "priority": random.choice([1, 2])}
+    if random.random() < 0.6:
+        spec["until"] = _condition(random, names, each)
+    for field, share, values in (
+        ("for", 0.5, ("200ms", "500ms", "1s")),
+        ("cooldown", 0.3, ("500ms", "2s")),
+        ("unknownTimeout", 0.5, ("300ms", "1s")),
+        ("maxEpisodesPerHour", 0.2, (1, 2)),
+    ):
+        if random.random() < share:
+            spec[field] = random.choice(values)
+    if random.random() < 0.25:
+        where = [*(form.format(*names[0]) for form in ("client != 'c2'", "labels.kind == 'bus'")), "'p' in streams"]
+        spec["scope"] = {"client": {"where": random.choice(where)}}
+    if random.random() < 0.4:
+        parameters = {"x": "${g0}", "c": "${client}"}
+        deploy = {"template": "t", "parameters": parameters, **random.choice([{}, {"follow": True}])}
+        spec["actions"] = [{"name": "d", "deploy": deploy}]
+    return a_rule(f"r{number}", **spec)
+
+
+def _message(random: Random, stream: str) -> dict[str, Any]:
+    if stream == "s":
+        return dict(random.choice([{"v": round(random.uniform(-1, 5), 1)}] * 14 + _VALUES))
+    place = {"w": random.uniform(0, 4), "z": random.choice([0, 1, 2.0])}
+    message = {
+        "gear": random.choice(["D", "D", "R", 1, None]),
+        "on": random.choice([True, False, 1.0]),
+        "q": random.choice([place] * 5 + [{}, None, {"w": "k"}, 7, [1.5, 2]]),
+    }
+    return {name: value for name, value in message.items() if random.random() > 0.1}
+
+
+def _arrivals(random: Random, data: bool) -> list[Arrival]:
+    """In order of time; many come at a tick, some together, and clients fall silent for as long as makes them lost."""
+    sent = []
+    for client in range(3):
+        time = 0.0
+        while time < 5:
+            time += (
+                random.expovariate(random.choice([5, 20])) if random.random() > 0.03 else random.choice([0.6, 1.3, 3])
+            )
+            sent.append((time, f"c{client}", random.choice("ssp")))
+    arrivals, last = [], START
+    for time, client, stream in sorted(sent):
+        last = max(last + (random.random() > 0.05), START + round(time * 1e8) * 10)
+        if random.random() < 0.1:
+            last = -(-last // 10**8) * 10**8
+        message = _message(random, stream)
+        if data:
+            message["t"] = last / 1e9 + random.choice([0, 0, 0, -0.1, -0.3, 0.05])
+        payload = b"{broken" if random.random() < 0.01 else json.dumps(message).encode()
+        arrivals.append(Arrival(last, stream, f"vehicles/{client}/{stream}", payload))
+    return arrivals
+
+
+def a_scene(seed: int) -> Scene:
+    random = Random(seed)
+    data = random.random() < 0.25
+    stamp = {"stamp": "msg.t"} if data else {}
+    buffer = {"duration": random.choice(["3s", "5s"]), **random.choice([{}, {}, {}, {"bytes": "6k"}])}
+    capped = random.choice([{}] * 9 + [{"buffer": {"count": 5}}])
+    detector = a_detector(
+        a_stream("s", staleAfter=random.choice(["500ms", "1s", "Never"]), **capped, **stamp),
+        a_stream("p", staleAfter="1s", **stamp),
+        clientTimeout="2s", buffer=buffer, clock="Data" if data else "Wall", **({"lateness": "200ms"} if data else {}),
+        clients=[{"name": "c0", "labels": {"kind": "bus"}},
+                 {"name": "c1", "labels": {"kind": "car"}, "parameters": {f"r{random.randrange(5)}": {"f": 2.5}}}],
+    )  # fmt: skip
+    mixed = random.random() < 0.3
+    kinds = ["client"] * 3 + (random.sample(["client", "over", "fleet"], 2) if mixed else ["client"] * 2)
+    rules = [a_random_rule(random, number, kind) for number, kind in enumerate(kinds)]
+    arrivals = _arrivals(random, data)
+    operations, done = [Operation("rules", rules)], 0
+    for mark in sorted(random.sample(range(1, len(arrivals)), random.choice([0, 1, 2, 3]))):
+        while mark < len(arrivals) and arrivals[mark].received == arrivals[mark - 1].received:
+            mark += 1  # noqa: PLW2901
+        if not done < mark < len(arrivals):
+            continue
+        operations.append(Operation("advance", arrivals[done:mark], arrivals[mark - 1].received))
+        done = mark
+        match random.choice(["rules", "pause", "resume", "level", "ask", *([] if data else ["gap"])]):
+            case "rules":
+                for at in range(len(rules)):
+                    if random.random() < 0.3:
+                        rules = [*rules[:at], a_random_rule(random, at, "client"), *rules[at + 1 :]]
+                operations.append(Operation("rules", rules))
+            case "pause":
+                operations.append(Operation("pause", random.sample([rule.name for rule in rules], 2)))
+            case "resume":
+                operations.append(Operation("pause", []))
+            case "level":
+                operations.append(Operation("level", random.choice([0, 1, 2, 5])))
+            case "ask":
+                operations.append(Operation("ask", random.choice(rules).name))
+            case "gap":
+                operations.append(Operation("gap", arrivals[done].received - 1))
+    operations.append(Operation("advance", arrivals[done:], arrivals[-1].received + 3 * SECOND))
+    return Scene(detector, [*operations, Operation("finish", None)])
+
+
+class Outcome(NamedTuple):
+    """What came of a scene."""
+
+    events: list[str]
+    demands: list[list[tuple[str, str]]]
+    """After each operation."""
+    counters: dict[str, Any]
+
+
+def driven(scene: Scene, cut: Callable[[], int]) -> Outcome:
+    """Drive the scene; `cut` says how many arrivals come in one call, at least: those of equal times come together."""
+    entries, book = inlets(scene.detector), RuleBook()
+    engine = make_engine(scene.detector, entries, holder="h", start=START - 1)
+    engine.counters.watch_ages = True
+    events: list[str] = []
+    demands = []
+    for kind, what, until in scene.operations:
+        found = []
+        match kind:
+            case "rules":
+                found += engine.set_rules(book.compile(what, scene.detector, entries.fields)[0])
+            case "pause":
+                engine.set_paused(what)
+            case "level":
+                engine.set_level(what)
+            case "gap":
+                found += engine.gap(what)
+            case "ask":
+                try:
+                    found, answers = engine.ask(what)
+                    events.append(str(answers))
+                except NoAnswerError:
+                    pass
+            case "finish":
+                found += [event for some in engine.finish() for event in some]
+            case "advance":
+                begin = 0
+                while begin < len(what):
+                    end = begin + cut()
+                    while end < len(what) and what[end].received == what[end - 1].received:
+                        end += 1
+                    last = end >= len(what)
+                    found += engine.advance(what[begin:end], until if last else what[end - 1].received)
+                    begin = end
+        events += [event.to_json() for event in found]
+        demands.append(sorted((name, str(each.parameters)) for name, each in engine.demands().items()))
+    counted = {name: _counted(each) for name, each in sorted(engine.counters.rules.items())}
+    return Outcome(events, demands, {**counted, "undecodable": dict(engine.counters.undecodable)})
+
+
+def _counted(rule: RuleCounters) -> dict[str, Any]:
+    numbers = ("evaluations", "skipped", "suppressed", "started", "ended", "unknowns", "errors", "unfollowed", "ticks")
+    uses = rule.ages.uses if rule.ages is not None else {}
+    return {name: getattr(rule, name) for name in numbers} | {
+        # Which of several keys of a path is missing is looked up once for all samples that look alike.
+        "absences": Counter(re.sub('^no key ".*"', "no key", each) for each in rule.absences.elements()),
+        "ages": {stream: (dict(use.ages), dict(use.periods)) for stream, use in sorted(uses.items())},
+    }

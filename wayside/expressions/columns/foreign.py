@@ -1,0 +1,109 @@
+"""Finds the rows that columns cannot decide as CEL does, so that the caller asks CEL there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from wayside.expressions.columns.frame import Frame, Source
+from wayside.expressions.columns.nodes import Concern, Holds, Nodes, Op, Watch
+from wayside.expressions.columns.values import Bools, Bytes, Tag
+
+Places = Mapping[int, tuple[Source, int]]
+Found = Mapping[int, Bools]
+"""bool[n] by the number of a watch: the rows that it found, if any."""
+
+
+class Foreign:
+    """The watches below each root of a program. Nearly always none finds anything, and that costs next to nothing."""
+
+    def __init__(self, graph: Nodes, roots: Sequence[int], places: Places) -> None:
+        self._places = places
+        numbers: dict[Watch, int] = {}
+        self._below = {
+            root: frozenset(numbers.setdefault(watch, len(numbers)) for watch in _watches(graph, root))
+            for root in roots
+        }
+        self._of_others: dict[int, int] = {}
+        """For the row of a leaf the watch that looks for what is OTHER."""
+        self._of_texts: dict[tuple[int, int], int] = {}
+        """For the rows of two leaves the watch that looks for texts in both."""
+        self._rest: list[tuple[int, Watch]] = []
+        for watch, number in numbers.items():
+            rows = [places[node][1] for node in watch.nodes]
+            if watch.concern is Concern.UNEXPECTED or any(places[n][0] is not Source.LEAVES for n in watch.nodes):
+                self._rest.append((number, watch))
+            elif watch.concern is Concern.OTHER:
+                self._of_others[rows[0]] = number
+            else:
+                self._of_texts[rows[0], rows[1]] = number
+
+    def find(self, frame: Frame) -> Found:
+        """What all watches find in one run."""
+        return dict(self._find(frame))
+
+    def _find(self, frame: Frame) -> Iterator[tuple[int, Bools]]:
+        if frame.odd:
+            for row in frame.leaves_with(Tag.OTHER) & self._of_others.keys():
+                yield self._of_others[row], _holds(frame.leaf_tags[row], Tag.OTHER)
+            texts = frame.leaves_with(Tag.TEXT) if self._of_texts else frozenset()
+            for (one, other), number in self._of_texts.items() if texts else ():
+                if one in texts and other in texts:
+                    yield number, _holds(frame.leaf_tags[one], Tag.TEXT) & _holds(frame.leaf_tags[other], Tag.TEXT)
+        for number, watch in self._rest:
+            found = self._found(watch, frame)
+            if found is not None and found.any():
+                yield number, found
+
+    def rows(self, root: int, found: Found) -> Bools | None:
+        """bool[n]: the rows that some watch below the root found; None: none. Raises KeyError for what is no root."""
+        watches = self._below[root]
+        rows: Bools | None = None
+        for number, here in found.items():
+            if number in watches:
+                rows = here if rows is None else rows | here
+        return rows if rows is not None and rows.any() else None
+
+    def _found(self, watch: Watch, frame: Frame) -> Bools | None:
+        tags = [self._tags(each, frame) for each in watch.nodes]
+        first = tags[0]
+        if watch.concern is Concern.UNEXPECTED:
+            if watch.expected is Tag.NUMBER and not frame.odd:
+                return None
+            if first is None:
+                return np.ones(frame.leaves.shape[1], bool)
+            return ~(_holds(first, watch.expected) | _holds(first, Tag.ABSENT) | _holds(first, Tag.UNREACHABLE))
+        wanted = Tag.OTHER if watch.concern is Concern.OTHER else Tag.TEXT
+        rows = [None if each is None else _holds(each, wanted) for each in tags]
+        if len(rows) == 1:
+            return rows[0]
+        return None if rows[0] is None or rows[1] is None else rows[0] & rows[1]
+
+    def _tags(self, node: int, frame: Frame) -> Bytes | None:
+        """The tags of a node; None: all are numbers."""
+        source, row = self._places[node]
+        if source is Source.LEAVES and not frame.tagged:
+            return None
+        tags: Bytes = (frame.leaf_tags if source is Source.LEAVES else frame.mixed_tags)[row]
+        return tags
+
+
+def _holds(tags: Bytes, tag: Tag) -> Bools:
+    found: Bools = tags == np.uint8(tag)
+    return found
+
+
+def _watches(graph: Nodes, root: int) -> tuple[Watch, ...]:
+    found: dict[Watch, None] = {}
+    if graph.nodes[root].holds is Holds.ANY and graph.nodes[root].op is Op.CHOOSE:
+        found[Watch(Concern.OTHER, (root,))] = None
+    seen, pending = {root}, [root]
+    while pending:
+        number = pending.pop()
+        found.update(dict.fromkeys(graph.watches(number)))
+        for each in graph.nodes[number].operands:
+            if each not in seen:
+                seen.add(each)
+                pending.append(each)
+    return tuple(found)

@@ -1,0 +1,171 @@
+"""The memory of one run: a row of doubles or truths for each node, over n points."""
+
+from __future__ import annotations
+
+import enum
+import sys
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wayside.expressions.columns.values import Bools, Bytes, Doubles, Tag
+
+Rows = slice | NDArray[np.intp]
+"""Which rows of an array: a slice where possible, since that copies nothing."""
+
+ABSENT: Final = np.uint8(Tag.ABSENT)
+NUMBER: Final = np.uint8(Tag.NUMBER)
+BOOLEAN: Final = np.uint8(Tag.BOOLEAN)
+ONE: Final = np.uint8(1)
+THREE: Final = np.uint8(3)
+
+
+class Source(enum.IntEnum):
+    """The array that an operand lies in."""
+
+    CONSTANT = 0
+    LEAVES = 1
+    NUMBERS = 2
+    TRUTHS = 3
+    MIXED = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Operand:
+    """k nodes as one operand of k operations."""
+
+    source: Source
+    rows: Rows
+    """Where in that array; of constants, where in `values`."""
+    partial: bool
+    """Whether some may be unknown even where every leaf is a number."""
+    values: Doubles
+    """float64[k, 1], of constants; otherwise empty."""
+    tags: Bytes | None
+    """uint8[k, 1], of constants that are no numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """How many nodes of each kind there are."""
+
+    numbers: int
+    truths: int
+    mixed: int
+
+    def bytes(self, n: int) -> int:
+        """What a frame takes for n points."""
+        return n * (9 * self.numbers + 2 * self.truths + 9 * self.mixed)
+
+
+class Memory:
+    """Memory for frames, used again once nothing refers to it: new pages cost more than the calculation in them."""
+
+    def __init__(self) -> None:
+        self._spare: list[Bytes] = []
+
+    def frame(self, sizes: Sizes, values: Doubles, tags: Bytes | None) -> Frame:
+        """A frame in memory that nobody else uses; any thread may ask."""
+        needed = sizes.bytes(values.shape[1])
+        try:
+            block = self._spare.pop()  # nobody else gets it before it is in use
+        except IndexError:
+            block = np.empty(needed, np.uint8)
+        # Every array within the block refers to it: results, and whatever a caller took out of them.
+        if sys.getrefcount(block) > _UNUSED or not needed <= block.size <= _ROOMY * needed + _SMALL:
+            block = np.empty(needed, np.uint8)
+        frame = Frame(sizes, values, tags, block)
+        self._spare.append(block)
+        return frame
+
+
+_UNUSED: Final = 2
+"""References to a block that nobody uses: the variable, and the argument of `sys.getrefcount`."""
+_ROOMY: Final = 4
+_SMALL: Final = 1 << 20
+
+
+class Frame:
+    """The arrays of one run. `tagged` says whether any leaf holds anything but numbers; if not, much is left out."""
+
+    def __init__(self, sizes: Sizes, values: Doubles, tags: Bytes | None, block: Bytes) -> None:
+        n = values.shape[1]
+        self.tagged = tags is not None and not bool((tags == NUMBER).all())
+        self.leaves = values
+        self.leaf_tags = tags if tags is not None else np.empty((0, n), np.uint8)
+        of_numbers, of_truths, of_mixed = (sizes.numbers, n), (sizes.truths, n), (sizes.mixed, n)
+        at = 8 * n * (sizes.numbers + sizes.mixed)
+        self.numbers: Doubles = np.ndarray(of_numbers, np.float64, block)
+        self.mixed: Doubles = np.ndarray(of_mixed, np.float64, block, 8 * n * sizes.numbers)
+        self.known: Bools = np.ndarray(of_numbers, np.bool_, block, at)
+        self.true: Bools = np.ndarray(of_truths, np.bool_, block, at := at + n * sizes.numbers)
+        self.false: Bools = np.ndarray(of_truths, np.bool_, block, at := at + n * sizes.truths)
+        self.mixed_tags: Bytes = np.ndarray(of_mixed, np.uint8, block, at + n * sizes.truths)
+
+    @cached_property
+    def odd(self) -> bool:
+        """Whether any leaf holds anything but numbers and nothing."""
+        return self.tagged and bool((self.leaf_tags > NUMBER).any())
+
+    def leaves_with(self, tag: Tag) -> frozenset[int]:
+        """The leaves that hold such a value in some row."""
+        return frozenset(np.flatnonzero((self.leaf_tags == np.uint8(tag)).any(axis=1)).tolist())
+
+    @cached_property
+    def leaf_known(self) -> Bools:
+        """bool[leaves, n]: where a leaf is a number."""
+        return np.equal(self.leaf_tags, NUMBER)
+
+    def number(self, operand: Operand) -> tuple[Doubles, Bools | None]:
+        """The operand's numbers, and where there is one; None: everywhere."""
+        rows = operand.rows
+        match operand.source:
+            case Source.LEAVES:
+                return self.leaves[rows], self.leaf_known[rows] if self.tagged else None
+            case Source.NUMBERS:
+                return self.numbers[rows], self.known[rows] if self.tagged or operand.partial else None
+            case Source.CONSTANT:
+                return operand.values, None
+        return self.mixed[rows], self.mixed_tags[rows] == NUMBER
+
+    def truth(self, operand: Operand) -> tuple[Bools, Bools]:
+        """Where the operand is true, and where it is false."""
+        rows = operand.rows
+        match operand.source:
+            case Source.TRUTHS:
+                true = self.true[rows]
+                return true, self.false[rows] if self.tagged or operand.partial else ~true
+            case Source.LEAVES if not self.tagged:
+                never = np.zeros((1, self.leaves.shape[1]), bool)
+                return never, never
+            case Source.LEAVES:
+                return _truths(self.leaves[rows], self.leaf_tags[rows])
+            case Source.CONSTANT:
+                true = operand.values != 0
+                return true, ~true
+        return _truths(self.mixed[rows], self.mixed_tags[rows])
+
+    def anything(self, operand: Operand) -> tuple[Doubles, Bytes | None]:
+        """The operand's values and tags; None: they are all numbers."""
+        rows = operand.rows
+        match operand.source:
+            case Source.LEAVES:
+                return self.leaves[rows], self.leaf_tags[rows] if self.tagged else None
+            case Source.MIXED:
+                return self.mixed[rows], self.mixed_tags[rows]
+            case Source.CONSTANT:
+                return operand.values, operand.tags
+            case Source.NUMBERS:
+                values, known = self.number(operand)
+                return values, None if known is None else known.view(np.uint8)  # True is the tag of a number
+        true, false = self.truth(operand)
+        return true.astype(np.float64), (true | false).view(np.uint8) * BOOLEAN
+
+
+def _truths(values: Doubles, tags: Bytes) -> tuple[Bools, Bools]:
+    boolean = tags == BOOLEAN
+    true = boolean & (values != 0)
+    return true, boolean & ~true

@@ -1,0 +1,209 @@
+"""From the syntax tree of an expression to nodes of the graph, or the refusal of what only CEL can evaluate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable
+from typing import Final, NamedTuple
+
+from wayside.expressions.cel import Expression, Kind
+from wayside.expressions.columns.functions import takes_columns
+from wayside.expressions.columns.nodes import Holds, Nodes, Op
+from wayside.expressions.columns.values import Tag
+from wayside.expressions.projection import integer
+from wayside.expressions.syntax import Call, Collection, Node, Path, Select, path_of
+from wayside.expressions.syntax import Constant as Literal
+
+_ARITHMETIC: Final = {"_+_": Op.ADD, "_-_": Op.SUBTRACT, "_*_": Op.MULTIPLY, "_/_": Op.DIVIDE}
+_ORDER: Final = {"_<_": (Op.LESS, False), "_<=_": (Op.LESS_EQUAL, False)} | {
+    "_>_": (Op.LESS, True), "_>=_": (Op.LESS_EQUAL, True),
+}  # fmt: skip
+"""The operation, and whether its operands change places."""
+_DECLARED: Final = {Kind.DOUBLE: Tag.NUMBER, Kind.BOOL: Tag.BOOLEAN, Kind.STRING: Tag.TEXT}
+_MOST_ELEMENTS: Final = 256
+"""Of a list after `in`: each is one comparison for each row."""
+
+
+class Constant(NamedTuple):
+    """A value that stands in place of a leaf, the same for every row."""
+
+    value: bool | float | str
+
+
+class RefusedError(Exception):
+    """The columns cannot take this expression."""
+
+
+Leaves = Callable[[Path], Hashable | Constant | None]
+"""The leaf of a path, a constant in its place, or None where the columns do not have it."""
+
+
+def lower(graph: Nodes, expression: Expression, leaf: Leaves) -> int:
+    """The node of the expression's result. Raises RefusedError where there is none."""
+    return _Lowering(graph, expression, leaf).root()
+
+
+class _Lowering:
+    def __init__(self, graph: Nodes, expression: Expression, leaf: Leaves) -> None:
+        self._graph = graph
+        self._expression = expression
+        self._tree = expression.tree
+        self._leaf = leaf
+        self._names = expression.names
+
+    def root(self) -> int:
+        """The result, checked against the kind that the expression was compiled for."""
+        found = self._lower(self._tree)
+        holds = self._holds(found)
+        match self._expression.result, holds:
+            case (Kind.DYN, _) | (Kind.DOUBLE, Holds.NUMBERS) | (Kind.STRING, Holds.TEXTS):
+                return found
+            case Kind.BOOL, _:
+                return self._graph.truth(found)
+            case Kind.DOUBLE, Holds.ANY:
+                return self._graph.node(Op.NUMBER, Holds.NUMBERS, (found,))
+            case Kind.STRING, Holds.ANY:
+                return self._graph.node(Op.TEXT, Holds.ANY, (found,))
+        raise RefusedError
+
+    def _holds(self, node: int) -> Holds:
+        return self._graph.nodes[node].holds
+
+    def _lower(self, node: Node) -> int:
+        path = path_of(node, self._names)
+        if path is not None and not (isinstance(node, Select) and node.test_only):
+            return self._given(path)
+        match node:
+            case Literal(bool() | float() | str() as value):
+                return self._constant(value)
+            case Select(_, _, True) if path is not None:
+                return self._has(path)
+            case Call("_&&_" | "_||_" as name, None, (a, b)):
+                return self._graph.node(
+                    Op.AND if name == "_&&_" else Op.OR, Holds.TRUTHS, (self._truth(a), self._truth(b))
+                )
+            case Call("!_", None, (a,)):
+                return self._not(self._truth(a))
+            case Call("-_", None, (a,)):
+                return self._graph.node(Op.NEGATE, Holds.NUMBERS, (self._number(a),))
+            case Call(name, None, (a, b)) if name in _ARITHMETIC:
+                return self._graph.node(_ARITHMETIC[name], Holds.NUMBERS, (self._number(a), self._number(b)))
+            case Call(name, None, (a, b)) if name in _ORDER:
+                return self._order(name, a, b)
+            case Call("_==_", None, (a, b)):
+                return self._equal(a, b)
+            case Call("_!=_", None, (a, b)):
+                return self._not(self._equal(a, b))
+            case Call("@in", None, (a, Collection(False, elements))):
+                return self._in(a, elements)
+            case Call("_?_:_", None, (condition, a, b)):
+                return self._choose(condition, a, b)
+            case Call(name, None, given) if takes_columns(name, len(given)):
+                return self._graph.node(
+                    Op.CALL, Holds.NUMBERS, tuple(self._number(each) for each in given), (name, len(given))
+                )
+        raise RefusedError
+
+    def _given(self, path: Path) -> int:
+        found = self._named(path)
+        kind = self._expression.kinds[str(path[0])] if len(path) == 1 else Kind.DYN
+        if isinstance(found, Constant):
+            expected = {bool: Kind.BOOL, str: Kind.STRING}.get(type(found.value), Kind.DOUBLE)
+            if kind not in (Kind.DYN, expected):
+                raise RefusedError
+            return self._constant(found.value.replace("\0", "␀") if isinstance(found.value, str) else found.value)
+        node = self._graph.leaf(found)
+        if kind is Kind.DYN:
+            return node
+        if kind not in _DECLARED:
+            raise RefusedError
+        return self._graph.node(Op.EXPECT, Holds.ANY, (node,), _DECLARED[kind])
+
+    def _named(self, path: Path) -> Hashable | Constant:
+        found = self._leaf(path)
+        if found is None:
+            raise RefusedError
+        return found
+
+    def _constant(self, value: bool | float | str) -> int:
+        if isinstance(value, str):
+            _check_text(value)
+        elif math.isnan(value) or (type(value) is int and type(integer(value)) is int):
+            raise RefusedError
+        return self._graph.constant(value)
+
+    def _has(self, path: Path) -> int:
+        found = self._named(path)
+        if isinstance(found, Constant):
+            return self._graph.constant(True)
+        # Bytes that the expression also orders are absent in all of it; that comparison makes their rows foreign.
+        return self._graph.node(Op.HAS, Holds.TRUTHS, (self._graph.leaf(found),))
+
+    def _number(self, node: Node) -> int:
+        found = self._lower(node)
+        if self._holds(found) not in (Holds.NUMBERS, Holds.ANY):
+            raise RefusedError
+        return found
+
+    def _truth(self, node: Node) -> int:
+        found = self._lower(node)
+        return found if self._holds(found) in (Holds.TRUTHS, Holds.ANY) else self._graph.truth(found)
+
+    def _not(self, node: int) -> int:
+        return self._graph.node(Op.NOT, Holds.TRUTHS, (node,))
+
+    def _order(self, name: str, a: Node, b: Node) -> int:
+        op, turned = _ORDER[name]
+        first, second = self._lower(a), self._lower(b)
+        kinds = {self._holds(first), self._holds(second)}
+        if Holds.TEXTS in kinds or kinds == {Holds.NUMBERS, Holds.TRUTHS}:
+            raise RefusedError
+        return self._graph.node(op, Holds.TRUTHS, (second, first) if turned else (first, second))
+
+    def _equal(self, a: Node, b: Node) -> int:
+        self._check_not_null(a)
+        self._check_not_null(b)
+        return self._graph.node(Op.EQUAL, Holds.TRUTHS, (self._lower(a), self._lower(b)))
+
+    def _in(self, sought: Node, elements: tuple[Node, ...]) -> int:
+        literals = [each.value for each in elements if isinstance(each, Literal)]
+        if not elements or len(literals) < len(elements) or len(elements) > _MOST_ELEMENTS:
+            raise RefusedError
+        self._check_not_null(sought)
+        what = self._lower(sought)
+        found: list[int] = []
+        for value in literals:
+            if not isinstance(value, bool | float | str):
+                raise RefusedError
+            found.append(self._graph.node(Op.EQUAL, Holds.TRUTHS, (what, self._constant(value))))
+        while len(found) > 1:  # as a tree, so that it is not deep
+            rest = found[len(found) & ~1 :]
+            found = [self._graph.node(Op.OR, Holds.TRUTHS, pair) for pair in zip(found[::2], found[1::2], strict=False)]
+            found += rest
+        return found[0]
+
+    def _choose(self, condition: Node, a: Node, b: Node) -> int:
+        asked, first, second = self._truth(condition), self._lower(a), self._lower(b)
+        kinds = {self._holds(first), self._holds(second)}
+        holds = kinds.pop() if kinds in ({Holds.NUMBERS}, {Holds.TRUTHS}) else Holds.ANY
+        return self._graph.node(Op.CHOOSE, holds, (asked, first, second))
+
+    def _check_not_null(self, node: Node) -> None:
+        """Refuses an item of a list: null is a value there, which a column cannot tell from absent."""
+        match node:
+            case Call("_?_:_", None, (_, a, b)):
+                self._check_not_null(a)
+                self._check_not_null(b)
+            case _:
+                path = path_of(node, self._names)
+                if path is not None and isinstance(path[-1], int):
+                    raise RefusedError
+
+
+def _check_text(text: str) -> None:
+    if "\0" in text:
+        raise RefusedError
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise RefusedError from None

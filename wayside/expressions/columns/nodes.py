@@ -1,0 +1,153 @@
+"""The nodes of a graph of expressions: what there is, and where a node needs CEL's help."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from wayside.expressions.columns.values import Tag
+
+
+class Holds(enum.Enum):
+    """What a node yields, as far as that is known before any row is."""
+
+    NUMBERS = enum.auto()
+    TRUTHS = enum.auto()
+    TEXTS = enum.auto()
+    ANY = enum.auto()
+    """Each row says it by its tag."""
+
+
+class Op(enum.Enum):
+    """What a node does with its operands."""
+
+    LEAF = enum.auto()
+    CONSTANT = enum.auto()
+    EXPECT = enum.auto()
+    """The leaf itself, of which the expression declares what it holds."""
+    ADD = enum.auto()
+    SUBTRACT = enum.auto()
+    MULTIPLY = enum.auto()
+    DIVIDE = enum.auto()
+    NEGATE = enum.auto()
+    CALL = enum.auto()
+    """A function of numbers."""
+    LESS = enum.auto()
+    LESS_EQUAL = enum.auto()
+    EQUAL = enum.auto()
+    AND = enum.auto()
+    OR = enum.auto()
+    NOT = enum.auto()
+    HAS = enum.auto()
+    CHOOSE = enum.auto()
+    """`?:`."""
+    NUMBER = enum.auto()
+    """The numbers of its operand; what is none is unknown."""
+    TRUTH = enum.auto()
+    TEXT = enum.auto()
+    NEVER = enum.auto()
+    """Unknown in every row: a truth asked of what cannot be one."""
+
+
+COMMUTATIVE = frozenset({Op.ADD, Op.MULTIPLY, Op.EQUAL, Op.AND, Op.OR})
+GIVEN = frozenset({Op.LEAF, Op.CONSTANT, Op.EXPECT})
+"""What needs no calculation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One operation. Its operands have smaller numbers than itself."""
+
+    op: Op
+    holds: Holds
+    operands: tuple[int, ...]
+    detail: Hashable = None
+    """A leaf's name, a constant's value, the tag that is expected, a function's name and count of arguments."""
+    depth: int = 0
+
+
+class Nodes:
+    """Nodes that the expressions of all rules share: equal operations on equal operands are one node."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._numbers: dict[Hashable, int] = {}
+
+    def leaf(self, name: Hashable) -> int:
+        """The node of a leaf itself."""
+        return self.node(Op.LEAF, Holds.ANY, detail=name)
+
+    def truth(self, node: int) -> int:
+        """The node's rows as truths: a row that is no boolean is unknown."""
+        match self.nodes[node]:
+            case Node(Op.CONSTANT, Holds.TRUTHS) | Node(holds=Holds.ANY):
+                return self.node(Op.TRUTH, Holds.TRUTHS, (node,))
+            case Node(holds=Holds.TRUTHS):
+                return node
+        return self.node(Op.NEVER, Holds.TRUTHS, (node,))
+
+    def constant(self, value: bool | float | str) -> int:
+        """The node of a literal."""
+        if isinstance(value, bool):
+            return self.node(Op.CONSTANT, Holds.TRUTHS, detail=value)
+        if isinstance(value, str):
+            return self.node(Op.CONSTANT, Holds.TEXTS, detail=value)
+        return self.node(Op.CONSTANT, Holds.NUMBERS, detail=float(value))
+
+    def node(self, op: Op, holds: Holds, operands: Sequence[int] = (), detail: Hashable = None) -> int:
+        """The number of this node, a new one if there is none yet."""
+        operands = tuple(sorted(operands) if op in COMMUTATIVE else operands)
+        named = detail.hex() if isinstance(detail, float) and op is Op.CONSTANT else detail  # 0.0 is not -0.0
+        key = (op, holds, operands, named)
+        found = self._numbers.get(key)
+        if found is None:
+            depth = 0 if op in GIVEN else 1 + max((self.nodes[each].depth for each in operands), default=0)
+            found = self._numbers[key] = len(self.nodes)
+            self.nodes.append(Node(op, holds, operands, detail, depth))
+        return found
+
+    def forget(self, count: int) -> None:
+        """Keeps the first `count` nodes alone."""
+        del self.nodes[count:]
+        self._numbers = {key: number for key, number in self._numbers.items() if number < count}
+
+    def watches(self, node: int) -> tuple[Watch, ...]:
+        """Where this node alone takes a row that the columns cannot decide."""
+        here = self.nodes[node]
+        if here.op is Op.EXPECT and isinstance(here.detail, Tag):
+            return (Watch(Concern.UNEXPECTED, here.operands, here.detail),)
+        anything = [self._leaf_of(each) for each in here.operands if self.nodes[each].holds is Holds.ANY]
+        found = (
+            []
+            if here.op in (Op.CHOOSE, Op.HAS)
+            else [Watch(Concern.OTHER, (each,)) for each in dict.fromkeys(anything)]
+        )
+        if here.op in (Op.ADD, Op.LESS, Op.LESS_EQUAL) and len(anything) == 2:
+            found.append(Watch(Concern.TEXTS, (anything[0], anything[1])))
+        return tuple(found)
+
+    def _leaf_of(self, node: int) -> int:
+        """The leaf that an expectation is about; any other node is itself."""
+        here = self.nodes[node]
+        return here.operands[0] if here.op is Op.EXPECT else node
+
+
+class Concern(enum.Enum):
+    """Which rows CEL has to decide."""
+
+    OTHER = enum.auto()
+    """Those with a value that is OTHER."""
+    TEXTS = enum.auto()
+    """Those where both are texts: CEL orders and joins them."""
+    UNEXPECTED = enum.auto()
+    """Those with anything but what is declared: CEL converts some of it."""
+
+
+class Watch(NamedTuple):
+    """A concern about the rows of one or two nodes."""
+
+    concern: Concern
+    nodes: tuple[int, ...]
+    expected: Tag = Tag.NUMBER

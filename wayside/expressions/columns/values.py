@@ -1,0 +1,188 @@
+"""What the rows of a column hold: a double for each row, and a tag that says what the double stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, cast, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wayside.expressions.cel import Value
+from wayside.expressions.numbers import MAX_EXACT
+from wayside.expressions.projection import integer
+from wayside.expressions.unknown import UNKNOWN, Unknown
+
+Doubles = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+Objects = NDArray[np.object_]
+
+
+class Tag(IntEnum):
+    """What a row holds."""
+
+    ABSENT = 0
+    """Nothing: not there, null, NaN or unknown."""
+    NUMBER = 1
+    BOOLEAN = 2
+    TEXT = 3
+    OTHER = 4
+    """A list, a map, bytes, a time, or an integer beyond 2^53."""
+    UNREACHABLE = 5
+    """Nothing, and there is no map above either that could hold it: `has()` of it is unknown, not false."""
+
+
+@final
+class _Sentinel:
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __repr__(self) -> str:
+        return self._name
+
+
+MISSING: Final = _Sentinel("MISSING")
+"""In place of a value: the map that is read has no such field."""
+NOWHERE: Final = _Sentinel("NOWHERE")
+"""In place of a value: what the field is read of is no map, or is absent itself."""
+
+
+class Texts:
+    """Gives each text a code. Codes are small integers and stay the same for its life."""
+
+    __slots__ = ("_codes", "_texts")
+
+    def __init__(self) -> None:
+        self._codes: dict[str, int] = {}
+        self._texts: list[str] = []
+
+    def __len__(self) -> int:
+        return len(self._texts)
+
+    def code(self, text: str) -> int:
+        """The code of the text; NUL in it is `␀`, as in every expression.
+
+        Raises UnicodeEncodeError for a lone surrogate, which no expression takes.
+        """
+        found = self._codes.get(text)
+        if found is None:
+            text.encode()
+            if "\0" in text:
+                return self.code(text.replace("\0", "␀"))
+            found = self._codes[text] = len(self._texts)
+            self._texts.append(text)
+        return found
+
+    def text(self, code: int) -> str:
+        """The text of a code. Raises IndexError for a code that was never given."""
+        return self._texts[code]
+
+
+@dataclass(slots=True)
+class Column:
+    """One value for each of n rows."""
+
+    values: Doubles
+    """float64[n]: the number, 1.0 or 0.0 of a boolean, the code of a text, 0.0 otherwise."""
+    tags: Bytes | None
+    """uint8[n]: a `Tag` for each row; None: every row is a number."""
+    others: Objects | None = None
+    """object[n]: the values whose tag is OTHER; None: there is none."""
+
+
+def column_of(values: Sequence[object], texts: Texts) -> Column:
+    """The column of plain values, one a row, as decoders give them and `Expression.evaluate_or_unknown` takes them.
+
+    None, NaN, UNKNOWN and MISSING are absent; NOWHERE is unreachable. Integers are doubles up to 2^53.
+    """
+    column = _column_of_numbers(values)
+    if column is not None:
+        return column
+    doubles: list[float] = []
+    tags: list[Tag] = []
+    for value in values:
+        tag, double = _entry(value, texts)
+        tags.append(tag)
+        doubles.append(double)
+    others: Objects | None = None
+    for row, tag in enumerate(tags) if Tag.OTHER in tags else ():
+        if others is None:
+            others = np.full(len(tags), None, dtype=object)
+        if tag is Tag.OTHER:
+            others[row] = values[row]
+    return Column(np.array(doubles, np.float64), np.array(tags, np.uint8), others)
+
+
+def _column_of_numbers(values: Sequence[object]) -> Column | None:
+    """The column of values that are nothing but doubles, small integers and None; None for others."""
+    kinds = set(map(type, values))
+    if not kinds <= _NUMERIC:
+        return None
+    try:
+        doubles = np.array(values, np.float64)  # None becomes NaN
+    except OverflowError:
+        return None
+    absent = np.isnan(doubles)
+    if int in kinds and not bool((np.abs(doubles) < MAX_EXACT).all(where=~absent)):
+        return None
+    if not absent.any():
+        return Column(doubles, None)
+    doubles[absent] = 0.0
+    return Column(doubles, np.where(absent, np.uint8(Tag.ABSENT), np.uint8(Tag.NUMBER)))
+
+
+_NUMERIC: Final = frozenset({float, int, type(None)})
+_NOTHING: Final = ((None, Tag.ABSENT), (UNKNOWN, Tag.ABSENT), (MISSING, Tag.ABSENT), (NOWHERE, Tag.UNREACHABLE))
+
+
+def _entry(value: object, texts: Texts) -> tuple[Tag, float]:
+    if type(value) is float:
+        return (Tag.NUMBER, value) if value == value else (Tag.ABSENT, 0.0)  # noqa: PLR0124 (NaN alone differs)
+    if type(value) is str:
+        try:
+            return Tag.TEXT, float(texts.code(value))
+        except UnicodeEncodeError:
+            return Tag.OTHER, 0.0
+    if type(value) is bool:
+        return Tag.BOOLEAN, 1.0 if value else 0.0
+    if type(value) is int:
+        number = integer(value)
+        return (Tag.NUMBER, number) if isinstance(number, float) else (Tag.OTHER, 0.0)
+    for nothing, tag in _NOTHING:
+        if value is nothing:
+            return tag, 0.0
+    return _rare_entry(value, texts)
+
+
+def _rare_entry(value: object, texts: Texts) -> tuple[Tag, float]:
+    if isinstance(value, np.generic):  # before the plain types: numpy's double is one of them
+        return _entry(value.item(), texts)
+    if isinstance(value, str):  # an enum's member, say
+        return _entry(str.__str__(value), texts)
+    if isinstance(value, int):
+        return _entry(int(value), texts)
+    return _entry(float(value), texts) if isinstance(value, float) else (Tag.OTHER, 0.0)
+
+
+def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
+    """The value of a row, as `evaluate_or_unknown` gives it; UNKNOWN where the row is absent.
+
+    Raises ValueError for a row whose tag is OTHER in a column that has no others.
+    """
+    tag = Tag.NUMBER if column.tags is None else Tag(int(column.tags[row]))
+    double = float(column.values[row])
+    match tag:
+        case Tag.NUMBER:
+            return double
+        case Tag.BOOLEAN:
+            return double != 0
+        case Tag.TEXT:
+            return texts.text(int(double))
+        case Tag.OTHER:
+            if column.others is None:
+                raise ValueError(f"row {row} holds a value that this column does not have: ask CEL for it")
+            return cast("Value", column.others[row])
+    return UNKNOWN
