@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
-from detector.engine.columns.conditions import Codes
 from detector.engine.columns.group import Group, fits
 from detector.engine.columns.pairs import fits_pairs
 from detector.engine.columns.table import Integers, Truths
+from detector.engine.columns.verdicts import Codes
 from detector.engine.episodes.episodes import TRUE
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import RuleRun

@@ -1,4 +1,4 @@
-"""The conditions of rules that are evaluated together, as one program over the points of a block.
+"""Conditions about clients, of rules that are evaluated together, as one program over the points of a block.
 
 What the columns cannot take or decide is left to CEL, once for each run of ticks in which its inputs do not change.
 """
@@ -6,24 +6,22 @@ What the columns cannot take or decide is left to CEL, once for each run of tick
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
-from detector.engine.columns.reading import constant
+from detector.engine.columns.leaves import ClientLeaves, stacked
 from detector.engine.columns.table import Truths
-from detector.engine.episodes.episodes import FALSE, OUTSIDE, TRUE, UNSURE, UNTIL, UNTIL_UNSURE
-from wayside.expressions import Expression, Path, Reason
+from detector.engine.columns.verdicts import Verdict
+from detector.engine.episodes.episodes import FALSE, TRUE, UNSURE
+from wayside.expressions import Expression, Reason
 from wayside.expressions.columns.graph import Graph
-from wayside.expressions.columns.lowering import Constant
 from wayside.expressions.columns.program import Program
-from wayside.expressions.columns.values import MISSING, Column, Tag, column_of
-from wayside.rules import ClientSubject
-
-Codes = NDArray[np.uint8]
+from wayside.expressions.columns.values import Tag
+from wayside.rules import CompiledRule
 
 _OF_CLIENTS = frozenset({"client", "labels", "parameters"})
 """Variables that differ from client to client."""
@@ -50,10 +48,14 @@ class Condition(NamedTuple):
 class Conditions:
     """What the rules of a group say at the points of a block."""
 
-    def __init__(self, context: Context, tracks: Sequence[Track]) -> None:
-        """The tracks know the places of their signals."""
+    def __init__(
+        self, context: Context, tracks: Sequence[Track], chosen: Callable[[CompiledRule], Mapping[str, Expression]]
+    ) -> None:
+        """`chosen` are a rule's conditions, by what errors call them. The tracks know the places of their signals."""
         self._context = context
         self._tracks = tracks
+        self._chosen = chosen
+        self._leaves = ClientLeaves(context, tracks)
         self._graph = Graph()
         self._of: list[dict[str, Condition]] = [self._conditions(track) for track in tracks]
         """By track and field."""
@@ -62,12 +64,9 @@ class Conditions:
         self._cache: dict[tuple[int, str], dict[str, tuple[Hashable, int, tuple[Reason, str] | None]]] = {}
 
     def _conditions(self, track: Track) -> dict[str, Condition]:
-        rule, found = track.rule, dict[str, Condition]()
-        where = rule.subject.where if isinstance(rule.subject, ClientSubject) else None
-        for field, expression in (("where", where), ("when", rule.when), ("until", rule.until)):
-            if expression is None:
-                continue
-            node = self._graph.add(expression, lambda path: self._leaf(track, path))
+        found = dict[str, Condition]()
+        for field, expression in self._chosen(track.rule).items():
+            node = self._graph.add(expression, lambda path: self._leaves.leaf(track, path))
             found[field] = Condition(
                 field,
                 expression,
@@ -78,126 +77,41 @@ class Conditions:
             )
         return found
 
-    def _leaf(self, track: Track, path: Path) -> Hashable | Constant | None:
-        name = str(path[0])
-        if name in track.signals:
-            return ("signal", track.signals[name]) if len(path) == 1 else None
-        if name in track.element.variables:
-            return constant(track.element.variables, path)
-        if name == "client":
-            return ("client",)
-        if name == "parameters":
-            if not track.rule.parameters.overridden:
-                return constant({"parameters": track.rule.parameters.own}, path)
-            return ("parameters", track.rule.name, *path[1:])
-        if name == "labels":
-            return path if len(path) == 2 else None
-        return None
+    def has(self, field: str) -> Truths:
+        """Which tracks have the condition; shape (tracks, 1)."""
+        return np.array([[field in each] for each in self._of])
 
-    def observed(self, block: Block) -> Codes:
-        """The rules' observations (see SubjectState.run), shape (tracks, clients, ticks). Counts what is unknown."""
-        shape = (len(self._tracks), len(block.clients) * len(block.ticks))
-        true: dict[str, Truths] = {}
-        false: dict[str, Truths] = {}
-        values, tags = self._leaves(block)
+    def verdicts(self, block: Block) -> dict[str, Verdict]:
+        """What the conditions say, by field, shape (tracks, points); unknown in tracks without it. Counts unknowns."""
+        points = len(block.clients) * len(block.ticks)
+        shape = (len(self._tracks), points)
+        found: dict[str, Verdict] = {}
+        values, tags = stacked([self._leaves.at_points(block, each) for each in self._program.leaves], points)
         results = self._program.run(values, tags)
         strange = tags is not None and bool((tags > Tag.NUMBER).any())
-        for field in ("where", "when", "until"):
-            chosen = [(row, self._of[row][field]) for row, track in enumerate(self._tracks) if field in self._of[row]]
-            if not chosen:
-                continue
-            true[field], false[field] = np.zeros(shape, bool), np.zeros(shape, bool)
+        for field in dict.fromkeys(field for each in self._of for field in each):
+            chosen = [(row, self._of[row][field]) for row in range(len(self._tracks)) if field in self._of[row]]
+            true, false = found[field] = Verdict(np.zeros(shape, bool), np.zeros(shape, bool))
             ours = [(row, each.node) for row, each in chosen if each.node is not None]
             if ours:
                 rows = [row for row, _ in ours]
-                true[field][rows], false[field][rows] = results.truths([node for _, node in ours])
+                true[rows], false[rows] = results.truths([node for _, node in ours])
             for row, condition in chosen:
                 foreign: Truths | None = None
                 if condition.node is None:
-                    self._ask_cel(block, row, condition, true[field][row], false[field][row])
+                    self._ask_cel(block, row, condition, true[row], false[row])
                     continue
                 if strange and (foreign := results.foreign(condition.node)) is not None and foreign.any():
                     own = block.points(row)
                     foreign = foreign if own is None else foreign & own
                     for point in np.flatnonzero(foreign).tolist():
-                        self._ask_point(block, row, condition, point, true[field][row], false[field][row])
-            unknown = ~(true[field] | false[field])
+                        self._ask_point(block, row, condition, point, true[row], false[row])
+            unknown = ~(true | false)
             if unknown.any():
                 for row, condition in chosen:
                     if condition.node is not None and unknown[row].any():
                         self._note_unknown(block, row, condition, unknown[row], tags)
-        return self._coded(block, true, false, shape)
-
-    def _coded(
-        self, block: Block, true: Mapping[str, Truths], false: Mapping[str, Truths], shape: tuple[int, int]
-    ) -> Codes:
-        when_true, when_false = true["when"], false["when"]
-        if "until" in true:
-            has = np.array(["until" in each for each in self._of])[:, None]
-            until_true = np.where(has, true["until"], when_false)
-            until_false = np.where(has, false["until"], when_true)
-        else:
-            until_true, until_false = when_false, when_true
-        may, not_ = when_true & until_false, when_false | until_true
-        outside: Truths | None = None
-        if "where" in true:
-            has = np.array(["where" in each for each in self._of])[:, None]
-            may = may & (true["where"] | ~has)
-            outside = false["where"]
-            not_ = not_ | outside
-        codes = np.where(not_, np.uint8(FALSE), np.where(may, np.uint8(TRUE), np.uint8(UNSURE)))
-        codes |= np.where(until_true, np.uint8(UNTIL), np.where(until_false, np.uint8(0), np.uint8(UNTIL_UNSURE)))
-        if outside is not None:
-            codes[outside] = FALSE | OUTSIDE
-        codes = codes.reshape(shape[0], len(block.clients), len(block.ticks))
-        if block.present is not None:
-            codes[:, ~block.present] = FALSE
-        return codes
-
-    def _leaves(self, block: Block) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
-        """What the program's leaves are at the points."""
-        columns = [self._leaf_column(block, name) for name in self._program.leaves]
-        points = len(block.clients) * len(block.ticks)
-        values = np.empty((len(columns), points))
-        for at, column in enumerate(columns):
-            values[at] = column.values
-        if all(column.tags is None for column in columns):
-            return values, None
-        tags = np.full(values.shape, Tag.NUMBER, np.uint8)
-        for at, column in enumerate(columns):
-            if column.tags is not None:
-                tags[at] = column.tags
-        return values, tags
-
-    def _leaf_column(self, block: Block, name: Any) -> Column:
-        if name[0] == "signal":
-            column: Column = block.signals[name[1]]
-            return column
-        texts = self._context.tables.texts
-        if name[0] == "client":
-            codes = np.array([texts.code(client) for client in block.clients], float)
-            column = Column(codes, np.full(len(codes), Tag.TEXT, np.uint8), None)
-        else:
-            column = column_of([*self._of_clients(block, name)], texts)
-        times = len(block.ticks)
-        return Column(
-            np.repeat(column.values, times),
-            None if column.tags is None else np.repeat(column.tags, times),
-            None if column.others is None else np.repeat(column.others, times),
-        )
-
-    def _of_clients(self, block: Block, name: tuple[Any, ...]) -> Iterator[Any]:
-        """A label or a parameter of each client."""
-        rule = next((track.rule for track in self._tracks if track.rule.name == name[1]), None)
-        for client in block.clients:
-            if name[0] == "labels":
-                yield self._context.clients.labels(client).get(name[1], MISSING)
-                continue
-            assert rule is not None  # noqa: S101  the leaf is of one of the rules
-            value: Any = rule.parameters.of(client)
-            for step in name[2:]:
-                value = value.get(step, MISSING) if isinstance(value, Mapping) else MISSING
-            yield value
+        return found
 
     # CEL
 
@@ -293,7 +207,7 @@ class Conditions:
             never = {signal.name for signal in track.rule.signals if not possible(signal.stream, client)}
             if any(path[0] in never for path in condition.expression.paths):
                 return
-        name = client if condition.field == "where" else track.subject(client).text
+        name = track.subject(client).text if condition.field in track.place else client
         track.counters.note(
             reason, message, f"{condition.field} of {name}{track.place.get(condition.field, '')}", times
         )

@@ -8,19 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from detector.engine.columns.leaves import stacked
 from detector.engine.columns.table import Truths
+from detector.engine.columns.verdicts import Verdict
 from wayside.expressions import Expression, Path, Reason
 from wayside.expressions.columns.graph import Graph
 from wayside.expressions.columns.lowering import Constant
 from wayside.expressions.columns.program import Program
-from wayside.expressions.columns.values import Column, Tag, Texts
-
-
-class Verdict(NamedTuple):
-    """Where a condition is true and where it is false; unknown where it is neither."""
-
-    true: Truths
-    false: Truths
+from wayside.expressions.columns.values import Column, Texts
 
 
 class Rows(NamedTuple):
@@ -63,12 +58,7 @@ class Formulas:
         if not count or not self._conditions:
             return {field: Verdict(np.zeros(count, bool), np.zeros(count, bool)) for field in self._conditions}
         columns = [rows.column(leaf) for leaf in self._program.leaves]
-        values = np.stack([each.values for each in columns]) if columns else np.zeros((0, count))
-        tags = None
-        if any(each.tags is not None for each in columns):
-            tags = np.stack(
-                [np.full(count, Tag.NUMBER, np.uint8) if each.tags is None else each.tags for each in columns]
-            )
+        values, tags = stacked(columns, count)
         results = self._program.run(values, tags)
         found: dict[str, Verdict] = {}
         for field, node in self._nodes.items():

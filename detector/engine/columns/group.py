@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from detector.engine.buffering.clients import Clients
 from detector.engine.columns.block import Block, Context, Track
-from detector.engine.columns.conditions import Codes, Conditions
+from detector.engine.columns.conditions import Conditions
 from detector.engine.columns.signals import Signals
 from detector.engine.columns.table import Truths
 from detector.engine.columns.tables import Tables
+from detector.engine.columns.verdicts import Codes, Verdict, observed
+from detector.engine.episodes.episodes import FALSE
+from detector.engine.episodes.subjects import Subject
 from wayside.api.eventrule import Aggregate
+from wayside.expressions import Expression
 from wayside.rules import ClientSubject, CompiledRule
 
 
@@ -45,7 +50,7 @@ class Group:
         self.tracks = tracks
         self._context = context
         self._signals = Signals(context, tracks)
-        self._conditions = Conditions(context, tracks)
+        self._conditions = Conditions(context, tracks, _conditions)
         if any("streams" in names_of(track.rule) for track in tracks):
             self._signals.watch_all_streams()
 
@@ -58,30 +63,62 @@ class Group:
         looks at: `looked`, shape (tracks, clients), or all.
         """
         block = Block(self._context, ticks, clients)
-        block.present = self._present(block)
+        block.present = present(block, self._context.clients)
         block.looked = None if looked is None or looked.all() else looked
         self._signals.look(block, floor)
         for row, track in enumerate(self.tracks):
             points = block.points(row)
             track.counters.evaluations += len(clients) * len(ticks) if points is None else int(points.sum())
-        return block, self._conditions.observed(block)
+        return block, self._observed(block)
 
-    def _present(self, block: Block) -> Truths | None:
-        """Which clients are known at which ticks: within a block, some may come."""
-        clients = self._context.clients
-        if clients.newest <= block.ticks[0]:
-            return None
-        since = np.array([clients.since(client) for client in block.clients], np.int64)
-        present: Truths = block.times[None, :] >= since[:, None]
-        return present
+    def _observed(self, block: Block) -> Codes:
+        found = self._conditions.verdicts(block)
+        when = found["when"]
+        until, scope = Verdict(when.false, when.true), None
+        if "until" in found:
+            until = self._where_any("until", found["until"], until)
+        if "where" in found:
+            scope = self._where_any("where", found["where"], Verdict(np.array(True), np.array(False)))
+        codes = observed(when, until, scope).reshape(len(self.tracks), *block.shape)
+        if block.present is not None:
+            codes[:, ~block.present] = FALSE
+        return codes
+
+    def _where_any(self, field: str, verdict: Verdict, otherwise: Verdict) -> Verdict:
+        """A condition's verdict, and another for the rules that have none."""
+        has = self._conditions.has(field)
+        return Verdict(np.where(has, verdict.true, otherwise.true), np.where(has, verdict.false, otherwise.false))
+
+    @property
+    def room(self) -> int:
+        """Numbers of subjects of a rule are smaller."""
+        return len(self._context.tables.names)
+
+    def number(self, subject: Subject) -> int:
+        """The number of a subject among those of its rule and element."""
+        return self._context.tables.number(subject.clients[0])
+
+
+def _conditions(rule: CompiledRule) -> Mapping[str, Expression]:
+    where = rule.subject.where if isinstance(rule.subject, ClientSubject) else None
+    conditions = {"where": where, "when": rule.when, "until": rule.until}
+    return {field: each for field, each in conditions.items() if each is not None}
+
+
+def present(block: Block, clients: Clients) -> Truths | None:
+    """Which clients are known at which ticks: within a block, some may come. None: all at all."""
+    if clients.newest <= block.ticks[0]:
+        return None
+    since = np.array([clients.since(client) for client in block.clients], np.int64)
+    known: Truths = block.times[None, :] >= since[:, None]
+    return known
 
 
 def names_of(rule: CompiledRule) -> frozenset[str]:
     """The variables that a rule's conditions and the templates of its actions read."""
-    expressions = [rule.when, rule.until, rule.subject.where if isinstance(rule.subject, ClientSubject) else None]
     templates = [
         *(deploy.parameters for deploy in rule.deploys),
         *(template for action in rule.actions for template in action.templates.values()),
     ]
-    found = {name for each in expressions if each is not None for name in each.names}
+    found = {name for each in _conditions(rule).values() for name in each.names}
     return frozenset(found.union(*(template.names for template in templates)))

@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
-from detector.engine.columns.conditions import Codes
-from detector.engine.columns.formulas import Formulas, Rows, Verdict
+from detector.engine.columns.formulas import Formulas, Rows
 from detector.engine.columns.group import fit_signals
+from detector.engine.columns.leaves import ClientLeaves
 from detector.engine.columns.nearby import Crowd, Nearby, nearby
 from detector.engine.columns.places import Places, Whereabouts
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import Signals
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables
-from detector.engine.episodes.episodes import FALSE, OUTSIDE, TRUE, UNSURE, UNTIL, UNTIL_UNSURE
+from detector.engine.columns.verdicts import Codes, Verdict, observed
 from detector.engine.episodes.subjects import Subject
 from detector.engine.scoping.positions import described
 from detector.engine.scoping.scopes import CLOSING_NS
 from wayside.expressions import Path, Reason
 from wayside.expressions.columns.lowering import Constant
-from wayside.expressions.columns.values import MISSING, Column, Doubles, Tag, column_of
+from wayside.expressions.columns.values import Column, Doubles, Tag
 from wayside.rules import CompiledRule, PairSubject
 
 _ROLES = ("a", "b")
@@ -81,9 +81,10 @@ class PairColumns:
             self._signals.watch_all_streams()
         self._reads_streams = bool(rule.signals) or _reads_streams(rule)
         self._where_abouts = Whereabouts(rule.subject.position, context, track.counters, self._signals.ages)
+        self._leaves = ClientLeaves(context, [track])
         texts = context.tables.texts
         self._roles = {
-            role: Formulas({"where": where}, self._leaf_of_client, texts)
+            role: Formulas({"where": where}, lambda path: self._leaves.leaf(track, path), texts)
             for role, where in zip(_ROLES, (rule.subject.a, rule.subject.b), strict=True)
         }
         conditions = {"where": rule.subject.where, "when": rule.when, "until": rule.until}
@@ -192,7 +193,7 @@ class PairColumns:
 
         rows = Rows(
             len(block.clients),
-            lambda leaf: self._column(block, leaf),
+            lambda leaf: self._leaves.column(block, leaf),
             lambda row: {**block.view(self._track, row), **self._track.element.variables},
             note,
             not self._context.possible.limited,
@@ -232,12 +233,7 @@ class PairColumns:
         for each in scope:
             inside &= each.true
             outside |= each.false
-        may = inside & near & when.true & until.false
-        never = outside | (sight.placed & ~near) | when.false | until.true
-        codes = np.where(never, np.uint8(FALSE), np.where(may, np.uint8(TRUE), np.uint8(UNSURE)))
-        codes |= np.where(until.true, np.uint8(UNTIL), np.where(until.false, np.uint8(0), np.uint8(UNTIL_UNSURE)))
-        codes[outside] = FALSE | OUTSIDE
-        return codes
+        return observed(when, until, Verdict(inside, outside), Verdict(near, sight.placed & ~near))
 
     def _names(self, sight: Sight, row: int) -> tuple[str, str]:
         return sight.block.clients[int(sight.first[row])], sight.block.clients[int(sight.second[row])]
@@ -262,26 +258,8 @@ class PairColumns:
             return None
         if below[0] == "position":
             return path if len(below) == 2 and below[1] in (*self._subject.position.axes, "z") else None
-        found = self._leaf_below(below)
+        found = self._leaves.of_client(self._track, below)
         return found if found is None or isinstance(found, Constant) else (name, found)
-
-    def _leaf_of_client(self, path: Path) -> Hashable | Constant | None:
-        """The leaf of a path of a role's condition."""
-        if str(path[0]) in self._track.element.variables:
-            return constant(self._track.element.variables, path)
-        return self._leaf_below(path)
-
-    def _leaf_below(self, path: Path) -> Hashable | Constant | None:
-        name = str(path[0])
-        if name in self._track.signals or name == "client":
-            return path if len(path) == 1 else None
-        if name == "labels":
-            return path if len(path) == 2 else None
-        if name == "parameters" and len(path) > 1:
-            if not self._track.rule.parameters.overridden:
-                return constant({"parameters": self._track.rule.parameters.own}, path)
-            return path
-        return None
 
     def _pair_column(self, sight: Sight, leaf: Any) -> Column:
         if leaf == ("distance",):
@@ -296,29 +274,12 @@ class PairColumns:
             axes = [*self._subject.position.axes]
             values = places.axes[axes.index(leaf[2])] if leaf[2] in axes else np.zeros(len(at))
             return Column(values, np.where(places.known, np.uint8(Tag.NUMBER), np.uint8(Tag.UNREACHABLE)))
-        whole, rows = self._column(sight.seen, leaf[1]), sight.at[at]
+        whole, rows = self._leaves.column(sight.seen, leaf[1]), sight.at[at]
         return Column(
             whole.values[rows],
             None if whole.tags is None else whole.tags[rows],
             None if whole.others is None else whole.others[rows],
         )
-
-    def _column(self, block: Block, leaf: Any) -> Column:
-        """What a leaf is for each client of a block."""
-        name = leaf[0]
-        if name in self._track.signals:
-            return block.signals[self._track.signals[name]]
-        values: list[Any] = []
-        for client in block.clients:
-            value: Any = {
-                "client": client,
-                "labels": self._context.clients.labels(client),
-                "parameters": self._track.rule.parameters.of(client),
-            }
-            for step in leaf:
-                value = value.get(step, MISSING) if isinstance(value, Mapping) else MISSING
-            values.append(value)
-        return column_of(values, self._context.tables.texts)
 
 
 def _where(values: Doubles, known: Truths) -> Column:

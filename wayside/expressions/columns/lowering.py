@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Final, NamedTuple
 
 from wayside.expressions.cel import Expression, Kind
@@ -34,17 +34,31 @@ class RefusedError(Exception):
     """The columns cannot take this expression."""
 
 
+class Part(NamedTuple):
+    """A part of an expression, or one that was put together of parts."""
+
+    tree: Node
+    kinds: Mapping[str, Kind]
+    """Of the variables that it may read."""
+    result: Kind
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The variables that it may read."""
+        return frozenset(self.kinds)
+
+
 Leaves = Callable[[Path], Hashable | Constant | None]
 """The leaf of a path, a constant in its place, or None where the columns do not have it."""
 
 
-def lower(graph: Nodes, expression: Expression, leaf: Leaves) -> int:
+def lower(graph: Nodes, expression: Expression | Part, leaf: Leaves) -> int:
     """The node of the expression's result. Raises RefusedError where there is none."""
     return _Lowering(graph, expression, leaf).root()
 
 
 class _Lowering:
-    def __init__(self, graph: Nodes, expression: Expression, leaf: Leaves) -> None:
+    def __init__(self, graph: Nodes, expression: Expression | Part, leaf: Leaves) -> None:
         self._graph = graph
         self._expression = expression
         self._tree = expression.tree

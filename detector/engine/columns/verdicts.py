@@ -1,0 +1,39 @@
+"""What conditions yield: verdicts, and of those the observations that bring episodes forward."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.engine.columns.table import Truths
+from detector.engine.episodes.episodes import FALSE, OUTSIDE, TRUE, UNSURE, UNTIL, UNTIL_UNSURE
+
+Codes = NDArray[np.uint8]
+"""Observations, see `SubjectState.run`."""
+
+
+class Verdict(NamedTuple):
+    """Where a condition is true and where it is false; unknown where it is neither."""
+
+    true: Truths
+    false: Truths
+
+
+def observed(when: Verdict, until: Verdict, scope: Verdict | None = None, start: Verdict | None = None) -> Codes:
+    """The observations of arrays of points of any shape.
+
+    `scope`: whether a point is in the rule's scope; outside, open episodes end. `start`: whether an episode may start
+    at all. None: everywhere.
+    """
+    may, not_ = when.true & until.false, when.false | until.true
+    for each in (scope, start):
+        if each is not None:
+            may = may & each.true
+            not_ = not_ | each.false
+    codes = np.where(not_, np.uint8(FALSE), np.where(may, np.uint8(TRUE), np.uint8(UNSURE)))
+    codes |= np.where(until.true, np.uint8(UNTIL), np.where(until.false, np.uint8(0), np.uint8(UNTIL_UNSURE)))
+    if scope is not None:
+        codes[scope.false] = FALSE | OUTSIDE
+    return codes
