@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from detector.assembly import RuleBook, inlets, make_engine
 from detector.engine.episodes.events import Event
+from detector.engine.evaluation import Sight
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import replay_arrivals
 from wayside.api import Detector, EventRule
@@ -35,9 +36,18 @@ class Live:
         self._engine = make_engine(detector, entries, holder=detector.name, start=start)
         self._engine.set_rules(compiled)
 
+    def watch(self) -> None:
+        """Look at each evaluation by itself, so that no rule is evaluated in columns."""
+        for run in self._engine.rules.values():
+            run.witness = _nobody
+
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, and run the ticks up to `until`, in nanoseconds since the epoch."""
         return self._engine.advance(arrivals, until)
+
+
+def _nobody(_: Sight) -> None:
+    """Looks on."""
 
 
 def by_tick(arrivals: Iterable[Arrival], period: int) -> Iterator[tuple[int, list[Arrival]]]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.fleets import FleetBlock, FleetGroup, fits_fleet
 from detector.engine.columns.group import Group, fits
 from detector.engine.columns.pairs import fits_pairs
 from detector.engine.columns.table import Integers, Truths
@@ -36,15 +37,24 @@ _NEVER = np.iinfo(np.int64).max
 class RuleGroup:
     """The rules that are due at the same ticks, and what was last seen of their subjects."""
 
-    def __init__(self, runs: Sequence[RuleRun], orders: Mapping[str, int], context: Context, every: int, period: int):
+    def __init__(
+        self,
+        runs: Sequence[RuleRun],
+        orders: Mapping[str, int],
+        context: Context,
+        every: int,
+        period: int,
+        columns: type[Group | FleetGroup] = Group,
+    ) -> None:
         """`every` is the rules' period, `period` that at which they are evaluated: longer where some are left out."""
         self.every = every
         self.period = period
         self.runs = runs
         self.waiting: list[int] = []
         """Ticks that are not evaluated yet."""
-        self.columns = Group(
-            [Track(run.rule, element, run.counters, run.read) for run in runs for element in run.rule.elements], context
+        elements = [(run, element) for run in runs for element in run.rule.elements]
+        self.columns = columns(
+            [Track(run.rule, each, run.counters, run.read, row) for row, (run, each) in enumerate(elements)], context
         )
         self.may_wait = True
         """Whether several ticks are evaluated together."""
@@ -66,7 +76,7 @@ class RuleGroup:
         self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
     ) -> Iterator[Happened]:
         """What happens at these ticks. `only`: by rule, the subjects that it looks at; others are looked at in vain."""
-        if not clients:
+        if not clients and self.columns.needs_clients:
             return
         looked = None if only is None else self._looked(clients, only)
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
@@ -98,11 +108,11 @@ class RuleGroup:
                 run.disturbed = True
         # Before there is room for all clients: of a subject that was restored, no sample may have come yet.
         watched = {
-            row: [tables.number(each.clients[0]) for each in run.subjects if each.element == track.element.name]
+            row: [self.columns.number(each) for each in run.subjects if each.element == track.element.name]
             for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True))
             if run.disturbed
         }
-        clients, room = len(tables.names), self._last.shape[1]
+        clients, room = self.columns.room, self._last.shape[1]
         if clients > room:
             more = (len(self._of), max(clients, 2 * room) - room)
             self._last = np.concatenate((self._last, np.full(more, _AGAIN, np.uint8)), axis=1)
@@ -116,7 +126,7 @@ class RuleGroup:
             run.disturbed = False
 
     def _changed(
-        self, block: Block, codes: Codes, looked: Truths | None
+        self, block: Block | FleetBlock, codes: Codes, looked: Truths | None
     ) -> Iterator[tuple[int, tuple[int, list[int]]]]:
         """By track and client, the ticks at which the observation changes or something is due, where that matters."""
         numbers, last = block.numbers, int(block.times[-1])
@@ -151,7 +161,9 @@ class RuleGroup:
             row, at = divmod(int(which[begin]), len(block.clients))
             yield row, (at, ticks[begin:end])
 
-    def _step(self, block: Block, codes: Codes, row: int, subject_at: tuple[int, list[int]]) -> Iterator[Happened]:
+    def _step(
+        self, block: Block | FleetBlock, codes: Codes, row: int, subject_at: tuple[int, list[int]]
+    ) -> Iterator[Happened]:
         """Bring one subject's state forward over all ticks of the block."""
         at, changes = subject_at
         run, track, number = self._of[row], self.columns.tracks[row], int(block.numbers[at])
@@ -180,7 +192,7 @@ class RuleGroup:
         self._watched[row, number] = run.state(subject) is not None
         self._wakes[row, number] = _NEVER if wake is None else wake
 
-    def _candidate(self, block: Block, track: Track, subject: Subject, point: int) -> Candidate:
+    def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
         return Candidate(subject, block.variables(track, point), in_scope=True, near=True)
 
 
@@ -205,6 +217,7 @@ class Blocks:
         orders = {name: order for order, name in enumerate(runs)}
         by_times: dict[tuple[int, int], list[RuleRun]] = {}
         by_stream: dict[str, list[RuleRun]] = {}
+        fleets: dict[tuple[int, int], list[RuleRun]] = {}
         pairs: list[tuple[RuleRun, int]] = []
         for run in runs.values():
             rule = run.rule
@@ -212,6 +225,8 @@ class Blocks:
                 continue
             if rule.every_ns is not None and fits_pairs(rule, self._context):
                 pairs.append((run, rule.every_ns))
+            elif rule.every_ns is not None and fits_fleet(rule, self._context.tables):
+                fleets.setdefault((rule.every_ns, rule.every_ns * thinning(run)), []).append(run)
             elif not fits(rule, self._context.tables):
                 continue
             elif rule.every_ns is not None:
@@ -221,6 +236,10 @@ class Blocks:
         self._context.tables.forget_users()
         self._groups = [
             RuleGroup(chosen, orders, self._context, every, period) for (every, period), chosen in by_times.items()
+        ]
+        self._groups += [
+            RuleGroup(chosen, orders, self._context, every, period, FleetGroup)
+            for (every, period), chosen in fleets.items()
         ]
         self._groups += [
             PairGroup(run, orders[run.rule.name], self._context, every, every * thinning(run)) for run, every in pairs

@@ -71,7 +71,7 @@ class PairGroup:
         self._order = order
         self._context = context
         self._element = run.rule.elements[0]
-        self._columns = PairColumns(Track(run.rule, self._element, run.counters, run.read), context)
+        self._columns = PairColumns(Track(run.rule, self._element, run.counters, run.read, 0), context)
         self._watched = _NOBODY
         self._version = -1
         self._clients: Sequence[str] = ()

@@ -15,7 +15,7 @@ from detector.engine.buffering.possible import Possible
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables
 from detector.engine.counters import RuleCounters
-from detector.engine.episodes.subjects import Subject
+from detector.engine.episodes.subjects import FLEET, Subject
 from detector.engine.scoping.positions import Positions
 from wayside.expressions import UNKNOWN
 from wayside.expressions.columns.values import Column, value_at
@@ -40,23 +40,26 @@ class Context(NamedTuple):
 class Track:
     """A rule for one element of its `each`."""
 
-    def __init__(self, rule: CompiledRule, element: CompiledElement, counters: RuleCounters, place: Mapping[str, str]):
-        """`place` has, by condition, what errors say that it reads."""
+    def __init__(
+        self, rule: CompiledRule, element: CompiledElement, counters: RuleCounters, place: Mapping[str, str], row: int
+    ) -> None:
+        """`place` has, by condition, what errors say that it reads; `row` is the track's place in its group."""
         self.rule = rule
         self.element = element
         self.counters = counters
         self.place = place
+        self.row = row
         self.signals: dict[str, int] = {}
         """Places of the rule's signals in the group, by name, in the order of the rule."""
         self._subjects: dict[str, Subject] = {}
 
     def subject(self, client: str) -> Subject:
-        """The subject that the client is."""
+        """The subject that the client, or the fleet, is."""
         subject = self._subjects.get(client)
         if subject is None:
             if len(self._subjects) > _SUBJECTS:
                 self._subjects.clear()
-            subject = self._subjects[client] = Subject((client,), self.element.name)
+            subject = self._subjects[client] = Subject(() if client == FLEET else (client,), self.element.name)
         return subject
 
 

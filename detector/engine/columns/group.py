@@ -43,7 +43,9 @@ def fit_signals(rule: CompiledRule, tables: Tables) -> bool:
 
 
 class Group:
-    """The rules that are evaluated at the same ticks."""
+    """The rules about clients that are evaluated at the same ticks."""
+
+    needs_clients = True
 
     def __init__(self, tracks: Sequence[Track], context: Context) -> None:
         """All rules fit (see `fits`)."""

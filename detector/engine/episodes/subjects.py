@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from wayside.names import subject_text
 from wayside.rules import ClientSubject, CompiledRule, FleetSubject, PairSubject
+
+FLEET: Final = ""
+"""In place of a client's name: the fleet. No client has such a name."""
 
 
 class Subject(NamedTuple):

@@ -14,14 +14,12 @@ from typing import Any
 from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.plain import plain, to_text
+from detector.engine.episodes.subjects import FLEET
 from detector.engine.samples.sample import Sample, Stamped
 from wayside.rules import CompiledRule, episode_stream
 
 MAXIMUM_BYTES = 64 * 2**20
 """Of all starts that are kept; beyond, the oldest go and are counted as evicted."""
-
-_EVERYBODY = ""
-"""In place of a client: no client has such a name."""
 
 
 class Starts:
@@ -69,7 +67,7 @@ class Starts:
             self.started(event)
         elif event.end_time is not None:
             open_episodes = self._open.get(episode_stream(event.rule), {})
-            for client in event.subjects or (_EVERYBODY,):
+            for client in event.subjects or (FLEET,):
                 open_episodes.get(client, set()).discard(event.episode)
                 if not open_episodes.get(client):
                     open_episodes.pop(client, None)
@@ -80,7 +78,7 @@ class Starts:
         if stream not in self._durations:
             return
         payload = _payload(event)
-        for client in event.subjects or (_EVERYBODY,):
+        for client in event.subjects or (FLEET,):
             self._open.setdefault(stream, {}).setdefault(client, set()).add(event.episode)
             lane = self.buffer.lane(client, stream)
             if lane is None:
@@ -101,11 +99,11 @@ class Starts:
     def is_open(self, client: str, stream: str) -> bool:
         """Whether an episode is open that the client is a subject of."""
         episodes = self._open.get(stream, {})
-        return bool(episodes.get(client) or episodes.get(_EVERYBODY))
+        return bool(episodes.get(client) or episodes.get(FLEET))
 
     def lane(self, client: str, stream: str) -> Lane | None:
         """The starts of the episodes that the client is a subject of."""
-        return self.buffer.lane(client, stream) or self.buffer.lane(_EVERYBODY, stream)
+        return self.buffer.lane(client, stream) or self.buffer.lane(FLEET, stream)
 
     def lose(self, clients: Iterable[str]) -> None:
         """These clients are lost; should they return, past starts are not theirs. (What is open ends by an event.)"""

@@ -1,4 +1,4 @@
-"""Random scenes for rules about clients: rules of every kind, what comes in, and what is done to the engine meanwhile.
+"""Random scenes for rules about clients and the fleet: rules, what comes in, and what is done to the engine meanwhile.
 
 A scene follows from its seed. It is driven in cuts: each is one call of `Engine.advance`.
 """
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from detector.assembly import RuleBook, inlets, make_engine
 from detector.engine.counters import RuleCounters
 from detector.engine.engine import NoAnswerError
+from detector.engine.evaluation import Sight
 from detector.engine.samples.sample import Arrival
 from tests.driving import SECOND, START, a_detector, a_rule, a_stream
 from wayside.api import Detector, EventRule
@@ -57,6 +58,13 @@ _FORMS = {
     "list": ["size({}) > 1", "{}[0] > 1"],
 }  # fmt: skip
 
+_FOLDS = [
+    "members.exists(m, {})", "members.all(m, {})", "members.exists_one(m, {})",
+    "size(members.filter(m, {})) >= 2", "members.filter(m, {}).size() * 2 == 4", "size(members) > 1",
+    "size(members) < parameters.f", "members.exists(m, ({}) && m.client == members[0].client)",
+    "members.filter(m, {}).map(m, m.client)[0] == 'c1'",
+]  # fmt: skip
+
 _VALUES: list[dict[str, Any]] = [
     {}, {"v": None}, {"v": "x"}, {"v": True}, {"w": 1}, {"v": 1, "w": 2}, {"v": 0.0}, {"v": -0.0}, {"v": 0.1},
     {"v": [1]},
@@ -92,13 +100,38 @@ def _condition(random: Random, names: list[tuple[str, str]], each: bool) -> str:
     return text
 
 
+def _members(random: Random, names: list[tuple[str, str]]) -> str:
+    simple = [random.choice(_FORMS[kind]).format(name) for name, kind in names]
+    return random.choice(["true", "client != 'c2'", "'p' in streams", *simple, *simple])
+
+
+def _fleet_condition(random: Random, names: list[tuple[str, str]], each: bool) -> str:
+    """Loops that columns take, and others."""
+
+    def simple() -> str:
+        name, kind = random.choice(names)
+        item = f"m.{name}"
+        if each and kind == "number" and random.random() < 0.4:
+            predicate = f"{item} > e.limit"
+        else:
+            predicate = random.choice(_FORMS[kind]).format(item)
+            for variable in ("labels.", "parameters.", "client ", "streams"):
+                predicate = predicate.replace(variable, f"m.{variable}")
+        return random.choice(_FOLDS).format(predicate)
+
+    text = simple()
+    for _ in range(random.choice([0, 0, 1, 2])):
+        text = f"{random.choice(['!(', '('])}{text}) {random.choice(['&&', '||'])} ({simple()})"
+    return text
+
+
 def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
     signals, names = [], []
     for at in range(random.choice([1, 1, 2])):
         what, signal = random.choice(_SIGNALS)
         signals.append({"name": f"g{at}", **signal})
         names.append((f"g{at}", what))
-    each = kind == "client" and random.random() < 0.2
+    each = kind in ("client", "fleet") and random.random() < 0.2
     spec: dict[str, Any] = {"signals": signals, "parameters": {"f": 1.5}}
     spec["evaluation"] = random.choice([{"every": every} for every in ("100ms", "100ms", "300ms", "1s")])
     if each:
@@ -110,7 +143,17 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
         signals.append({"name": "over", "rule": "r0", "aggregate": "Active"})
         spec["when"] = f"over && ({spec['when']})"
     if kind == "fleet":
-        return a_rule(f"r{number}", **spec | {"scope": {"fleet": {"members": "true"}}, "when": "size(members) > 1"})
+        spec["when"] = _fleet_condition(random, names, each)
+        spec["scope"] = {"fleet": {"members": _members(random, names)}}
+        if random.random() < 0.5:
+            spec["until"] = _fleet_condition(random, names, each)
+        if random.random() < 0.3:
+            sources = {"sources": "${members.map(m, m.client)}"}
+            spec["actions"] = [{"name": "d", "deploy": {"template": "t", "parameters": sources, "follow": True}}]
+        for field, values in (("for", ("200ms", "1s")), ("cooldown", ("500ms",)), ("unknownTimeout", ("300ms", "1s"))):
+            if random.random() < 0.3:
+                spec[field] = random.choice(values)
+        return a_rule(f"r{number}", **spec)
     if random.random() < 0.1:
         spec["evaluation"] = random.choice([{"onSample": "s"}, {"onSample": "p"}, {"onDemand": True}])
     if random.random() < 0.3:
@@ -183,7 +226,7 @@ def a_scene(seed: int) -> Scene:
         clients=[{"name": "c0", "labels": {"kind": "bus"}},
                  {"name": "c1", "labels": {"kind": "car"}, "parameters": {f"r{random.randrange(5)}": {"f": 2.5}}}],
     )  # fmt: skip
-    mixed = random.random() < 0.3
+    mixed = random.random() < 0.5
     kinds = ["client"] * 3 + (random.sample(["client", "over", "fleet"], 2) if mixed else ["client"] * 2)
     rules = [a_random_rule(random, number, kind) for number, kind in enumerate(kinds)]
     arrivals = _arrivals(random, data)
@@ -224,8 +267,11 @@ class Outcome(NamedTuple):
     counters: dict[str, Any]
 
 
-def driven(scene: Scene, cut: Callable[[], int]) -> Outcome:
-    """Drive the scene; `cut` says how many arrivals come in one call, at least: those of equal times come together."""
+def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) -> Outcome:
+    """Drive the scene; `cut` says how many arrivals come in one call, at least: those of equal times come together.
+
+    `one_by_one`: every rule is evaluated by CEL, subject by subject, as if somebody watched each evaluation.
+    """
     entries, book = inlets(scene.detector), RuleBook()
     engine = make_engine(scene.detector, entries, holder="h", start=START - 1)
     engine.counters.watch_ages = True
@@ -236,6 +282,8 @@ def driven(scene: Scene, cut: Callable[[], int]) -> Outcome:
         match kind:
             case "rules":
                 found += engine.set_rules(book.compile(what, scene.detector, entries.fields)[0])
+                for run in engine.rules.values() if one_by_one else ():
+                    run.witness = _nobody
             case "pause":
                 engine.set_paused(what)
             case "level":
@@ -263,6 +311,10 @@ def driven(scene: Scene, cut: Callable[[], int]) -> Outcome:
         demands.append(sorted((name, str(each.parameters)) for name, each in engine.demands().items()))
     counted = {name: _counted(each) for name, each in sorted(engine.counters.rules.items())}
     return Outcome(events, demands, {**counted, "undecodable": dict(engine.counters.undecodable)})
+
+
+def _nobody(_: Sight) -> None:
+    """Watches."""
 
 
 def _counted(rule: RuleCounters) -> dict[str, Any]:

@@ -20,3 +20,13 @@ def test_any_cut_gives_the_same_events_demands_and_counts(seed: int, sizes: tupl
     assert found.events == expected.events
     assert found.demands == expected.demands
     assert found.counters == expected.counters
+
+
+@settings(max_examples=int(os.environ.get("WAYSIDE_EQUIVALENCE", "20")))
+@given(st.integers(0, 10**6))
+def test_rules_in_columns_have_the_events_and_demands_of_rules_evaluated_one_by_one(seed: int) -> None:
+    scene = a_scene(seed)
+    expected = driven(scene, lambda: 40, one_by_one=True)
+    found = driven(scene, lambda: 10**9)
+    assert found.events == expected.events
+    assert found.demands == expected.demands

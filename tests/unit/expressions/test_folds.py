@@ -1,0 +1,59 @@
+"""Which loops become folds, and that nothing else does."""
+
+from __future__ import annotations
+
+import pytest
+
+from wayside.expressions import Environment, Kind
+from wayside.expressions.columns.folds import How, folded
+from wayside.expressions.syntax import Loop
+
+ENVIRONMENT = Environment({"members": Kind.LIST, "others": Kind.LIST, "limit": Kind.DOUBLE})
+
+
+def loops(node: object) -> int:
+    """How many loops there are in a tree."""
+    if isinstance(node, tuple):
+        return sum(loops(each) for each in node)
+    fields = [getattr(node, name) for name in getattr(node, "__match_args__", ())]
+    return isinstance(node, Loop) + sum(loops(each) for each in fields)
+
+
+@pytest.mark.parametrize(
+    ("source", "how"),
+    [
+        ("members.exists(m, m.v > limit)", [How.ANY]),
+        ("members.all(m, m.v > limit)", [How.ALL]),
+        ("members.exists_one(m, m.v > limit)", [How.COUNT]),
+        ("size(members) > 2", [How.COUNT]),
+        ("members.size() > 2", [How.COUNT]),
+        ("size(members.filter(m, m.v > 1)) >= 2", [How.COUNT]),
+        ("!(members.filter(m, m.v > 1).size() * 2 >= size(members)) || members.all(m, m.v > 0)",
+         [How.COUNT, How.COUNT, How.ALL]),
+    ],
+)  # fmt: skip
+def test_loops_over_the_items_become_folds(source: str, how: list[How]) -> None:
+    rest, folds = folded(ENVIRONMENT.compile(source, result=Kind.BOOL), "members")
+    assert [each.how for each in folds.values()] == how
+    assert loops(rest.tree) == 0
+
+
+@pytest.mark.parametrize(
+    ("source", "left"),
+    [
+        ("others.exists(m, m.v > 1)", 1),
+        ("members.map(m, m.v)[0] > 1.0", 1),
+        ("members.filter(m, m.v > 1).exists(m, m.w > 1)", 2),
+    ],
+)
+def test_other_loops_stay(source: str, left: int) -> None:
+    rest, folds = folded(ENVIRONMENT.compile(source, result=Kind.BOOL), "members")
+    assert folds == {}
+    assert loops(rest.tree) == left
+
+
+def test_a_fold_is_named_like_no_variable() -> None:
+    environment = Environment({"members": Kind.LIST, "fold0": Kind.DOUBLE})
+    rest, folds = folded(environment.compile("size(members) > fold0", result=Kind.BOOL), "members")
+    assert list(folds) == ["fold0_"]
+    assert rest.names == {"members", "fold0", "fold0_"}
