@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,17 @@ _AGAIN = 255
 """In place of the observation before: the subject has to be looked at."""
 
 _NEVER = np.iinfo(np.int64).max
+
+
+class Changes(NamedTuple):
+    """When a subject has to be looked at, by the block's ticks, and its observations then."""
+
+    row: int
+    """The subject's track."""
+    at: int
+    """Its place among the block's clients."""
+    ticks: list[int]
+    codes: list[int]
 
 
 class RuleGroup:
@@ -81,8 +93,14 @@ class RuleGroup:
         looked = None if only is None else self._looked(clients, only)
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
         self._follow()
-        for row, subject_at in self._changed(block, codes, looked):
-            yield from self._step(block, codes, row, subject_at)
+        numbers: list[int] = block.numbers.tolist()
+        states: list[tuple[int, int, bool, int]] = []
+        for change in self._changed(block, codes, looked):
+            yield from self._step(block, change, numbers[change.at], states)
+        if states:
+            rows, at, watched, wakes = zip(*states, strict=True)
+            self._watched[rows, at] = watched
+            self._wakes[rows, at] = wakes
         last = ticks[-1]
         for run in self._budgeted:
             run.tidy_starts(last)
@@ -125,10 +143,8 @@ class RuleGroup:
         for run in self.runs:
             run.disturbed = False
 
-    def _changed(
-        self, block: Block | FleetBlock, codes: Codes, looked: Truths | None
-    ) -> Iterator[tuple[int, tuple[int, list[int]]]]:
-        """By track and client, the ticks at which the observation changes or something is due, where that matters."""
+    def _changed(self, block: Block | FleetBlock, codes: Codes, looked: Truths | None) -> Iterator[Changes]:
+        """Of each subject, where it matters, the ticks at which the observation changes or something is due."""
         numbers, last = block.numbers, int(block.times[-1])
         changed = np.empty(codes.shape, bool)
         np.not_equal(codes[:, :, 0], self._last[:, numbers], out=changed[:, :, 0])
@@ -156,41 +172,43 @@ class RuleGroup:
             return
         which, when = np.divmod(flat, len(block.ticks))
         bounds = [0, *(np.flatnonzero(np.diff(which)) + 1).tolist(), len(flat)]
-        ticks = when.tolist()
-        for begin, end in itertools.pairwise(bounds):
-            row, at = divmod(int(which[begin]), len(block.clients))
-            yield row, (at, ticks[begin:end])
+        ticks: list[int] = when.tolist()
+        seen: list[int] = codes.ravel()[flat].tolist()
+        tracks, subjects = (each.tolist() for each in np.divmod(which[bounds[:-1]], len(block.clients)))
+        for row, at, (begin, end) in zip(tracks, subjects, itertools.pairwise(bounds), strict=True):
+            yield Changes(row, at, ticks[begin:end], seen[begin:end])
 
     def _step(
-        self, block: Block | FleetBlock, codes: Codes, row: int, subject_at: tuple[int, list[int]]
-    ) -> Iterator[Happened]:
-        """Bring one subject's state forward over all ticks of the block."""
-        at, changes = subject_at
-        run, track, number = self._of[row], self.columns.tracks[row], int(block.numbers[at])
+        self, block: Block | FleetBlock, changes: Changes, number: int, states: list[tuple[int, int, bool, int]]
+    ) -> list[Happened]:
+        """Bring one subject's state forward over all ticks of the block; adds whether it has one, and when to look."""
+        row, at = changes.row, changes.at
+        run, track = self._of[row], self.columns.tracks[row]
         subject = track.subject(block.clients[at])
         state = run.state(subject) or run.new_state(subject)
-        follows = run.has_deploys
-        ticks, seen, count = block.ticks, codes[row, at], len(block.ticks)
+        happened: list[Happened] = []
+        ticks, timing, count = block.ticks, run.timing, len(block.ticks)
         wake: int | None = None
-        for begin, end in itertools.pairwise((*changes, count)):
-            code, first = int(seen[begin]), begin
+        for code, begin, end in zip(changes.codes, changes.ticks, (*changes.ticks[1:], count), strict=True):
+            first = begin
             while first < end:
-                one_by_one = follows and state.is_open and run.needs_every_tick(subject)
-                ran = state.run(ticks, first, first + 1 if one_by_one else end, run.timing, code)
+                one_by_one = run.has_deploys and state.is_open and run.needs_every_tick(subject)
+                ran = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
                 wake, happened_at = ran.wake, ran.at
                 if ran.what is not None:
                     candidate = self._candidate(block, track, subject, at * count + happened_at)
                     event = run.happened(ticks[happened_at], ran.what, candidate)
                     if event is not None:
-                        yield Happened(ticks[happened_at], self._orders[row], event)
+                        happened.append(Happened(ticks[happened_at], self._orders[row], event))
                     happened_at += 1
                 elif one_by_one:
                     run.stays(ticks[first], self._candidate(block, track, subject, at * count + first))
                 first = happened_at
-        if state.idle_at(ticks[-1]):
+        idle = state.idle_at(ticks[-1])
+        if idle:
             run.drop_state(subject)
-        self._watched[row, number] = run.state(subject) is not None
-        self._wakes[row, number] = _NEVER if wake is None else wake
+        states.append((row, number, not idle, _NEVER if wake is None else wake))
+        return happened
 
     def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
         return Candidate(subject, block.variables(track, point), in_scope=True, near=True)

@@ -32,14 +32,14 @@ def parts_of(batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]
             yield part
             part, size = [], 0
         part += piece
-        size += sum([len(arrival.payload) for arrival in piece])
+        size += sum([len(arrival[3]) for arrival in piece])
         if len(part) >= _ARRIVALS or size >= _BYTES:
             # What has the last time waits: more of that time may follow.
             cut = bisect_left(part, part[-1].received, key=_received)
             if cut:
                 yield part[:cut]
                 part = part[cut:]
-                size = sum([len(arrival.payload) for arrival in part])
+                size = sum([len(arrival[3]) for arrival in part])
     if part:
         yield part
 

@@ -106,26 +106,23 @@ class Block:
 
     def variables(self, track: Track, point: int) -> dict[str, Any]:
         """What expressions see at a point, as in `scopes`."""
-        return {**self.view(track, point), **track.element.variables}
+        view = self.view(track, point)
+        view.update(track.element.variables)
+        return view
 
     def view(self, track: Track, point: int) -> dict[str, Any]:
         """The same without the element."""
         client = self.clients[point // len(self.ticks)]
-        return {
+        found: dict[str, Any] = {
             "client": client,
             "labels": self._context.clients.labels(client),
-            "streams": [stream for stream, fresh in self.fresh.items() if fresh.flat[point]],
+            "streams": [stream for stream, fresh in self.fresh.items() if fresh.item(point)],
             "parameters": track.rule.parameters.of(client),
-            **self.values(track, point),
         }
-
-    def values(self, track: Track, point: int) -> dict[str, Any]:
-        """The rule's signals at a point, those that are known."""
-        found: dict[str, Any] = {}
         for name, at in track.signals.items():
             column = self.signals[at]
             if column.tags is None:
-                found[name] = float(column.values[point])
+                found[name] = column.values.item(point)
             elif (value := value_at(column, point, self._context.tables.texts)) is not UNKNOWN:
                 found[name] = value
         return found
