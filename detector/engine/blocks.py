@@ -14,7 +14,7 @@ import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.fleets import FleetBlock, FleetGroup, fits_fleet
-from detector.engine.columns.group import Group, fits
+from detector.engine.columns.group import Group, fit_signals, fits, signals_of
 from detector.engine.columns.pairs import fits_pairs
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes
@@ -25,6 +25,7 @@ from detector.engine.happened import Happened
 from detector.engine.pairs import PairGroup
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
+from wayside.rules import CompiledRule, episode_stream
 
 _POINTS = 200_000
 """At most so many points are evaluated together, for all ticks and clients: the columns of all rules are in memory."""
@@ -221,6 +222,8 @@ class Blocks:
         """`floor`: windows do not reach back to this time or beyond; nanoseconds."""
         self._context = context
         self._floor = floor
+        self._depths: list[list[RuleGroup | PairGroup]] = []
+        """First the groups whose rules look at no episodes of others, then those that look at episodes of these, …"""
         self._groups: list[RuleGroup | PairGroup] = []
         self._on_sample: dict[str, RuleGroup] = {}
         self.with_samples: Mapping[str, Sequence[RuleRun]] = {}
@@ -233,35 +236,37 @@ class Blocks:
     ) -> None:
         """These rules are evaluated from now on; `thinning`: of so many evaluations of a rule, one takes place."""
         orders = {name: order for order, name in enumerate(runs)}
-        by_times: dict[tuple[int, int], list[RuleRun]] = {}
+        depths: dict[str, int] = {}
+        together: dict[tuple[int, type[Group | FleetGroup], int, int], list[RuleRun]] = {}
         by_stream: dict[str, list[RuleRun]] = {}
-        fleets: dict[tuple[int, int], list[RuleRun]] = {}
-        pairs: list[tuple[RuleRun, int]] = []
+        pairs: list[tuple[int, RuleRun, int]] = []
         for run in runs.values():
-            rule = run.rule
-            if rule.name in paused or not rule.enabled or run.alone:
+            rule, every = run.rule, run.rule.every_ns
+            if rule.name in paused or not rule.enabled or run.alone or not fit_signals(rule, self._context.tables):
                 continue
-            if rule.every_ns is not None and fits_pairs(rule, self._context):
-                pairs.append((run, rule.every_ns))
-            elif rule.every_ns is not None and fits_fleet(rule, self._context.tables):
-                fleets.setdefault((rule.every_ns, rule.every_ns * thinning(run)), []).append(run)
-            elif not fits(rule, self._context.tables):
+            depth = self._depth(rule, depths)
+            if depth is None:
                 continue
-            elif rule.every_ns is not None:
-                by_times.setdefault((rule.every_ns, rule.every_ns * thinning(run)), []).append(run)
-            elif rule.on_sample is not None:
-                by_stream.setdefault(rule.on_sample, []).append(run)
+            if every is None:
+                if rule.on_sample is not None and fits(rule) and not depth:
+                    by_stream.setdefault(rule.on_sample, []).append(run)
+                continue
+            if fits_pairs(rule, self._context):
+                pairs.append((depth, run, every))
+            elif fits(rule) or fits_fleet(rule):
+                columns = Group if fits(rule) else FleetGroup
+                together.setdefault((depth, columns, every, every * thinning(run)), []).append(run)
+            else:
+                continue
+            depths[rule.name] = depth
         self._context.tables.forget_users()
-        self._groups = [
-            RuleGroup(chosen, orders, self._context, every, period) for (every, period), chosen in by_times.items()
-        ]
-        self._groups += [
-            RuleGroup(chosen, orders, self._context, every, period, FleetGroup)
-            for (every, period), chosen in fleets.items()
-        ]
-        self._groups += [
-            PairGroup(run, orders[run.rule.name], self._context, every, every * thinning(run)) for run, every in pairs
-        ]
+        self._depths = [[] for _ in range(max(depths.values(), default=-1) + 1)]
+        for (depth, columns, every, period), chosen in together.items():
+            self._depths[depth].append(RuleGroup(chosen, orders, self._context, every, period, columns))
+        for depth, run, every in pairs:
+            period = every * thinning(run)
+            self._depths[depth].append(PairGroup(run, orders[run.rule.name], self._context, every, period))
+        self._groups = [group for groups in self._depths for group in groups]
         self._on_sample = {
             stream: RuleGroup(chosen, orders, self._context, 0, 0) for stream, chosen in by_stream.items()
         }
@@ -271,6 +276,14 @@ class Blocks:
         for group in groups:
             for run in group.runs:
                 run.disturbed = True
+
+    def _depth(self, rule: CompiledRule, depths: Mapping[str, int]) -> int | None:
+        """How far the rule is above those that look at no other; None: one that it looks at is not evaluated here."""
+        named = {signal.rule for signal in signals_of(rule) if signal.rule is not None}
+        evaluated = {each for each in named if self._context.starts.is_evaluated(episode_stream(each))}
+        if not evaluated <= depths.keys():
+            return None
+        return 1 + max((depths[each] for each in evaluated), default=0) if named else 0
 
     def due(self, time: int) -> list[RuleGroup | PairGroup]:
         """The groups that are evaluated at a tick."""
@@ -306,11 +319,22 @@ class Blocks:
         """Evaluate all ticks that wait; what happened, in order."""
         happened: list[Happened] = []
         clients = [*self._context.clients]
-        for group in self._groups:
-            if group.waiting:
-                ticks, group.waiting = group.waiting, []
-                happened += _timed(group, ticks, stopwatch, group.evaluate(ticks, clients, self._floor()))
-        happened.sort(key=lambda each: (each.time, each.order, each.event.subject))
+        for groups in self._depths:
+            found: list[Happened] = []
+            for group in groups:
+                if group.waiting:
+                    ticks, group.waiting = group.waiting, []
+                    found += _timed(group, ticks, stopwatch, group.evaluate(ticks, clients, self._floor()))
+            happened += self._noted(found)
+        happened.sort(key=_place)
+        return happened
+
+    def _noted(self, happened: list[Happened]) -> list[Happened]:
+        """The same, in order, once rules that look at episodes of others can see it."""
+        happened.sort(key=_place)
+        if self._context.starts.needed:
+            for each in happened:
+                self._context.starts.note(each.event)
         return happened
 
     def run_with_samples(
@@ -319,7 +343,11 @@ class Blocks:
         """Evaluate the rules that are evaluated with the samples of a stream, by rule for these subjects."""
         group = self._on_sample[stream]
         present = sorted({client for each in only.values() for client in each.present(self._context.clients)})
-        return _timed(group, (time,), stopwatch, group.evaluate((time,), present, self._floor(), only))
+        return self._noted(_timed(group, (time,), stopwatch, group.evaluate((time,), present, self._floor(), only)))
+
+
+def _place(happened: Happened) -> tuple[int, int, str]:
+    return happened.time, happened.order, happened.event.subject
 
 
 def _timed(

@@ -356,10 +356,11 @@ class Engine:
         happened = self._in_columns()
         self._known.forget_rows(self._last_wait)
         self._known.looked(self.now)
+        self._starts.settle(self._last_wait)
         events = [each.event for each in happened]
-        if self._starts.needed or self.consequences.wanted:
+        if self.consequences.wanted:
             for event in events:
-                self._noted(self._runs[event.rule], (event,))
+                self.consequences.note(self._runs[event.rule].rule, event)
         return events
 
     def _in_columns(self) -> list[Happened]:
@@ -419,8 +420,11 @@ class Engine:
                 own = happened.get(name)
                 if own is None and name not in self._blocks.names:
                     self._losing.discard(name)
-                    own = self._turn(run, time, sampled, regular)
-                events += self._noted(run, sorted(own or (), key=lambda event: event.subject))
+                    own = self._seen(self._turn(run, time, sampled, regular))
+                for event in sorted(own or (), key=lambda event: event.subject):
+                    self.consequences.note(run.rule, event)
+                    events.append(event)
+        self._starts.settle(time)
         self._known.forget_rows(time)
         self._known.looked(self.now)
         return events
@@ -430,7 +434,7 @@ class Engine:
         if name not in self._losing:
             return []
         self._losing.discard(name)
-        return self._runs[name].lose(time, self.clients)
+        return self._seen(self._runs[name].lose(time, self.clients))
 
     def _with_samples(
         self, time: int, regular: bool, sampled: Mapping[str, frozenset[str]]
@@ -460,11 +464,16 @@ class Engine:
         )
         return [subject for subject in subjects if only.takes(subject)]
 
-    def _noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
-        """The events, once the rules over this one and its actions know of them."""
-        happened = list(events)
-        for event in happened:
+    def _seen(self, events: list[Event]) -> list[Event]:
+        """The events, once rules that look at episodes of others can see them."""
+        for event in events:
             self._starts.note(event)
+        return events
+
+    def _noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
+        """The events, once other rules and the rule's actions know of them."""
+        happened = self._seen([*events])
+        for event in happened:
             self.consequences.note(run.rule, event)
         return happened
 
@@ -497,8 +506,6 @@ class Engine:
     def _keep_house(self, time: int) -> None:
         """Forget old samples and lost clients."""
         lost = self._known.age(time)
-        if time % HOUSEKEEPING == 0:
-            self._starts.buffer.expire(time)
         if lost:
             self._losing.update(self._runs)
             self._starts.lose(lost)
@@ -516,7 +523,7 @@ class Engine:
 
     def _gap(self, time: int, backwards: bool) -> None:
         if backwards:
-            self._starts.buffer.step_back(time)
+            self._starts.step_back(time)
         self._known.gap(time, backwards)
         self._plugins.gap()
         for run in self._runs.values():

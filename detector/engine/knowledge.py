@@ -112,7 +112,16 @@ class Knowledge:
         self._positions = Positions(self.buffer, self.messages, self._stale_after, possible, self._floor)
         self.tables = Tables(self.buffer)
         self.tables.configure(detector, decoders, self.messages, self._counters)
-        self.context = Context(self.tables, self.clients, self._stale_after, possible, self._positions, self._exact)
+        self.context = Context(
+            self.tables,
+            self.clients,
+            self._stale_after,
+            possible,
+            self._positions,
+            self._starts,
+            self.signals,
+            self._exact,
+        )
         """What rules in columns look at; a new one with each change of the Detector."""
 
     @property

@@ -17,6 +17,8 @@ from detector.engine.columns.tables import Tables
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.subjects import FLEET, Subject
 from detector.engine.scoping.positions import Positions
+from detector.engine.signals.signals import Signals as OfStarts
+from detector.engine.signals.starts import Starts
 from wayside.expressions import UNKNOWN
 from wayside.expressions.columns.values import Column, value_at
 from wayside.rules import CompiledElement, CompiledRule
@@ -33,6 +35,9 @@ class Context(NamedTuple):
     stale_after: Mapping[str, int | None]
     possible: Possible
     positions: Positions
+    starts: Starts
+    of_starts: OfStarts
+    """Computes signals over other rules' episodes."""
     exact: bool
     """See `timeline.ORDER`; False is order 1."""
 

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.conditions import Conditions
-from detector.engine.columns.group import fit_signals, present
+from detector.engine.columns.group import present
 from detector.engine.columns.leaves import ClientLeaves, stacked
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import Signals
 from detector.engine.columns.table import Integers, Truths
-from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Codes, Verdict, observed
 from detector.engine.episodes.subjects import FLEET, Subject
 from wayside.expressions import Expression, Path
@@ -34,10 +33,10 @@ from wayside.rules import CompiledRule, FleetSubject
 _MEMBERS = "members"
 
 
-def fits_fleet(rule: CompiledRule, tables: Tables) -> bool:
-    """Whether a rule about the fleet can be evaluated in columns."""
+def fits_fleet(rule: CompiledRule) -> bool:
+    """Whether a rule about the fleet whose signals fit can be evaluated in columns."""
     budgeted = rule.maximum_per_hour is not None and len(rule.elements) > 1
-    return isinstance(rule.subject, FleetSubject) and not budgeted and fit_signals(rule, tables)
+    return isinstance(rule.subject, FleetSubject) and not budgeted
 
 
 class Condition(NamedTuple):

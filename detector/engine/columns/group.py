@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -17,13 +17,13 @@ from detector.engine.episodes.episodes import FALSE
 from detector.engine.episodes.subjects import Subject
 from wayside.api.eventrule import Aggregate
 from wayside.expressions import Expression
-from wayside.rules import ClientSubject, CompiledRule
+from wayside.rules import ClientSubject, CompiledRule, CompiledSignal
 
 
-def fits(rule: CompiledRule, tables: Tables) -> bool:
-    """Whether a rule can be evaluated in columns."""
+def fits(rule: CompiledRule) -> bool:
+    """Whether a rule about clients whose signals fit can be evaluated in columns."""
     budgeted = rule.maximum_per_hour is not None and len(rule.elements) > 1
-    return isinstance(rule.subject, ClientSubject) and not budgeted and fit_signals(rule, tables)
+    return isinstance(rule.subject, ClientSubject) and not budgeted
 
 
 def fit_signals(rule: CompiledRule, tables: Tables) -> bool:
@@ -33,13 +33,21 @@ def fit_signals(rule: CompiledRule, tables: Tables) -> bool:
         not rule.models
         and not rule.plugins
         and all(
-            signal.rule is None
-            and signal.aggregate is not Aggregate.ACTIVE
-            and not (signal.aggregate is Aggregate.AGE and signal.where is not None)
-            and tables.takes(streams[signal.stream])
-            for signal in (*rule.signals, *(each for element in rule.elements for each in element.signals))
+            signal.rule is not None
+            or (
+                not (signal.aggregate is Aggregate.AGE and signal.where is not None)
+                and tables.takes(streams[signal.stream])
+            )
+            for signal in signals_of(rule)
         )
     )
+
+
+def signals_of(rule: CompiledRule) -> Iterator[CompiledSignal]:
+    """All of a rule's signals, those of its elements as well."""
+    yield from rule.signals
+    for element in rule.elements:
+        yield from element.signals
 
 
 class Group:

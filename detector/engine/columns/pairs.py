@@ -10,7 +10,6 @@ import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.formulas import Formulas, Rows
-from detector.engine.columns.group import fit_signals
 from detector.engine.columns.leaves import ClientLeaves
 from detector.engine.columns.nearby import Crowd, Nearby, nearby
 from detector.engine.columns.places import Places, Whereabouts
@@ -31,13 +30,12 @@ _ROLES = ("a", "b")
 
 
 def fits_pairs(rule: CompiledRule, context: Context) -> bool:
-    """Whether a rule about pairs can be evaluated in columns."""
+    """Whether a rule about pairs whose signals fit can be evaluated in columns."""
     return (
         isinstance(rule.subject, PairSubject)
         and context.exact
         and len(rule.elements) == 1
         and _takes(rule.subject.position.stream, context.tables)
-        and fit_signals(rule, context.tables)
     )
 
 

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.episodes import of_episodes
 from detector.engine.columns.reading import Reading, Used
 from detector.engine.columns.table import NEVER, Integers, Truths, rows_between
 from detector.engine.columns.watching import Ages
@@ -42,6 +43,8 @@ class Signals:
         self._keys: dict[Key, int] = {}
         self._users: list[list[tuple[int, CompiledSignal]]] = []
         """By signal: which tracks have it, and under which name."""
+        self._over_rules: list[tuple[int, Track, CompiledSignal]] = []
+        """Signals over the episodes of other rules, each with its place."""
         self._marks: dict[str, int] = {}
         """By stream, where the rows begin that no window of ours has seen: one of its table's marks."""
         self._shared = shared
@@ -67,13 +70,17 @@ class Signals:
         return frozenset(key.stream for key in self._keys)
 
     def _place(self, row: int, signal: CompiledSignal) -> int:
+        if signal.rule is not None:
+            self._users.append([(row, signal)])
+            self._over_rules.append((len(self._users) - 1, self._tracks[row], signal))
+            return len(self._users) - 1
         reader = self._context.tables.add(signal.stream)
         element = signal.element
         used = reader.use(
             None if signal.value is None else Reading(signal.value, signal.parameters, element),
             None if signal.where is None else Reading(signal.where, signal.parameters, element),
         )
-        at = self._keys.setdefault(Key(signal.stream, used, signal.over_ns, signal.aggregate), len(self._keys))
+        at = self._keys.setdefault(Key(signal.stream, used, signal.over_ns, signal.aggregate), len(self._users))
         if at == len(self._users):
             self._users.append([])
         self._users[at].append((row, signal))
@@ -106,7 +113,9 @@ class Signals:
                     self._note_new(block, at, key, high[:, -1], lows[key.over][:, -1])
                 found[at] = self._computed(block, at, key, high, lows)
             self._watch(block, stream, high, keys)
-        block.signals = [found[at] for at in range(len(self._keys))]
+        for at, track, signal in self._over_rules:
+            found[at] = of_episodes(self._context, block, track, signal)
+        block.signals = [found[at] for at in range(len(self._users))]
 
     def _ranges(
         self, block: Block, stream: str, overs: Iterable[int | None], floor: int | None
@@ -144,14 +153,20 @@ class Signals:
         table, reader = tables.table(stream), tables.readers[stream]
         if not reader.count or not len(table.keys):
             return
+        if block.present is not None:  # nobody looks at a client where it is not known
+            windows = [(key, np.where(block.present, low, high)) for key, low in windows]
         rows: list[Integers] = []
         whole = [low for key, low in windows if _needs_all(key)]
         if whole:
             low = whole[0] if len(whole) == 1 else np.minimum.reduce(whole)
             mark = table.marks[self._marks[stream]]
-            before = np.concatenate((mark[block.numbers][:, None], high[:, :-1]), axis=1)
+            begin = mark[block.numbers][:, None]
+            seen = high
+            if block.present is not None:
+                seen = np.maximum.accumulate(np.where(block.present, high, begin), axis=1)
+            before = np.concatenate((begin, seen[:, :-1]), axis=1)
             rows.append(rows_between(np.maximum(low, before).ravel(), high.ravel()))
-            mark[block.numbers] = high[:, -1]
+            mark[block.numbers] = seen[:, -1]
         for key, low in windows:
             if not _needs_all(key) and key.used.value is not None:
                 at, some = _row(key.aggregate, low, high)

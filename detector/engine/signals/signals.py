@@ -70,7 +70,7 @@ class Signals:
         else:
             lane = self._starts.lane(client, signal.stream)
         if signal.aggregate is Aggregate.ACTIVE:
-            return self._starts.is_open(client, signal.stream)
+            return self._starts.is_open(client, signal.stream, now)
         if signal.aggregate is Aggregate.AGE:
             return self._age(rule, signal, lane, client, now, counters)
         always_known = signal.aggregate in _ALWAYS_KNOWN
@@ -125,6 +125,8 @@ class Signals:
     ) -> float:
         """Seconds since the last sample (that `where` picks); while there was none, since the client is known."""
         latest = NEVER if lane is None else lane.latest
+        if lane is not None and latest > now:  # starts of episodes are there for all ticks of a block
+            latest = next((sample.time for sample in lane.newest_first(None, now)), NEVER)
         if lane is not None and signal.where is not None:
             key = (rule, signal.place, client)
             picked = self._window(rule, signal, lane, client, now, counters, at_most=1)

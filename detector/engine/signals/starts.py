@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Final
 
-from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.buffering.buffer import NEVER, Buffer, Lane
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.plain import plain, to_text
 from detector.engine.episodes.subjects import FLEET
 from detector.engine.samples.sample import Sample, Stamped
+from detector.engine.timing.ticks import HOUSEKEEPING
 from wayside.rules import CompiledRule, episode_stream
 
 MAXIMUM_BYTES = 64 * 2**20
 """Of all starts that are kept; beyond, the oldest go and are counted as evicted."""
+
+ALWAYS: Final = 2**63 - 1
+"""After all times: an episode is open."""
 
 
 class Starts:
@@ -30,9 +34,12 @@ class Starts:
         self._durations: dict[str, int] = {}
         """Of the rules that are named, by what their starts are called: how long starts are kept, in nanoseconds."""
         self._evaluated: set[str] = set()
-        self._open: dict[str, dict[str, set[str]]] = {}
-        """Episodes that are open, by what starts are called and client."""
+        self._open: dict[str, dict[str, dict[str, int]]] = {}
+        """Since when episodes are open, by what starts are called, client and episode; nanoseconds."""
+        self._ended: dict[str, dict[str, list[tuple[int, int]]]] = {}
+        """From when to when episodes were open that ended since `settle`, by what starts are called and client."""
         self._number = 0
+        self._expired = NEVER
 
     def configure(self, rules: Iterable[CompiledRule], least: int) -> set[str]:
         """These rules are evaluated from now on; starts are kept as long as any signal looks back, or `least` (ns).
@@ -53,6 +60,7 @@ class Starts:
         for lane in self.buffer:
             lane.duration = durations[lane.stream]
         self._open = {stream: each for stream, each in self._open.items() if stream in durations}
+        self._ended.clear()
         return new
 
     def forget(self, rule: str) -> None:
@@ -64,28 +72,46 @@ class Starts:
     def note(self, event: Event) -> None:
         """An episode started or ended."""
         if event.started:
-            self.started(event)
+            self.started(event, event.start_time)
         elif event.end_time is not None:
-            open_episodes = self._open.get(episode_stream(event.rule), {})
+            stream = episode_stream(event.rule)
+            open_episodes = self._open.get(stream, {})
             for client in event.subjects or (FLEET,):
-                open_episodes.get(client, set()).discard(event.episode)
+                since = open_episodes.get(client, {}).pop(event.episode, None)
+                if since is not None:
+                    self._ended.setdefault(stream, {}).setdefault(client, []).append((since, event.end_time))
                 if not open_episodes.get(client):
                     open_episodes.pop(client, None)
 
-    def started(self, event: Event) -> None:
-        """An episode started, now or, where it was restored, before."""
+    def started(self, event: Event, since: int = NEVER) -> None:
+        """An episode started, now or, where it was restored, before; `since`: when rules can first see that."""
         stream = episode_stream(event.rule)
         if stream not in self._durations:
             return
         payload = _payload(event)
         for client in event.subjects or (FLEET,):
-            self._open.setdefault(stream, {}).setdefault(client, set()).add(event.episode)
+            self._open.setdefault(stream, {}).setdefault(client, {})[event.episode] = since
             lane = self.buffer.lane(client, stream)
             if lane is None:
                 lane = self.buffer.add(Lane(client, stream, self._durations[stream]))
             self._number += 1
             sample = Stamped(event.start_time, self._number, payload, event.start_time, event.key)
             self.buffer.grew(lane.insert(sample))
+
+    def settle(self, now: int) -> None:
+        """All ticks up to `now` were evaluated, in nanoseconds: forget what later ones do not look at."""
+        self._ended.clear()
+        if not 0 <= now - self._expired < HOUSEKEEPING:
+            self._expired = now
+            self.buffer.expire(now)
+
+    def step_back(self, time: int) -> None:
+        """Time goes on from here, which is earlier. What is open stays so."""
+        self.buffer.step_back(time)
+        self._ended.clear()
+        for of_clients in self._open.values():
+            for episodes in of_clients.values():
+                episodes.update(dict.fromkeys(episodes, NEVER))
 
     @property
     def needed(self) -> bool:
@@ -96,10 +122,15 @@ class Starts:
         """Whether the rule whose starts these are is there and enabled; else nothing can be said of its episodes."""
         return stream in self._evaluated
 
-    def is_open(self, client: str, stream: str) -> bool:
-        """Whether an episode is open that the client is a subject of."""
-        episodes = self._open.get(stream, {})
-        return bool(episodes.get(client) or episodes.get(FLEET))
+    def is_open(self, client: str, stream: str, now: int) -> bool:
+        """Whether an episode is open at a time that the client is a subject of; nanoseconds."""
+        return any(begin <= now < end for begin, end in self.spans(client, stream))
+
+    def spans(self, client: str, stream: str) -> list[tuple[int, int]]:
+        """From when to when episodes were or are open that the client is a subject of; some of those that ended."""
+        open_episodes, ended = self._open.get(stream, {}), self._ended.get(stream, {})
+        found = [(since, ALWAYS) for whose in (client, FLEET) for since in open_episodes.get(whose, {}).values()]
+        return found + [span for whose in (client, FLEET) for span in ended.get(whose, ())]
 
     def lane(self, client: str, stream: str) -> Lane | None:
         """The starts of the episodes that the client is a subject of."""

@@ -56,6 +56,16 @@ _FORMS = {
     "list": ["size({}) > 1", "{}[0] > 1"],
 }  # fmt: skip
 
+_OVER: list[tuple[dict[str, Any], str]] = [
+    ({"aggregate": "Active"}, "over"), ({"aggregate": "Active"}, "!over"),
+    ({"aggregate": "Count", "over": "2s"}, "over > 1"), ({"aggregate": "Age"}, "over < 0.8"),
+    ({"aggregate": "Last", "value": "msg.values.g0"}, "over > 1.5"),
+    ({"aggregate": "Any", "value": "msg.subject == 'c1'", "over": "3s"}, "over"),
+    ({"aggregate": "Age", "where": "has(msg.values.g0)"}, "over > 0.5"),
+    ({"aggregate": "Distinct", "value": "msg.subject", "over": "3s"}, "size(over) > 0"),
+]  # fmt: skip
+"""Signals over the episodes of another rule."""
+
 _FOLDS = [
     "members.exists(m, {})", "members.all(m, {})", "members.exists_one(m, {})",
     "size(members.filter(m, {})) >= 2", "members.filter(m, {}).size() * 2 == 4", "size(members) > 1",
@@ -138,8 +148,9 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
         names.append(("ge", "number"))
     spec["when"] = _condition(random, names, each)
     if kind == "over":
-        signals.append({"name": "over", "rule": "r0", "aggregate": "Active"})
-        spec["when"] = f"over && ({spec['when']})"
+        signal, form = random.choice(_OVER)
+        signals.append({"name": "over", "rule": f"r{random.randrange(number)}", **signal})
+        spec["when"] = random.choice(["{1}", "{1} && ({0})", "({0}) || {1}"]).format(spec["when"], form)
     if kind == "fleet":
         spec["when"] = _fleet_condition(random, names, each)
         spec["scope"] = {"fleet": {"members": _members(random, names)}}
@@ -225,7 +236,7 @@ def a_scene(seed: int) -> Scene:
                  {"name": "c1", "labels": {"kind": "car"}, "parameters": {f"r{random.randrange(5)}": {"f": 2.5}}}],
     )  # fmt: skip
     mixed = random.random() < 0.5
-    kinds = ["client"] * 3 + (random.sample(["client", "over", "fleet"], 2) if mixed else ["client"] * 2)
+    kinds = ["client"] * 2 + (random.choices(["client", "over", "fleet"], k=3) if mixed else ["client"] * 3)
     rules = [a_random_rule(random, number, kind) for number, kind in enumerate(kinds)]
     arrivals = _arrivals(random, data)
     operations, done = [Operation("rules", rules)], 0

@@ -88,6 +88,24 @@ def test_what_a_cap_pushes_out_is_gone_and_nothing_else() -> None:
     assert in_one_go(detector, [rule], arrivals, 12) == one_by_one(detector, [rule], arrivals, 12)
 
 
+def test_samples_without_a_value_count_only_while_their_client_is_known() -> None:
+    detector = a_detector(a_stream("speed", staleAfter="Never"), clientTimeout="1s", buffer={"duration": "9s"})
+    rule = a_rule(signals=[{**SPEED, "over": "5s", "aggregate": "Max"}], when="speed > 10", evaluation=OFTEN)
+    without, back = arrival(0.95, "car", {}), arrival(7.95, "car", {"v": 1})
+    arrivals = [arrival(n / 10, "van", {"v": 1}) for n in range(1, 79)]
+    counts = []
+    for together in (True, False):
+        engine = an_engine(detector)
+        engine.advance(sorted([*arrivals[:29], without]), at(3))  # the car is lost before the rule is there
+        engine.set_rules(compiled(detector, rule))
+        rest = [*arrivals[30:], back]
+        for part in [rest] if together else [[each] for each in rest]:
+            engine.advance(part, part[-1].received)
+        engine.advance([], at(9))
+        counts.append(engine.counters.rules["r"].unknowns)
+    assert counts[0] == counts[1]
+
+
 def fleet_that_comes_and_goes() -> list[Any]:
     """Every client for a second, then others; some come back."""
     return [
