@@ -52,6 +52,14 @@ def test_only_those_that_are_surely_members_count() -> None:
     assert engine.counters.rules["r"].absences  # that b was no member for want of a value
 
 
+def test_loops_look_at_members_alone() -> None:
+    fast = "members.exists(m, m.speed > 10)"
+    rule = a_rule(scope={"fleet": {"members": "client != 'a'"}}, signals=[SPEED], when=fast, evaluation={"every": "1s"})
+    engine = an_engine(a_detector(), rule)
+    assert told(engine.advance(ARRIVALS, at(1))) == []
+    assert told(engine.advance([arrival(1.5, "b", {"v": 11})], at(2))) == ["r ~fleet started 2"]
+
+
 def test_a_fleet_of_nobody_is_looked_at_as_well() -> None:
     rule = a_rule(
         scope={"fleet": {"members": "true"}}, when="size(members) == 0 && members.all(m, m.client == 'a')",
