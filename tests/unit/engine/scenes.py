@@ -327,10 +327,10 @@ def _nobody(_: Sight) -> None:
 
 
 def _counted(rule: RuleCounters) -> dict[str, Any]:
-    numbers = ("evaluations", "skipped", "suppressed", "started", "ended", "unknowns", "errors", "unfollowed", "ticks")
+    numbers = ("evaluations", "skipped", "suppressed", "started", "ended", "unfollowed", "ticks")
     uses = rule.ages.uses if rule.ages is not None else {}
     return {name: getattr(rule, name) for name in numbers} | {
-        # Where several values are missing, the one that is named is that of one point for all that look alike.
-        "absences": sum(rule.absences.values()),
+        # Of several reasons for an unknown, the one of one point counts for all points that look alike.
+        "unknowns": rule.unknowns + rule.errors,
         "ages": {stream: (dict(use.ages), dict(use.periods)) for stream, use in sorted(uses.items())},
     }
