@@ -184,7 +184,7 @@ class Table:
         self._base = base
         live = self.end - self.first
         need = live + counts
-        room = np.where(need > 0, np.maximum(_LEAST_ROOM, need + need // 2), 0)
+        room = np.where(need > 0, np.maximum(_LEAST_ROOM, need + need // 4), 0)
         start = np.cumsum(room) - room
         source, target = rows_between(self.first, self.end), rows_between(start, start + live)
         size = int(room.sum())
