@@ -20,6 +20,7 @@ from detector.engine.episodes.episodes import TRUE
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import RuleRun
 from detector.engine.happened import Happened
+from detector.engine.observing import Observer
 from detector.engine.pairs import PairGroup
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
@@ -46,6 +47,7 @@ class RuleGroup:
         self.columns = Group(
             [Track(run.rule, element, run.counters, run.read) for run in runs for element in run.rule.elements], context
         )
+        self.observer: Observer | None = None
         self.may_wait = True
         """Whether several ticks are evaluated together."""
         self.width = len(self.columns.tracks)
@@ -70,6 +72,8 @@ class RuleGroup:
             return
         looked = None if only is None else self._looked(clients, only)
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
+        if self.observer is not None:
+            self.observer.clients(self.columns.tracks, block, codes, looked)
         self._follow()
         for row, subject_at in self._changed(block, codes, looked):
             yield from self._step(block, codes, row, subject_at)
@@ -187,8 +191,9 @@ class RuleGroup:
 class Blocks:
     """All rules in columns."""
 
-    def __init__(self, context: Context, floor: Callable[[], int | None]) -> None:
+    def __init__(self, context: Context, floor: Callable[[], int | None], observer: Observer | None = None) -> None:
         """`floor`: windows do not reach back to this time or beyond; nanoseconds."""
+        self._observer = observer
         self._context = context
         self._floor = floor
         self._groups: list[RuleGroup | PairGroup] = []
@@ -232,6 +237,7 @@ class Blocks:
         groups: list[RuleGroup | PairGroup] = [*self._groups, *self._on_sample.values()]
         self.names = frozenset(run.rule.name for group in groups for run in group.runs)
         for group in groups:
+            group.observer = self._observer
             for run in group.runs:
                 run.disturbed = True
 

@@ -82,6 +82,8 @@ class Block:
         """Which points there are; None: all. Shape (clients, ticks)."""
         self.looked: Truths | None = None
         """Which rule looks at which client; None: all at all. Shape (tracks, clients)."""
+        self.verdicts: Mapping[str, tuple[Truths, Truths]] = {}
+        """By field, where conditions are true and where false; shape (tracks, points)."""
         self._context = context
 
     @property

@@ -126,6 +126,7 @@ class Conditions:
                 for row, condition in chosen:
                     if condition.node is not None and unknown[row].any():
                         self._note_unknown(block, row, condition, unknown[row], tags)
+        block.verdicts = {field: (true[field], false[field]) for field in true}
         return self._coded(block, true, false, shape)
 
     def _coded(
