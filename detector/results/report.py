@@ -91,7 +91,7 @@ def data_of(result: Result) -> dict[str, Any]:
     subjects = [_subject(result, each, by_subject.get((each.rule, each.subject), ()), table) for each in trace.subjects]
     deeds = deeds_of(result)
     return {
-        "recording": result.recording,
+        "recording": Path(result.recording).name,
         "begin": format_time(trace.begin),
         "beginNs": str(trace.begin),
         "length": (trace.end - trace.begin) / 1e9,
