@@ -73,7 +73,7 @@ def write(folder: Path, vehicles: int, seconds: int) -> None:
                 value = {
                     "x": round(300 * math.cos(at * 0.05 + phase) + 20 * car, 3),
                     "y": round(200 * math.sin(at * 0.04 + phase * 1.3), 3),
-                    "speed": round(15 + 8 * math.sin(at * 0.11 + phase) + 2 * math.sin(at * 1.7), 3),
+                    "speed": round(15 + 8 * math.sin(at * 0.11 + phase) + 0.3 * math.sin(at * 1.7), 3),
                     "brake": math.sin(at * 0.3 + phase) > 0.9,
                 }
                 message = {"t": START + step * 10**9 // HZ, "key": f"vehicles/car{car}/odom", "value": value}
@@ -98,7 +98,7 @@ def of_one(number: int) -> dict[str, object]:
     when, until = f"speed > {20 + number * 0.5}", "speed < 14"
     if number % 2:
         signals.append({**speed, "name": "top", "over": f"{number}s", "aggregate": "Max"})
-        when, until = f"top - speed > {number / 2}", "top - speed < 0.2 || braking"
+        when, until = f"top - speed > {number * 0.8:g}", "top - speed < 0.2 || braking"
     return {"evaluation": {"every": "100ms"}, "signals": signals, "when": when, "until": until}
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from detector.results.episodes import Episode, episodes_of
+from detector.results.episodes import Episode
 from detector.results.result import Result
 from wayside.times import parse_time
 
@@ -45,7 +45,7 @@ def _tasks(result: Result) -> Iterator[Deed]:
 
 
 def _windows(result: Result) -> Iterator[Deed]:
-    for episode in episodes_of(result):
+    for episode in result.episodes:
         rule = result.rules.get(episode.rule)
         if rule is None or rule.dry_run:
             continue

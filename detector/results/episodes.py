@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from detector.engine.episodes.events import Event
-from detector.results.result import Result
-from detector.results.series import Kind, Series, SubjectTrace
+from detector.results.series import Kind, Series, SubjectTrace, Trace
 from wayside.times import format_time
 
 Plain = float | bool | str | None
@@ -50,27 +49,27 @@ class Episode:
         return None if self.end_time is None else (self.end_time - self.start_time) / 1e9
 
 
-def episodes_of(result: Result) -> list[Episode]:
+def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[Episode]:
     """The episodes of a recording, in order of their starts.
 
     Minimum and maximum are those of all ticks of the episode; the mean is weighted by time. An episode that is open
     has those up to the end of the recording.
     """
-    traces = {(each.rule, each.subject): each for each in result.trace.subjects}
+    traces = {(each.rule, each.subject): each for each in trace.subjects}
     found: dict[str, Episode] = {}
-    for event in result.events:
+    for event in events:
         episode = found.get(event.episode)
         if episode is None:
-            episode = found[event.episode] = _episode(result.recording, event)
+            episode = found[event.episode] = _episode(recording, event)
         if event.started:
             episode.values |= {f"{name}.start": value for name, value in flat(event.values)}
         else:
             episode.end_time, episode.reason = event.end_time, str(event.reason)
             episode.values |= {f"{name}.end": value for name, value in flat(event.values)}
     for episode in found.values():
-        trace = traces.get((episode.rule, episode.subject))
-        if trace is not None:
-            episode.values |= _statistics(trace, episode, result.trace.end)
+        subject = traces.get((episode.rule, episode.subject))
+        if subject is not None:
+            episode.values |= _statistics(subject, episode, trace.end)
     return sorted(found.values(), key=lambda each: (each.start_time, each.rule, each.subject))
 
 

@@ -13,7 +13,7 @@ from wayside.rules import CompiledRule, PairSubject
 _OTHERWISE = "a value that it reads is not there"
 
 
-def why_unknown(block: Block, track: Track, expression: Expression | None, point: int) -> str:
+def why_unknown(block: Block, point: int, track: Track, expression: Expression | None) -> str:
     """Why the condition of a rule about clients is unknown at a point."""
     if expression is None:
         return _OTHERWISE

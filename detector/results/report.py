@@ -11,7 +11,7 @@ import gzip
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from detector.results.actions import deeds_of
-from detector.results.episodes import Episode, episodes_of
+from detector.results.actions import Deed, deeds_of
+from detector.results.episodes import Episode
 from detector.results.places import polygons_of
 from detector.results.result import Result
 from detector.results.series import UNKNOWN, Integers, Kind, Series, SubjectTrace
@@ -34,6 +34,8 @@ _WIDEST = 1500
 """So many parts of the time are told apart at most: more pixels than a plot has."""
 _WAY = 600
 """So many places of a client are on the map at most."""
+_VALUES = 2000
+"""Of so many episodes of a page the values are listed; the others have their times."""
 _DEEDS = 2000
 """So many rows of what actions would have done are listed at most; the number of all is given."""
 
@@ -83,12 +85,15 @@ style-src 'unsafe-inline'; img-src data: blob:; font-src data:">
 def data_of(result: Result) -> dict[str, Any]:
     """All that the page shows."""
     trace = result.trace
-    episodes = episodes_of(result)
+    episodes = result.episodes
     table = _Table(result)
     by_subject: dict[tuple[str, str], list[Episode]] = {}
+    told = {episode.episode for episode in episodes[:_VALUES]}
     for episode in episodes:
         by_subject.setdefault((episode.rule, episode.subject), []).append(episode)
-    subjects = [_subject(result, each, by_subject.get((each.rule, each.subject), ()), table) for each in trace.subjects]
+    subjects = [
+        _subject(result, each, by_subject.get((each.rule, each.subject), ()), table, told) for each in trace.subjects
+    ]
     deeds = deeds_of(result)
     return {
         "recording": Path(result.recording).name,
@@ -113,7 +118,7 @@ def data_of(result: Result) -> dict[str, Any]:
             for each in deeds[:_DEEDS]
         ],
         "deedCount": len(deeds),
-        "demands": _demands(result, table),
+        "demands": _demands(deeds, table),
         "streams": [
             {
                 "stream": each.stream, "key": each.key, "encoding": each.encoding, "samples": each.samples,
@@ -205,7 +210,9 @@ def _event_times(result: Result) -> list[Integers]:
     return [np.array([event.start_time, event.onset_time], np.int64) for event in result.events]
 
 
-def _subject(result: Result, subject: SubjectTrace, episodes: Sequence[Episode], table: _Table) -> dict[str, Any]:
+def _subject(
+    result: Result, subject: SubjectTrace, episodes: Sequence[Episode], table: _Table, told: Set[str]
+) -> dict[str, Any]:
     terms = result.terms.get((subject.rule, subject.subject))
     return {
         "rule": subject.rule,
@@ -218,7 +225,7 @@ def _subject(result: Result, subject: SubjectTrace, episodes: Sequence[Episode],
                 "onset": table.seconds(each.onset_time),
                 "end": None if each.end_time is None else table.seconds(each.end_time),
                 "reason": each.reason,
-                "values": {name: value for name, value in each.values.items() if value is not None},
+                "values": _values(each) if each.episode in told else {},
             }
             for each in episodes
         ],
@@ -234,6 +241,12 @@ def _subject(result: Result, subject: SubjectTrace, episodes: Sequence[Episode],
         "thresholds": [list(each) for each in terms.thresholds] if terms is not None else [],
         "unknown": any((steps.codes == UNKNOWN).any() for steps in subject.conditions.values()),
     }
+
+
+def _values(episode: Episode) -> dict[str, Any]:
+    """Those that the page lists."""
+    shown = (".start", ".max")
+    return {name: value for name, value in episode.values.items() if value is not None and name.endswith(shown)}
 
 
 def _series_of(result: Result, subject: SubjectTrace) -> dict[str, Series]:
@@ -281,10 +294,10 @@ def _ways(result: Result, table: _Table) -> list[dict[str, Any]]:
     return found
 
 
-def _demands(result: Result, table: _Table) -> list[dict[str, Any]]:
+def _demands(deeds: Sequence[Deed], table: _Table) -> list[dict[str, Any]]:
     """By template, how many tasks demand it over time."""
     edges: dict[str, list[tuple[float, int]]] = {}
-    for deed in deeds_of(result):
+    for deed in deeds:
         if deed.what != "deploy":
             continue
         own = edges.setdefault(deed.about.partition(":")[0], [])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from detector.engine.episodes.events import Event
 from detector.replay.replaying import Outcome
+from detector.results.episodes import Episode, episodes_of
 from detector.results.quality import Arrivals, StreamQuality
 from detector.results.series import Trace
 from detector.results.thresholds import Terms, terms_of
@@ -15,7 +17,7 @@ from wayside.api import ApplicationTask, EventRule
 from wayside.rules import CompiledRule
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Result:
     """One recording."""
 
@@ -36,6 +38,11 @@ class Result:
     notes: Sequence[str]
     """What a person should know of the recording."""
     samples: int
+
+    @cached_property
+    def episodes(self) -> list[Episode]:
+        """The episodes, in order of their starts."""
+        return episodes_of(self.recording, self.events, self.trace)
 
 
 def result_of(

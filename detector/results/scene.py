@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ FRAME = "map"
 
 _STEP = 200_000_000
 """Nanoseconds: the scene is written no more often, but at each start and end of an episode."""
-_MOST = 4000
+_MOST = 2000
 """So many updates at most, besides."""
 _KEPT = 1_000_000_000
 """Nanoseconds: a client is shown for so long after its last place."""
@@ -78,12 +78,14 @@ def updates(result: Result) -> Iterator[tuple[int, SceneUpdate]]:
             row = int(rows[name][at])
             if row >= 0 and time <= last[name] + _KEPT:
                 there[name] = float(axes[0, row]), float(axes[1, row])
-        entities = [_client(name, place, time) for name, place in there.items()]
+        named: dict[str, list[str]] = {}
+        pairs = []
         for each in busy.values():
-            if len(each.clients) == 2 and there.keys() >= {*each.clients}:
-                entities.append(_pair(each.rule, each.clients, there, time))
-            elif len(each.clients) == 1 and each.clients[0] in there:
-                entities.append(_mark(each.rule, each.clients[0], there[each.clients[0]], time))
+            if len(each.clients) == 1:
+                named.setdefault(each.clients[0], []).append(each.rule)
+            elif len(each.clients) == 2 and there.keys() >= {*each.clients}:
+                pairs.append(_pair(each.rule, each.clients, there, time))
+        entities = [_client(name, place, named.get(name, ()), time) for name, place in there.items()] + pairs
         yield time, SceneUpdate(entities=entities)
 
 
@@ -114,9 +116,12 @@ def _entity(name: str, time: int, **primitives: Any) -> SceneEntity:
     return SceneEntity(timestamp=_stamp(time), frame_id=FRAME, id=name, lifetime=Duration(sec=2), **primitives)
 
 
-def _client(name: str, place: tuple[float, float], time: int) -> SceneEntity:
-    sphere = SpherePrimitive(pose=_pose(*place), size=Vector3(x=3.0, y=3.0, z=3.0), color=_color(_CLIENT))
-    return _entity(f"client {name}", time, spheres=[sphere], texts=[_label(name, place, 3.0, _CLIENT)])
+def _client(name: str, place: tuple[float, float], rules: Sequence[str], time: int) -> SceneEntity:
+    """A client; in an episode it has another colour, and its label names the rules."""
+    color = _OPEN if rules else _CLIENT
+    sphere = SpherePrimitive(pose=_pose(*place), size=Vector3(x=3.0, y=3.0, z=3.0), color=_color(color))
+    text = f"{name}: {', '.join(rules)}" if rules else name
+    return _entity(f"client {name}", time, spheres=[sphere], texts=[_label(text, place, 3.0, color)])
 
 
 def _pair(rule: str, pair: tuple[str, ...], there: Mapping[str, tuple[float, float]], time: int) -> SceneEntity:
@@ -131,10 +136,6 @@ def _pair(rule: str, pair: tuple[str, ...], there: Mapping[str, tuple[float, flo
     )
     text = _label(f"{rule}: {math.hypot(x - u, y - v):.0f} m", ((x + u) / 2, (y + v) / 2), 4.0, _OPEN)
     return _entity(f"{rule} {'+'.join(pair)}", time, lines=[line], texts=[text])
-
-
-def _mark(rule: str, client: str, place: tuple[float, float], time: int) -> SceneEntity:
-    return _entity(f"{rule} {client}", time, texts=[_label(rule, place, 6.0, _OPEN)])
 
 
 def _polygons(result: Result, time: int, origin: Doubles) -> Iterator[SceneEntity]:

@@ -15,6 +15,7 @@ from detector.engine.columns.table import Truths
 from detector.engine.engine import Engine
 from detector.engine.episodes.episodes import OUTSIDE
 from detector.results.changes import Changes
+from detector.results.joining import Seen, Waiting, joined_blocks
 from detector.results.pairing import PairLog, WayLog
 from detector.results.reasons import why_unknown
 from detector.results.series import (
@@ -35,6 +36,9 @@ from detector.results.witnessing import Witnessed
 from wayside.expressions.columns.values import Tag
 from wayside.rules import PairSubject
 
+_POINTS = 20_000
+"""So many points, clients and ticks, are noted together."""
+
 
 class _Plan(NamedTuple):
     """What is noted of the blocks of one group."""
@@ -46,6 +50,8 @@ class _Plan(NamedTuple):
     """The row of a track, it, the field and its changes."""
     seen: set[int]
     """The clients of the block before."""
+    waiting: list[Waiting]
+    """Small blocks, which are noted together: live and beside rules about pairs, blocks are of few ticks."""
 
 
 class Tracer:
@@ -90,6 +96,21 @@ class Tracer:
         plan = self._plans.get(id(tracks))
         if plan is None:
             plan = self._plans[id(tracks)] = self._plan(tracks)
+        if looked is None and not _has_texts(block):  # codes of texts may not last
+            plan.waiting.append(Waiting(block, codes, numbers))
+            if sum(len(each.block.ticks) for each in plan.waiting) * len(numbers) >= _POINTS:
+                self._flush(plan)
+            return
+        self._flush(plan)
+        self._note(plan, Seen([block]), codes, numbers, looked)
+
+    def _flush(self, plan: _Plan) -> None:
+        """Note the blocks that wait."""
+        for joined in joined_blocks(plan.waiting):
+            self._note(plan, joined.block, joined.codes, joined.numbers, None)
+        plan.waiting.clear()
+
+    def _note(self, plan: _Plan, block: Seen, codes: Codes, numbers: Integers, looked: Truths | None) -> None:
         everybody = looked is None
         at_all: slice | NDArray[np.bool_] = slice(None) if looked is None else np.asarray(looked.any(axis=0))
         for at, track, name, changes in plan.signals:
@@ -118,6 +139,8 @@ class Tracer:
 
     def trace(self) -> Trace:
         """All that was seen."""
+        for plan in self._plans.values():
+            self._flush(plan)
         found: dict[tuple[str, str], SubjectTrace] = {}
         self._of_clients(found)
         for (name, _), log in self._pairs.items():
@@ -177,11 +200,11 @@ class Tracer:
                     key = (track.rule.name, track.element.name, field)
                     self._reasons.setdefault(key, {})
                     conditions.append((row, track, field, self._conditions.setdefault(key, Changes())))
-        return _Plan(tracks, signals, conditions, set())
+        return _Plan(tracks, signals, conditions, set(), [])
 
     def _signal(
         self,
-        block: Block,
+        block: Seen,
         track: Track,
         name: str,
         numbers: Integers,
@@ -204,12 +227,12 @@ class Tracer:
             places = np.arange(shape[0])[chosen]
             for place in np.flatnonzero(texts).tolist():
                 point = int(places[found.rows[place]]) * shape[1] + int(found.ticks[place])
-                text = str(block.values(track, point)[name])
+                text = str(block.at(point)[0].values(track, block.at(point)[1])[name])
                 found.values[place] = self._texts.setdefault(text, len(self._texts))
 
     def _condition(
         self,
-        block: Block,
+        block: Seen,
         codes: Codes,
         row: int,
         track: Track,
@@ -232,7 +255,7 @@ class Tracer:
         places = np.arange(shape[0])[chosen]
         for place in np.flatnonzero(found.values == UNKNOWN).tolist():
             at, tick = int(places[found.rows[place]]), int(found.ticks[place])
-            why = why_unknown(block, track, expression, at * shape[1] + tick)
+            why = why_unknown(*block.at(at * shape[1] + tick), track, expression)
             reasons[int(numbers[at]), block.ticks[tick]] = why
 
     def _lost(self, plan: _Plan, gone: Integers, times: Integers) -> None:
@@ -257,6 +280,10 @@ class Tracer:
     def _time(self, first: int, last: int) -> None:
         self._begin = first if self._begin is None else min(self._begin, first)
         self._end = max(self._end, last)
+
+
+def _has_texts(block: Block) -> bool:
+    return any(column.tags is not None and bool((column.tags == Tag.TEXT).any()) for column in block.signals)
 
 
 def _key(track: Track, name: str) -> tuple[str, str, str]:

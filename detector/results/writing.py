@@ -12,7 +12,7 @@ from rich.table import Table
 
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import Outcome
-from detector.results.episodes import Episode, episodes_of, write_csv, write_parquet
+from detector.results.episodes import Episode, write_csv, write_parquet
 from detector.results.kinds import Kind
 from detector.results.quality import Arrivals
 from detector.results.result import Result, result_of
@@ -70,7 +70,7 @@ def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Kind
         written.append(folder / name)
         return written[-1]
 
-    episodes = [episode for result in results for episode in episodes_of(result)]
+    episodes = [episode for result in results for episode in result.episodes]
     if Kind.EPISODES in kinds:
         write_csv(path("episodes.csv"), episodes)
         write_parquet(path("episodes.parquet"), episodes)
@@ -95,7 +95,7 @@ def show_summary(console: Console, results: Sequence[Result]) -> None:
     table.add_column("rule", overflow="fold")
     for name in ("episodes", "subjects", "open", "in all", "longest", "unknown", "errors"):
         table.add_column(name, justify="right")
-    episodes = [episode for result in results for episode in episodes_of(result)]
+    episodes = [episode for result in results for episode in result.episodes]
     for rule in sorted({rule for result in results for rule in result.rules}):
         own = [episode for episode in episodes if episode.rule == rule]
         lasting = [episode.duration for episode in own if episode.duration is not None]
