@@ -16,6 +16,7 @@ import typer
 
 from detector import inquiry, recordings
 from detector.catalog.command import command as catalog_command
+from detector.results.kinds import Kind, chosen
 from wayside import commandline
 from wayside.beginning import importing
 from wayside.commandline import leave, refuse
@@ -139,6 +140,13 @@ def replay(
     as_one: Annotated[
         bool, typer.Option("--as-one", help="Play all recordings as one, merged by time: they are of one drive.")
     ] = False,
+    results: Annotated[
+        list[Kind] | None,
+        typer.Option(
+            help="Also write results to look at: report.html; results.mcap for Foxglove; the table of episodes as "
+            "Parquet and CSV; or all. May be repeated."
+        ),
+    ] = None,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with importing():
@@ -146,7 +154,7 @@ def replay(
         from detector.memory import tune_garbage_collection
 
     tune_garbage_collection()  # otherwise a third of the time of reading is spent on searching among samples
-    replay_files(recordings, output, detector, rules or (), compared, as_one=as_one)
+    replay_files(recordings, output, detector, rules or (), compared, as_one=as_one, kinds=chosen(results))
 
 
 @app.command()

@@ -22,7 +22,10 @@ from detector.replay.gathering import intake_file_of, name_of, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.playing import Played, play
 from detector.replay.progress import Progress
+from detector.replay.recordings import quick_span_of
 from detector.replay.replaying import Outcome, replay_intake
+from detector.results.kinds import Kind
+from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
 from detector.rules.files import load_rules
 from detector.rules.selection import select
 from detector.tracing import episode_traces
@@ -39,6 +42,7 @@ def replay_files(
     compared: tuple[str, str] | None,
     *,
     as_one: bool,
+    kinds: frozenset[Kind] = frozenset(),
 ) -> None:
     """Replay, write the results into the folder, and print a summary.
 
@@ -51,14 +55,22 @@ def replay_files(
         rules: files or folders with EventRules.
         compared: the names of two rules whose episodes are compared; None: nothing is compared.
         as_one: merge all recordings by time; otherwise each is replayed on its own.
+        kinds: the results to look at that are written as well.
 
     Raises:
+        MissingExtraError: a result needs a package that is not installed.
         DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text says why.
     """
+    check_installed(kinds)
+    looking = Looking() if kinds else None
     with Progress(Console(stderr=True)) as progress:
-        played = _replayed(recordings, detector, rules, as_one, progress)
+        played, evaluated = _replayed(recordings, detector, rules, as_one, progress, looking)
+        output.mkdir(parents=True, exist_ok=True)
+        results = [] if looking is None else looking.results(played.outcomes, evaluated)
+        if results:
+            progress.note("writing the results")
+            write_results(output, results, kinds)
     outcomes = list(played.outcomes.values())
-    output.mkdir(parents=True, exist_ok=True)
     traced = [_traced(outcome) for outcome in outcomes]
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
         file.writelines(event.to_json() + "\n" for events, _ in traced for event in events)
@@ -74,6 +86,8 @@ def replay_files(
             typer.echo(line, err=True)
     for error in played.errors:
         typer.echo(f"error: {error}", err=True)
+    if results:
+        show_summary(Console(stderr=True), results)
     typer.echo(f"{_counted(outcomes)}: {output}", err=True)
     if refusals or played.errors:
         raise typer.Exit(1)
@@ -129,37 +143,56 @@ def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:
 
 
 def _replayed(
-    recordings: Sequence[Path], detector: Path | None, rules: Sequence[Path], as_one: bool, progress: Progress
-) -> Played:
+    recordings: Sequence[Path],
+    detector: Path | None,
+    rules: Sequence[Path],
+    as_one: bool,
+    progress: Progress,
+    looking: Looking | None,
+) -> tuple[Played, Sequence[EventRule]]:
+    """What the recordings came to, and the rules as written, where files have them."""
     intake = intake_file_of(recordings)
     if intake is not None:
-        return Played({name_of((intake,)): _intake_replayed(intake, detector, rules, progress)}, [])
+        name = name_of((intake,))
+        outcome, given = _intake_replayed(
+            intake, detector, rules, progress, None if looking is None else looking.watch(name)
+        )
+        return Played({name: outcome}, []), given
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
     loaded = load_rules(detector, rules, lasting_problems)
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
     gathered = recordings_of(recordings, as_one=as_one)
-    return play(
+    if progress.shown:
+        progress.expect([quick_span_of(recording) for recording in gathered])
+    played = play(
         gathered,
         loaded.rule_set.detector,
         loaded.rule_set.rules,
         lambda: _plugins(Outages(lambda: ())),
-        progress.watch_batches,
+        lambda batches: progress.watch_batches(batches if looking is None else looking.batches(batches)),
+        lambda name: None if looking is None else looking.watch(name).tracer,
     )
+    return played, loaded.rule_set.rules
 
 
-def _intake_replayed(recording: Path, detector: Path | None, rules: Sequence[Path], progress: Progress) -> Outcome:
+def _intake_replayed(
+    recording: Path, detector: Path | None, rules: Sequence[Path], progress: Progress, look: Look | None
+) -> tuple[Outcome, Sequence[EventRule]]:
     if detector is None and rules:
         refuse("give --detector as well: rules are compiled against their Detector")
     given = None if detector is None else load_rules(detector, rules, lasting_problems).rule_set
+    records = progress.watch(read_intake(recording))
     with _plugins(Outages(lambda: recorded_outages(recording) if detector is None else ())) as plugins:
-        return replay_intake(
-            progress.watch(read_intake(recording)),
+        outcome = replay_intake(
+            records if look is None else look.arrivals.watch(records),
             None if given is None else given.detector,
             given.rules if given is not None and rules else None,
             plugins,
+            None if look is None else look.tracer,
         )
+    return outcome, [] if given is None else given.rules
 
 
 def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:

@@ -22,6 +22,7 @@ from detector.engine.episodes.episodes import TRUE
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import RuleRun
 from detector.engine.happened import Happened
+from detector.engine.observing import Observer
 from detector.engine.pairs import PairGroup
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
@@ -69,6 +70,7 @@ class RuleGroup:
         self.columns = columns(
             [Track(run.rule, each, run.counters, run.read, row) for row, (run, each) in enumerate(elements)], context
         )
+        self.observer: Observer | None = None
         self.may_wait = True
         """Whether several ticks are evaluated together."""
         self.width = len(self.columns.tracks)
@@ -93,6 +95,8 @@ class RuleGroup:
             return
         looked = None if only is None else self._looked(clients, only)
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
+        if self.observer is not None and isinstance(block, Block):
+            self.observer.clients(self.columns.tracks, block, codes, looked)
         self._follow()
         numbers: list[int] = block.numbers.tolist()
         states: list[tuple[int, int, bool, int]] = []
@@ -218,8 +222,9 @@ class RuleGroup:
 class Blocks:
     """All rules in columns."""
 
-    def __init__(self, context: Context, floor: Callable[[], int | None]) -> None:
+    def __init__(self, context: Context, floor: Callable[[], int | None], observer: Observer | None = None) -> None:
         """`floor`: windows do not reach back to this time or beyond; nanoseconds."""
+        self._observer = observer
         self._context = context
         self._floor = floor
         self._depths: list[list[RuleGroup | PairGroup]] = []
@@ -253,7 +258,7 @@ class Blocks:
                 continue
             if fits_pairs(rule, self._context):
                 pairs.append((depth, run, every))
-            elif fits(rule) or fits_fleet(rule):
+            elif fits(rule) or (fits_fleet(rule) and self._observer is None):  # it sees clients and pairs
                 columns = Group if fits(rule) else FleetGroup
                 together.setdefault((depth, columns, every, every * thinning(run)), []).append(run)
             else:
@@ -274,6 +279,7 @@ class Blocks:
         groups: list[RuleGroup | PairGroup] = [*self._groups, *self._on_sample.values()]
         self.names = frozenset(run.rule.name for group in groups for run in group.runs)
         for group in groups:
+            group.observer = self._observer
             for run in group.runs:
                 run.disturbed = True
 

@@ -23,6 +23,7 @@ from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import Answer, Change, RuleRun, same_semantics
 from detector.engine.happened import Happened
 from detector.engine.knowledge import Knowledge
+from detector.engine.observing import Observer
 from detector.engine.pairs import PairGroup
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.samples.sample import Arrival, Decoder, Sample
@@ -95,6 +96,8 @@ class Engine:
         """The last tick that waits to be evaluated."""
         self.journal: list[Change] | None = None
         """What became of demands, in order; None while nobody wants to know."""
+        self.observer: Observer | None = None
+        """Looks on at what is evaluated in columns; it is set before the rules are."""
 
     def set_detector(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
         """Go on with a changed Detector; call `set_rules` afterwards, with the rules compiled against it.
@@ -291,6 +294,11 @@ class Engine:
         return self._known.latency(sample, stream)
 
     @property
+    def in_columns(self) -> frozenset[str]:
+        """The rules that are evaluated in columns, and so are seen by the observer."""
+        return self._blocks.names
+
+    @property
     def rules(self) -> Mapping[str, RuleRun]:
         """The rules that are evaluated, by name."""
         return self._runs
@@ -317,7 +325,7 @@ class Engine:
         self._known.settle()
 
     def _make_blocks(self) -> None:
-        self._blocks = Blocks(self._known.context, lambda: self._known.floor)
+        self._blocks = Blocks(self._known.context, lambda: self._known.floor, self.observer)
         thinning = self.schedule.thinning
         self._blocks.set_rules(self._runs, self.schedule.paused, lambda run: thinning(run.rule))
 

@@ -15,6 +15,7 @@ from detector.engine.episodes.episodes import TRUE
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import RuleRun
 from detector.engine.happened import Happened
+from detector.engine.observing import Observer
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
 
@@ -71,7 +72,9 @@ class PairGroup:
         self._order = order
         self._context = context
         self._element = run.rule.elements[0]
-        self._columns = PairColumns(Track(run.rule, self._element, run.counters, run.read, 0), context)
+        self._track = Track(run.rule, self._element, run.counters, run.read, 0)
+        self._columns = PairColumns(self._track, context)
+        self.observer: Observer | None = None
         self._watched = _NOBODY
         self._version = -1
         self._clients: Sequence[str] = ()
@@ -98,6 +101,8 @@ class PairGroup:
         there = (first >= 0) & (second >= 0)
         look = watched.in_progress & there
         sight = self._columns.evaluate(block, floor, (first[look], second[look]))
+        if self.observer is not None:
+            self.observer.pairs(self._track, sight)
         # Where each watched pair is among those that were looked at; -1: it was not.
         pairs = sight.first * count + sight.second
         rows = np.searchsorted(pairs, first * count + second)

@@ -16,6 +16,8 @@ EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x"
 
 _BLOCK = 1 << 17
 """About how many bytes of lines make a batch."""
+_TAIL = 1 << 16
+"""The last line is looked for in so many bytes."""
 
 
 class _Line(msgspec.Struct, forbid_unknown_fields=True, gc=False):
@@ -67,6 +69,18 @@ def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch
                     on_cut(Cut(path, messages, f"line {where} has no end"))
                     return
                 raise RecordingError(f"{path}:{where}: {error}: a line reads {EXAMPLE}") from error
+
+
+def json_lines_span(path: Path) -> tuple[int, int] | None:
+    """The times of the first line and of the last that has an end; None where one cannot be read."""
+    with path.open("rb") as file:
+        first = file.readline()
+        file.seek(max(0, file.seek(0, 2) - _TAIL))
+        ends = [line for line in file.read().split(b"\n")[:-1] if line.strip()]
+    try:
+        return (_read(first).t, _read(ends[-1]).t) if ends else None
+    except _UNREADABLE:
+        return None
 
 
 def _decoded(texts: Sequence[bytes], number: int) -> _Block:

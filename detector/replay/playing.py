@@ -15,7 +15,7 @@ from detector.replay.gathering import Recording, name_of
 from detector.replay.latched import recorded_arrivals
 from detector.replay.message import Cut
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Outcome, replay_arrivals
+from detector.replay.replaying import Onlooker, Outcome, replay_arrivals
 from detector.replay.routing import Router
 from wayside.api import Detector, EventRule
 
@@ -45,11 +45,12 @@ def play(
     rules: Sequence[EventRule],
     plugins: Plugins = nullcontext,
     watch: Watch = lambda batches: batches,
+    onlooker: Callable[[str], Onlooker | None] = lambda _: None,
 ) -> Played:
     """What each recording came to. Without `plugins` they run in this process.
 
     Of several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
-    task names differ even if all begin at the same time.
+    task names differ even if all begin at the same time. `onlooker` gives who looks on at the recording of that name.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -63,7 +64,7 @@ def play(
         name = name_of(recording)
         try:
             holder = detector.name if number == 1 else f"{detector.name}.{number}"
-            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, holder)
+            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, holder, onlooker(name))
         except RecordingError as error:
             errors.append(error)
             continue
@@ -83,6 +84,7 @@ def _played(
     plugins: Plugins,
     watch: Watch,
     holder: str,
+    onlooker: Onlooker | None,
 ) -> tuple[Outcome, list[str]]:
     """What a recording came to, and its keys that belong to no stream."""
     cuts: list[Cut] = []
@@ -90,7 +92,7 @@ def _played(
     router = Router(completed.spec.streams, name_of(recording))
     arrivals = recorded_arrivals(recording, router, completed, cuts.append)
     with plugins() as host:
-        outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder)
+        outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder, onlooker)
     outcome.cuts = cuts
     if not outcome.samples:
         keys = router.unrouted

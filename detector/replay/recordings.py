@@ -7,7 +7,7 @@ from pathlib import Path
 
 from detector.replay.batches import Batch, merged
 from detector.replay.errors import RecordingError
-from detector.replay.json_lines import read_json_lines
+from detector.replay.json_lines import json_lines_span, read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
 from detector.replay.mcap_file import mcap_span, mcap_types, read_mcap
 from detector.replay.message import OnCut, RecordedType, Wanted, ignore
@@ -55,6 +55,26 @@ def span_of(path: Path) -> tuple[int, int] | None:
         first = batch.times[0] if first is None else first
         last = batch.times[-1]
     return None if first is None or last is None else (first, last)
+
+
+def quick_span_of(paths: Sequence[Path]) -> tuple[int, int] | None:
+    """About the times of the first and the last message of one recording; None where only reading all of it tells."""
+    quick: dict[_Read, Callable[[Path], tuple[int, int] | None]] = {
+        read_mcap: mcap_span,
+        read_rosbag1: rosbag1_span,
+        read_json_lines: json_lines_span,
+    }
+    spans: list[tuple[int, int]] = []
+    for path in paths:
+        try:
+            read = _reader(path)
+            span = quick[read](path) if read in quick else None
+        except (RecordingError, OSError):
+            return None
+        if span is None:
+            return None
+        spans.append(span)
+    return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
 
 def types_of(path: Path) -> list[RecordedType]:

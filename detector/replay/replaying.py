@@ -9,13 +9,14 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, from_task, to_task
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
+from detector.engine.observing import Observer
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
@@ -29,6 +30,13 @@ from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.times import format_time
 
 _BATCH = 4096
+
+
+class Onlooker(Observer, Protocol):
+    """Sees what a replay evaluates. It decides nothing."""
+
+    def attend(self, engine: Engine) -> None:
+        """The engine has other rules from now on."""
 
 
 @dataclass(slots=True)
@@ -69,6 +77,7 @@ class Replay:
         plugins: PluginHost | None = None,
         version: int = ORDER,
         order: int = ORDER,
+        onlooker: Onlooker | None = None,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
 
@@ -87,6 +96,7 @@ class Replay:
         )
         self._engine.counters.watch_ages = True
         self._engine.journal = []
+        self._engine.observer = self._onlooker = onlooker
         self._demands: dict[str, Demand] = {}
         self._demands_version: tuple[int, int] | None = None
         self.set_rules(rules)
@@ -132,6 +142,8 @@ class Replay:
         self.outcome.refusals += refused
         self.outcome.rules = tuple(sorted({*self.outcome.rules, *(rule.name for rule in rules)}))
         self._note(self._engine.set_rules([rule_as_of(rule, self._version) for rule in compiled]))
+        if self._onlooker is not None:
+            self._onlooker.attend(self._engine)
 
     def restore(self, demands: Sequence[Demand], time: int, episodes: Sequence[OpenEpisode] = ()) -> None:
         """Take up the episodes that were open before the recording."""
@@ -181,6 +193,7 @@ def replay_intake(
     detector: Detector | None,
     rules: Sequence[EventRule] | None,
     plugins: PluginHost | None = None,
+    onlooker: Onlooker | None = None,
 ) -> Outcome:
     """Replay an intake file: with what it holds, or with another Detector or other rules where given.
 
@@ -201,7 +214,7 @@ def replay_intake(
             batch.append(record)
             continue
         if replay is None:
-            replay = _begin(record, detector, rules, outcome, plugins)
+            replay = _begin(record, detector, rules, outcome, plugins, onlooker)
             continue
         replay.take(batch, _until(record, batch))
         batch = []
@@ -226,6 +239,7 @@ def _begin(
     rules: Sequence[EventRule] | None,
     outcome: Outcome,
     plugins: PluginHost | None,
+    onlooker: Onlooker | None,
 ) -> Replay:
     document = record.document
     if record.kind != "start":
@@ -240,6 +254,7 @@ def _begin(
         plugins=plugins,
         version=version if rules is None else ORDER,
         order=version,
+        onlooker=onlooker,
     )
 
 
@@ -286,6 +301,7 @@ def replay_arrivals(
     rules: Sequence[EventRule],
     plugins: PluginHost | None = None,
     holder: str | None = None,
+    onlooker: Onlooker | None = None,
 ) -> Outcome:
     """Replay what any other recording holds, as the live intake would have queued it; `plugins` as for an intake file.
 
@@ -303,7 +319,9 @@ def replay_arrivals(
     for part in parts_of(batches):
         first = part[0].received
         if replay is None:
-            replay = Replay(detector, rules, holder=holder, start=first - 1, outcome=outcome, plugins=plugins)
+            replay = Replay(
+                detector, rules, holder=holder, start=first - 1, outcome=outcome, plugins=plugins, onlooker=onlooker
+            )
         elif first - last > PAUSE:
             replay.gap(first - 1)
             outcome.notes.append(
@@ -313,7 +331,7 @@ def replay_arrivals(
         last = part[-1].received
         replay.take(part, last)
     if replay is None:
-        replay = Replay(detector, rules, holder=holder, start=0, outcome=outcome, plugins=plugins)
+        replay = Replay(detector, rules, holder=holder, start=0, outcome=outcome, plugins=plugins, onlooker=onlooker)
         replay.take((), 0)
     replay.finish()
     outcome.notes += replay.report()

@@ -14,6 +14,7 @@ from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.possible import Possible
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables
+from detector.engine.columns.verdicts import Verdict
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.subjects import FLEET, Subject
 from detector.engine.scoping.positions import Positions
@@ -90,6 +91,8 @@ class Block:
         """Which points there are; None: all. Shape (clients, ticks)."""
         self.looked: Truths | None = None
         """Which rule looks at which client; None: all at all. Shape (tracks, clients)."""
+        self.verdicts: Mapping[str, Verdict] = {}
+        """By field, where conditions are true and where false; shape (tracks, points)."""
         self._context = context
 
     @property
@@ -118,12 +121,17 @@ class Block:
     def view(self, track: Track, point: int) -> dict[str, Any]:
         """The same without the element."""
         client = self.clients[point // len(self.ticks)]
-        found: dict[str, Any] = {
+        return {
             "client": client,
             "labels": self._context.clients.labels(client),
             "streams": [stream for stream, fresh in self.fresh.items() if fresh.item(point)],
             "parameters": track.rule.parameters.of(client),
+            **self.values(track, point),
         }
+
+    def values(self, track: Track, point: int) -> dict[str, Any]:
+        """The rule's signals at a point, those that are known."""
+        found: dict[str, Any] = {}
         for name, at in track.signals.items():
             column = self.signals[at]
             if column.tags is None:

@@ -111,6 +111,7 @@ class Conditions:
                 for row, condition in chosen:
                     if condition.node is not None and unknown[row].any():
                         self._note_unknown(block, row, condition, unknown[row], tags)
+        block.verdicts = found
         return found
 
     # CEL

@@ -62,6 +62,8 @@ class Sight:
     closing_known: Truths | None = None
     codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint8))
     """Of each pair its observation (see SubjectState.run)."""
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    """By field, where conditions are true and where false."""
 
 
 class PairColumns:
@@ -220,7 +222,7 @@ class PairColumns:
             note,
             not self._context.possible.limited,
         )
-        found = self._conditions.evaluate(rows)
+        found = sight.verdicts = self._conditions.evaluate(rows)
         when = found["when"]
         until = found.get("until", Verdict(when.false, when.true))
         inside, outside = np.ones(rows.size, bool), np.zeros(rows.size, bool)

@@ -1,0 +1,24 @@
+"""Who looks on while rules are evaluated in columns. It decides nothing, and nothing is computed for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from detector.engine.columns.block import Block, Track
+from detector.engine.columns.pairs import Sight
+from detector.engine.columns.table import Truths
+from detector.engine.columns.verdicts import Codes
+
+
+class Observer(Protocol):
+    """Gets each block as it was evaluated. What it keeps of it, it copies."""
+
+    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
+        """Rules about clients: the observations have shape (tracks, clients, ticks), `looked` (tracks, clients).
+
+        The block has the signals and, by field, where conditions are true and false (`verdicts`), one row a track.
+        """
+
+    def pairs(self, track: Track, sight: Sight) -> None:
+        """A rule about pairs at one tick."""

@@ -1,0 +1,85 @@
+"""What changes in blocks of columns: the points at which a value differs from the one before."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.results.series import Bytes, Doubles, Integers
+
+_NEVER_SEEN = 255
+"""In place of a tag: no tag is like it, so the first point always counts."""
+
+
+class Found(NamedTuple):
+    """Points at which something changed, in order of the clients, then of the times."""
+
+    rows: NDArray[np.intp]
+    """Of the block: which of its clients."""
+    ticks: NDArray[np.intp]
+    """Of the block: which of its ticks."""
+    values: Doubles
+    """What they are from there on, as it is kept: texts may be written over."""
+
+
+class Changes:
+    """The changes of one value of many clients, block after block."""
+
+    def __init__(self) -> None:
+        self._last_values: Integers = np.zeros(0, np.int64)
+        self._last_tags: Bytes = np.zeros(0, np.uint8)
+        self._parts: list[tuple[Integers, Integers, Doubles, Bytes]] = []
+
+    def add(
+        self, clients: Integers, times: Integers, values: Doubles, tags: Bytes, present: NDArray[np.bool_] | None
+    ) -> Found:
+        """Note what changed, and return where.
+
+        Args:
+            clients: numbers of the block's clients, the same in every block.
+            times: the ticks, nanoseconds since the epoch, later than all before.
+            values: shape (clients, ticks).
+            tags: the same shape; values of different tags differ.
+            present: the same shape: which points there are; None: all.
+        """
+        bits = np.ascontiguousarray(values).view(np.int64)
+        self._make_room(int(clients.max()) + 1 if len(clients) else 0)
+        changed = np.empty(bits.shape, bool)
+        changed[:, 0] = (bits[:, 0] != self._last_values[clients]) | (tags[:, 0] != self._last_tags[clients])
+        changed[:, 1:] = (bits[:, 1:] != bits[:, :-1]) | (tags[:, 1:] != tags[:, :-1])
+        if present is not None:
+            changed[:, 1:] |= ~present[:, :-1]
+            changed &= present
+            there = present[:, -1]
+            clients_there = clients[there]
+            self._last_values[clients_there] = bits[there, -1]
+            self._last_tags[clients_there] = tags[there, -1]
+        else:
+            self._last_values[clients] = bits[:, -1]
+            self._last_tags[clients] = tags[:, -1]
+        rows, ticks = np.nonzero(changed)
+        new = values[rows, ticks]
+        if len(rows):
+            self._parts.append((clients[rows], times[ticks], new, tags[rows, ticks]))
+        return Found(rows, ticks, new)
+
+    def by_client(self) -> Iterator[tuple[int, Integers, Doubles, Bytes]]:
+        """Of each client: its number, and the times, values and tags of its changes."""
+        if not self._parts:
+            return
+        clients, times, values, tags = (np.concatenate(part) for part in zip(*self._parts, strict=True))
+        order = np.argsort(clients, kind="stable")
+        clients, times, values, tags = clients[order], times[order], values[order], tags[order]
+        bounds = [0, *(np.flatnonzero(np.diff(clients)) + 1).tolist(), len(clients)]
+        for begin, end in itertools.pairwise(bounds):
+            yield int(clients[begin]), times[begin:end], values[begin:end], tags[begin:end]
+
+    def _make_room(self, room: int) -> None:
+        more = room - len(self._last_tags)
+        if more > 0:
+            self._last_values = np.append(self._last_values, np.zeros(more, np.int64))
+            self._last_tags = np.append(self._last_tags, np.full(more, _NEVER_SEEN, np.uint8))

@@ -1,0 +1,180 @@
+"""Episodes as a table: a row each, with its times, its values and the statistics of its signals."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from detector.engine.episodes.events import Event
+from detector.results.series import Kind, Series, SubjectTrace, Trace
+from wayside.times import format_time
+
+Plain = float | bool | str | None
+
+FIXED = (
+    "recording", "rule", "subject", "subjects", "element", "episode", "onset_time", "start_time", "end_time",
+    "duration", "reason", "dry_run",
+)  # fmt: skip
+TIMES = ("onset_time", "start_time", "end_time")
+
+
+@dataclass(slots=True)
+class Episode:
+    """One row."""
+
+    recording: str
+    rule: str
+    subject: str
+    subjects: tuple[str, ...]
+    element: str | None
+    episode: str
+    onset_time: int
+    start_time: int
+    end_time: int | None
+    """None: it was open when the recording ended. Nanoseconds since the epoch, as all times."""
+    reason: str | None
+    dry_run: bool
+    values: dict[str, Plain] = field(default_factory=dict)
+    """By `<signal>.start`, `.end`, `.min`, `.max` and `.mean`: those that are known."""
+
+    @property
+    def duration(self) -> float | None:
+        """Seconds."""
+        return None if self.end_time is None else (self.end_time - self.start_time) / 1e9
+
+
+def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[Episode]:
+    """The episodes of a recording, in order of their starts.
+
+    Minimum and maximum are those of all ticks of the episode; the mean is weighted by time. An episode that is open
+    has those up to the end of the recording.
+    """
+    traces = {(each.rule, each.subject): each for each in trace.subjects}
+    found: dict[str, Episode] = {}
+    for event in events:
+        episode = found.get(event.episode)
+        if episode is None:
+            episode = found[event.episode] = _episode(recording, event)
+        if event.started:
+            episode.values |= {f"{name}.start": value for name, value in flat(event.values)}
+        else:
+            episode.end_time, episode.reason = event.end_time, str(event.reason)
+            episode.values |= {f"{name}.end": value for name, value in flat(event.values)}
+    for episode in found.values():
+        subject = traces.get((episode.rule, episode.subject))
+        if subject is not None:
+            episode.values |= _statistics(subject, episode, trace.end)
+    return sorted(found.values(), key=lambda each: (each.start_time, each.rule, each.subject))
+
+
+def _episode(recording: str, event: Event) -> Episode:
+    return Episode(
+        recording, event.rule, event.subject, event.subjects, event.element, event.episode, event.onset_time,
+        event.start_time, None, None, event.dry_run,
+    )  # fmt: skip
+
+
+def flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Plain]]:
+    """The values of an event by the names that expressions use; lists as JSON."""
+    for name, value in values.items():
+        if name == "client" and above:
+            continue
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{above}{name}.")
+        elif isinstance(value, list):
+            yield above + name, json.dumps(value)
+        elif isinstance(value, bool | str) or value is None:
+            yield above + name, value
+        else:
+            yield above + name, float(value)
+
+
+def _statistics(trace: SubjectTrace, episode: Episode, last: int) -> dict[str, Plain]:
+    end = last if episode.end_time is None else episode.end_time
+    found: dict[str, Plain] = {}
+    for name, series in trace.signals.items():
+        if series.kind is not Kind.NUMBER:
+            continue
+        times, values = within(series, episode.start_time, end)
+        known = ~np.isnan(values)
+        if not known.any():
+            continue
+        found[f"{name}.min"], found[f"{name}.max"] = float(values[known].min()), float(values[known].max())
+        lasting = np.diff(times, append=end).astype(float)
+        weights = lasting[known]
+        found[f"{name}.mean"] = (
+            float(np.average(values[known], weights=weights)) if weights.sum() else float(values[known][0])
+        )
+    return found
+
+
+def within(series: Series, begin: int, end: int) -> tuple[Any, Any]:
+    """Times and values of a series between two times, both included; the first is what holds at the beginning."""
+    low, high = np.searchsorted(series.times, [begin, end], "right")
+    times = np.concatenate(([begin], series.times[low:high]))
+    values = np.concatenate((series.at(np.array([begin])), series.values[low:high]))
+    return times, values
+
+
+def columns_of(episodes: Iterable[Episode]) -> list[str]:
+    """The names of the values, in their order."""
+    return sorted({name for each in episodes for name in each.values})
+
+
+def write_csv(path: Path, episodes: Sequence[Episode]) -> None:
+    """Write the table as CSV: times as RFC 3339, what is unknown as nothing."""
+    names = columns_of(episodes)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*FIXED, *names])
+        for each in episodes:
+            times = [None if time is None else format_time(time) for time in _times(each)]
+            row = [
+                each.recording, each.rule, each.subject, "+".join(each.subjects), each.element, each.episode, *times,
+                each.duration, each.reason, _text(each.dry_run), *(_text(each.values.get(name)) for name in names),
+            ]  # fmt: skip
+            writer.writerow(["" if value is None else value for value in row])
+
+
+def _times(each: Episode) -> tuple[int | None, ...]:
+    return each.onset_time, each.start_time, each.end_time
+
+
+def _text(value: Plain) -> Plain:
+    """Booleans as every reader of CSV knows them; numbers as they are, with all digits."""
+    return str(value).lower() if isinstance(value, bool) else value
+
+
+def write_parquet(path: Path, episodes: Sequence[Episode]) -> None:
+    """Write the table as Parquet: times as timestamps in UTC to the nanosecond, subjects as a list."""
+    import pyarrow as pa  # noqa: PLC0415  an extra
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
+    text, time = pa.string(), pa.timestamp("ns", tz="UTC")
+    types = {
+        "recording": text, "rule": text, "subject": text, "subjects": pa.list_(text), "element": text,
+        "episode": text, **dict.fromkeys(TIMES, time), "duration": pa.float64(), "reason": text, "dry_run": pa.bool_(),
+    }  # fmt: skip
+    columns = {name: pa.array([_cell(each, name) for each in episodes], types[name]) for name in FIXED}
+    for name in columns_of(episodes):
+        values = [each.values.get(name) for each in episodes]
+        kinds = {type(value) for value in values if value is not None}
+        if kinds == {bool}:
+            columns[name] = pa.array(values, pa.bool_())
+        elif kinds <= {float}:
+            columns[name] = pa.array(values, pa.float64())
+        else:
+            texts = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
+            columns[name] = pa.array(texts, text)
+    pq.write_table(pa.table(columns), path, compression="zstd")
+
+
+def _cell(each: Episode, name: str) -> Any:
+    value = getattr(each, name)
+    return list(value) if name == "subjects" else value

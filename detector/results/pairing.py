@@ -1,0 +1,198 @@
+"""What rules about pairs see, tick by tick, and where clients are on the way."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.engine.columns.block import Track
+from detector.engine.columns.pairs import Sight
+from detector.engine.episodes.episodes import OUTSIDE
+from detector.engine.episodes.subjects import Subject
+from detector.results.reasons import of_stream
+from detector.results.series import (
+    AWAY,
+    FALSE,
+    TRUE,
+    UNKNOWN,
+    Bytes,
+    Doubles,
+    Integers,
+    Kind,
+    Series,
+    Steps,
+    SubjectTrace,
+    Way,
+)
+from wayside.expressions.columns.values import Tag
+from wayside.rules import PairSubject
+
+_SHIFT = 32
+_ROLES = ("a", "b")
+
+
+class PairLog:
+    """What one rule saw of its pairs."""
+
+    def __init__(self, track: Track) -> None:
+        self._track = track
+        self._ticks: list[int] = []
+        self._keys: list[Integers] = []
+        self._said: dict[str, list[Bytes]] = {"when": []}
+        if track.rule.until is not None:
+            self._said["until"] = []
+        self._values: dict[str, list[Doubles]] = {"distance": []}
+        self._kinds: dict[str, Kind] = {}
+        self._odd: set[str] = set()
+        self._unsure: dict[str, Integers] = {}
+        self._reasons: dict[str, dict[tuple[int, int], str]] = {field: {} for field in self._said}
+
+    def add(self, time: int, sight: Sight, numbers: Integers) -> None:
+        """Note a tick; `numbers` are those of the clients of the sight's block."""
+        self._ticks.append(time)
+        keys = numbers[sight.first] << _SHIFT | numbers[sight.second]
+        self._keys.append(keys)
+        outside = sight.codes & OUTSIDE == OUTSIDE
+        for field, parts in self._said.items():
+            verdict = sight.verdicts[field]
+            said = np.where(verdict.true, np.uint8(TRUE), np.where(verdict.false, np.uint8(FALSE), np.uint8(UNKNOWN)))
+            said[outside] = AWAY
+            parts.append(said)
+            self._note_unsure(field, time, sight, keys, said)
+        self._values["distance"].append(np.where(sight.placed, sight.distance, np.nan))
+        if sight.closing is not None and sight.closing_known is not None:
+            speeds = np.where(sight.closing_known, sight.closing, np.nan)
+            self._values.setdefault("closingSpeed", []).append(speeds)
+        for name, at in self._track.signals.items():
+            column = sight.seen.signals[at] if len(sight.first) else None
+            for role, clients in zip(_ROLES, (sight.first, sight.second), strict=True):
+                values = self._values.setdefault(f"{role}.{name}", [])
+                if column is None:
+                    values.append(np.zeros(0))
+                    continue
+                rows = sight.at[clients]
+                tags = None if column.tags is None else column.tags[rows]
+                if tags is not None and ((tags == Tag.OTHER) | (tags == Tag.TEXT)).any():
+                    self._odd.add(f"{role}.{name}")
+                if tags is not None and (tags == Tag.BOOLEAN).any():
+                    self._kinds[f"{role}.{name}"] = Kind.BOOLEAN
+                known = None if tags is None else (tags == Tag.NUMBER) | (tags == Tag.BOOLEAN)
+                values.append(column.values[rows] if known is None else np.where(known, column.values[rows], np.nan))
+
+    def subjects(self, rule: str, names: Sequence[str]) -> Iterator[SubjectTrace]:
+        """Each pair that was looked at; `names` are the clients', by their numbers."""
+        sizes = [len(keys) for keys in self._keys]
+        if not sum(sizes):
+            return
+        keys, ordinals = np.concatenate(self._keys), np.repeat(np.arange(len(sizes)), sizes)
+        order = np.argsort(keys, kind="stable")
+        keys, ordinals = keys[order], ordinals[order]
+        ticks = np.array(self._ticks, np.int64)
+        said = {field: np.concatenate(parts)[order] for field, parts in self._said.items()}
+        values = {name: np.concatenate(parts)[order] for name, parts in self._values.items() if name not in self._odd}
+        bounds = [0, *(np.flatnonzero(np.diff(keys)) + 1).tolist(), len(keys)]
+        for begin, end in itertools.pairwise(bounds):
+            key, own = int(keys[begin]), slice(begin, end)
+            clients = names[key >> _SHIFT], names[key & (1 << _SHIFT) - 1]
+            subject = SubjectTrace(rule, Subject(clients, self._track.element.name).text, clients)
+            left = _left(ordinals[own], len(ticks))
+            for name, column in values.items():
+                kind = self._kinds.get(name, Kind.NUMBER)
+                subject.signals[name] = Series(*_changes(ticks, ordinals[own], column[own], left, np.nan), kind)
+            for field, codes_of in said.items():
+                times, codes = _changes(ticks, ordinals[own], codes_of[own].astype(float), left, AWAY)
+                reasons = self._reasons[field]
+                found = {at: reasons.get((key, int(times[at]))) for at in np.flatnonzero(codes == UNKNOWN).tolist()}
+                why = {at: each for at, each in found.items() if each is not None}
+                subject.conditions[field] = Steps(times, codes.astype(np.uint8), why)
+            yield subject
+
+    def _note_unsure(self, field: str, time: int, sight: Sight, keys: Integers, said: Bytes) -> None:
+        """Note of pairs whose condition is unknown from now on why it is."""
+        at = np.flatnonzero(said == UNKNOWN)
+        before = self._unsure.get(field)
+        if not len(at) and before is None:
+            return
+        unsure = keys[at]
+        for row in at.tolist() if before is None else at[~np.isin(unsure, before)].tolist():
+            self._reasons[field][int(keys[row]), time] = self._why(field, sight, row)
+        self._unsure[field] = unsure
+
+    def _why(self, field: str, sight: Sight, row: int) -> str:
+        rule = self._track.rule
+        assert isinstance(rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
+        expression = rule.when if field == "when" else rule.until
+        read = set() if expression is None else {path[:2] for path in expression.paths}
+        for role, index in zip(_ROLES, (int(sight.first[row]), int(sight.second[row])), strict=True):
+            client = sight.block.clients[index]
+            if not sight.places.known[index]:
+                return f"position of {client}: no sample of stream {rule.subject.position.stream}, or an old one"
+            point = int(sight.at[index])
+            values = sight.seen.values(self._track, point)
+            for signal in rule.signals:
+                if (role, signal.name) in read and signal.name not in values:
+                    return f"{role}.{signal.name} of {client}: {of_stream(sight.seen, signal.stream, point)}"
+        return "a value that it reads is not there"
+
+
+class WayLog:
+    """Where clients are, as one of the rules about pairs sees it: the first of them."""
+
+    def __init__(self) -> None:
+        self.geographic = False
+        self._rule: str | None = None
+        self._times: list[int] = []
+        self._clients: list[Integers] = []
+        self._axes: list[Doubles] = []
+
+    def add(self, rule: str, geographic: bool, time: int, sight: Sight, numbers: Integers) -> None:
+        """Note a tick."""
+        if self._rule is None:
+            self._rule, self.geographic = rule, geographic
+        if rule != self._rule:
+            return
+        known = sight.places.known
+        self._times.append(time)
+        self._clients.append(numbers[known])
+        self._axes.append(sight.places.axes[:2, known])
+
+    def ways(self, names: Sequence[str]) -> dict[str, Way]:
+        """By client, its places; without those at which it stands still."""
+        if not self._times:
+            return {}
+        clients = np.concatenate(self._clients)
+        times = np.repeat(np.array(self._times, np.int64), [len(each) for each in self._clients])
+        axes = np.concatenate(self._axes, axis=1)
+        order = np.argsort(clients, kind="stable")
+        clients, times, axes = clients[order], times[order], axes[:, order]
+        moved = np.ones(len(clients), bool)
+        moved[1:] = (clients[1:] != clients[:-1]) | (axes[:, 1:] != axes[:, :-1]).any(axis=0)
+        clients, times, axes = clients[moved], times[moved], axes[:, moved]
+        bounds = [0, *(np.flatnonzero(np.diff(clients)) + 1).tolist(), len(clients)] if len(clients) else [0]
+        return {
+            names[int(clients[begin])]: Way(times[begin:end], axes[:, begin:end])
+            for begin, end in itertools.pairwise(bounds)
+        }
+
+
+def _left(ordinals: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """The places after which the pair was not looked at."""
+    after = np.flatnonzero(np.diff(ordinals) > 1)
+    return np.append(after, len(ordinals) - 1) if ordinals[-1] < count - 1 else after
+
+
+def _changes(
+    ticks: Integers, ordinals: NDArray[np.intp], values: Doubles, left: NDArray[np.intp], away: float
+) -> tuple[Integers, Doubles]:
+    """Times and values where they change; `away` where the pair is left."""
+    kept = np.ones(len(values), bool)
+    same = (values[1:] == values[:-1]) | ((values[1:] != values[1:]) & (values[:-1] != values[:-1]))
+    kept[1:] = ~same | (np.diff(ordinals) > 1)
+    at = np.flatnonzero(kept)
+    places = np.concatenate((ordinals[at], ordinals[left] + 1))
+    found = np.concatenate((values[at], np.full(len(left), away).astype(values.dtype)))
+    order = np.argsort(places, kind="stable")
+    return ticks[places[order]], found[order]

@@ -1,0 +1,106 @@
+"""How good the data of a recording is, by stream: how much came, from whom, how regularly, and what was lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from detector.engine.engine import Engine
+from detector.engine.samples.sample import Arrival
+
+Record = TypeVar("Record")
+
+
+@dataclass(slots=True)
+class _Key:
+    count: int
+    first: int
+    last: int
+    gap: int = 0
+    since: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class StreamQuality:
+    """What came on one stream."""
+
+    stream: str
+    key: str
+    """The pattern."""
+    encoding: str
+    samples: int
+    keys: int
+    """Of how many keys: mostly one a client."""
+    rate: float | None
+    """Samples a second of one key, the median over the keys; None with less than two samples of each."""
+    gap: float | None
+    """The longest time between two samples of one key, seconds."""
+    gap_key: str | None
+    gap_time: int | None
+    """Where it is, and when it begins; nanoseconds since the epoch."""
+    unreadable: int
+    last_unreadable: str
+    unnamed: int
+
+
+class Arrivals:
+    """Counts arrivals on their way into a replay."""
+
+    def __init__(self) -> None:
+        self._keys: dict[tuple[str, str], _Key] = {}
+
+    def watch_batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
+        """The batches as they are."""
+        for batch in batches:
+            self._count(batch)
+            yield batch
+
+    def watch(self, records: Iterable[Record]) -> Iterator[Record]:
+        """The records of an intake file as they are."""
+        for record in records:
+            if isinstance(record, Arrival):
+                self._count((record,))
+            yield record
+
+    def _count(self, batch: Iterable[Arrival]) -> None:
+        keys = self._keys
+        for arrival in batch:
+            time = arrival.received
+            at = (arrival.stream, arrival.key)
+            seen = keys.get(at)
+            if seen is None:
+                keys[at] = _Key(1, time, time)
+                continue
+            if time - seen.last > seen.gap:
+                seen.gap, seen.since = time - seen.last, seen.last
+            seen.last = time
+            seen.count += 1
+
+    def by_stream(self, engine: Engine) -> list[StreamQuality]:
+        """What came on each stream of the Detector, in its order; the engine is the replay's."""
+        counters = engine.counters
+        found = []
+        for stream in engine.detector.spec.streams:
+            name = stream.name
+            keys = {key: seen for (of, key), seen in self._keys.items() if of == name}
+            rates = sorted((k.count - 1) * 1e9 / (k.last - k.first) for k in keys.values() if k.last > k.first)
+            worst = max(keys, key=lambda key: keys[key].gap, default=None)
+            gap = keys[worst] if worst is not None and keys[worst].gap else None
+            found.append(
+                StreamQuality(
+                    stream=name,
+                    key=stream.key,
+                    encoding=stream.encoding.value,
+                    samples=sum(seen.count for seen in keys.values()),
+                    keys=len(keys),
+                    rate=rates[len(rates) // 2] if rates else None,
+                    gap=None if gap is None else gap.gap / 1e9,
+                    gap_key=None if gap is None else worst,
+                    gap_time=None if gap is None else gap.since,
+                    unreadable=counters.undecodable[name],
+                    last_unreadable=counters.last_undecodable.get(name, ""),
+                    unnamed=counters.unnamed[name],
+                )
+            )
+        return found

@@ -1,0 +1,318 @@
+"""report.html: one page that needs nothing else, to see what a replay found and why.
+
+The page holds its data as compressed JSON, and BokehJS, which draws it. Times in the data are whole multiples of a unit
+after the beginning, each as the difference to the one before.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence, Set
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from detector.results.actions import Deed, deeds_of
+from detector.results.episodes import Episode
+from detector.results.places import polygons_of
+from detector.results.result import Result
+from detector.results.series import UNKNOWN, Integers, Kind, Series, SubjectTrace
+from detector.results.thinning import thinned
+from wayside.manifests import to_yaml
+from wayside.times import format_time
+
+MOST = 200_000
+"""About so many points of series are in a page."""
+_WIDEST = 1500
+"""So many parts of the time are told apart at most: more pixels than a plot has."""
+_WAY = 600
+"""So many places of a client are on the map at most."""
+_VALUES = 2000
+"""Of so many episodes of a page the values are listed; the others have their times."""
+_DEEDS = 2000
+"""So many rows of what actions would have done are listed at most; the number of all is given."""
+
+
+def write_report(path: Path, result: Result) -> None:
+    """Write the page."""
+    path.write_text(page(data_of(result)), encoding="utf-8")
+
+
+def page(data: Mapping[str, Any]) -> str:
+    """The page around the data; the same data gives the same bytes."""
+    own = resources.files("detector.results") / "page"
+    scripts = resources.files("bokeh") / "server" / "static" / "js"
+    packed = gzip.compress(json.dumps(data, separators=(",", ":"), allow_nan=False).encode(), 9, mtime=0)
+    parts = {
+        "title": escape(f"Replay of {data['recording']}"),
+        "style": (own / "report.css").read_text("utf-8"),
+        "body": (own / "report.html").read_text("utf-8"),
+        "data": base64.b64encode(packed).decode(),
+        "bokeh": "\n".join((scripts / name).read_text("utf-8") for name in ("bokeh.min.js", "bokeh-api.min.js")),
+        "script": (own / "report.js").read_text("utf-8"),
+    }
+    return _PAGE.format(**parts)
+
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline'; \
+style-src 'unsafe-inline'; img-src data: blob:; font-src data:">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+{body}
+<script type="text/plain" id="data">{data}</script>
+<script>{bokeh}</script>
+<script>{script}</script>
+</body>
+</html>
+"""
+
+
+def data_of(result: Result) -> dict[str, Any]:
+    """All that the page shows."""
+    trace = result.trace
+    episodes = result.episodes
+    table = _Table(result)
+    by_subject: dict[tuple[str, str], list[Episode]] = {}
+    told = {episode.episode for episode in episodes[:_VALUES]}
+    for episode in episodes:
+        by_subject.setdefault((episode.rule, episode.subject), []).append(episode)
+    subjects = [
+        _subject(result, each, by_subject.get((each.rule, each.subject), ()), table, told) for each in trace.subjects
+    ]
+    deeds = deeds_of(result)
+    return {
+        "recording": Path(result.recording).name,
+        "begin": format_time(trace.begin),
+        "beginNs": str(trace.begin),
+        "length": (trace.end - trace.begin) / 1e9,
+        "unit": table.unit,
+        "samples": result.samples,
+        "rules": [_rule(result, name, episodes) for name in sorted(result.rules)],
+        "subjects": subjects,
+        "series": table.entries,
+        "ways": _ways(result, table),
+        "geographic": trace.geographic,
+        "polygons": [
+            {"rule": each.rule, "name": each.name, "corners": each.corners}
+            for each in polygons_of(result.rules.values())
+            if each.geographic == trace.geographic
+        ],
+        "deeds": [
+            [each.rule, each.action, each.subject, each.what, each.about, table.seconds(each.begin),
+             None if each.end is None else table.seconds(each.end)]
+            for each in deeds[:_DEEDS]
+        ],
+        "deedCount": len(deeds),
+        "demands": _demands(deeds, table),
+        "streams": [
+            {
+                "stream": each.stream, "key": each.key, "encoding": each.encoding, "samples": each.samples,
+                "keys": each.keys, "rate": each.rate, "gap": each.gap, "gapKey": each.gap_key,
+                "gapAt": None if each.gap_time is None else table.seconds(each.gap_time),
+                "unreadable": each.unreadable, "lastUnreadable": each.last_unreadable, "unnamed": each.unnamed,
+            }
+            for each in result.streams
+        ],
+        "notes": [*result.notes],
+    }  # fmt: skip
+
+
+class _Table:
+    """The series of a page: equal ones are in it once."""
+
+    def __init__(self, result: Result) -> None:
+        trace = result.trace
+        self._begin, self._end = trace.begin, trace.end
+        self.entries: list[dict[str, Any]] = []
+        self._places: dict[bytes, int] = {}
+        lengths: dict[bytes, int] = {}
+        exact: dict[bytes, list[Integers]] = {}
+        for subject in trace.subjects:
+            changes = subject.changes
+            for series in _series_of(result, subject).values():
+                digest = _digest(series)
+                lengths[digest] = len(series.times)
+                exact.setdefault(digest, []).append(changes)
+        self._exact = {digest: np.unique(np.concatenate(times)) for digest, times in exact.items()}
+        """By series, the times at which a condition of any of its rules changes."""
+        self._buckets = _buckets([*lengths.values()])
+        named = [series.times for each in trace.subjects for series in each.signals.values()]
+        steps = [steps.times for each in trace.subjects for steps in each.conditions.values()]
+        self.unit = _unit([*named, *steps, *_event_times(result)], trace.begin)
+
+    def add(self, series: Series) -> int:
+        """The place of a series."""
+        digest = _digest(series)
+        place = self._places.get(digest)
+        if place is None:
+            place = self._places[digest] = len(self.entries)
+            short = thinned(series, self._begin, self._end, self._buckets, self._exact[digest])
+            used = [*short.texts] if short.kind is Kind.TEXT else None
+            values = [None if value != value else value for value in short.values.tolist()]  # noqa: PLR0124
+            if short.kind is not Kind.NUMBER:
+                values = [None if value is None else int(value) for value in values]
+            entry: dict[str, Any] = {"kind": short.kind.value, "t": self.times(short.times), "v": values}
+            self.entries.append({**entry, "texts": used} if used is not None else entry)
+        return place
+
+    def times(self, times: Integers) -> list[int]:
+        """Differences in units; the first is to the beginning."""
+        differences = np.diff(times, prepend=self._begin) // self.unit
+        found: list[int] = differences.tolist()
+        return found
+
+    def seconds(self, time: int) -> float:
+        """Since the beginning."""
+        return (time - self._begin) / 1e9
+
+
+def _digest(series: Series) -> bytes:
+    return hashlib.blake2b(series.times.tobytes() + series.values.tobytes(), digest_size=16).digest()
+
+
+def _buckets(lengths: Sequence[int]) -> int:
+    """Into how many parts the time is cut, so that all series together have about MOST points."""
+    low, high = 20, _WIDEST
+    while low < high:
+        middle = (low + high + 1) // 2
+        if sum(min(length, 2 * middle) for length in lengths) <= MOST:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+def _unit(times: Iterable[Integers], begin: int) -> int:
+    """The greatest unit, in nanoseconds, of which all times are whole multiples after the beginning."""
+    found = 0
+    for each in times:
+        if len(each):
+            found = math.gcd(found, int(np.gcd.reduce(each - begin)))
+    return found or 1
+
+
+def _event_times(result: Result) -> list[Integers]:
+    return [np.array([event.start_time, event.onset_time], np.int64) for event in result.events]
+
+
+def _subject(
+    result: Result, subject: SubjectTrace, episodes: Sequence[Episode], table: _Table, told: Set[str]
+) -> dict[str, Any]:
+    terms = result.terms.get((subject.rule, subject.subject))
+    return {
+        "rule": subject.rule,
+        "subject": subject.subject,
+        "clients": subject.clients,
+        "episodes": [
+            {
+                "id": each.episode,
+                "start": table.seconds(each.start_time),
+                "onset": table.seconds(each.onset_time),
+                "end": None if each.end_time is None else table.seconds(each.end_time),
+                "reason": each.reason,
+                "values": _values(each) if each.episode in told else {},
+            }
+            for each in episodes
+        ],
+        "signals": {name: table.add(series) for name, series in _series_of(result, subject).items()},
+        "conditions": {
+            field: {
+                "t": table.times(steps.times),
+                "c": steps.codes.tolist(),
+                "why": {str(at): why for at, why in steps.reasons.items()},
+            }
+            for field, steps in subject.conditions.items()
+        },
+        "thresholds": [list(each) for each in terms.thresholds] if terms is not None else [],
+        "unknown": any((steps.codes == UNKNOWN).any() for steps in subject.conditions.values()),
+    }
+
+
+def _values(episode: Episode) -> dict[str, Any]:
+    """Those that the page lists."""
+    shown = (".start", ".max")
+    return {name: value for name, value in episode.values.items() if value is not None and name.endswith(shown)}
+
+
+def _series_of(result: Result, subject: SubjectTrace) -> dict[str, Series]:
+    """What a condition compares first, then the other signals."""
+    terms = result.terms.get((subject.rule, subject.subject))
+    return {**(terms.computed if terms is not None else {}), **subject.signals}
+
+
+def _rule(result: Result, name: str, episodes: Sequence[Episode]) -> dict[str, Any]:
+    document, rule = result.documents.get(name), result.rules[name]
+    own = [each for each in episodes if each.rule == name]
+    evaluations, unknowns, errors = result.counts.get(name, (0, 0, 0))
+    text = f"when: {rule.when.source}\n"
+    if document is not None:
+        text = to_yaml([document.model_dump(mode="json", by_alias=True, exclude_unset=True)])
+    return {
+        "name": name,
+        "description": "" if document is None else document.spec.description,
+        "text": text,
+        "when": rule.when.source,
+        "until": None if rule.until is None else rule.until.source,
+        "for": rule.for_ns / 1e9,
+        "episodes": len(own),
+        "subjects": len({each.subject for each in own}),
+        "evaluations": evaluations,
+        "unknowns": unknowns,
+        "errors": errors,
+    }
+
+
+def _ways(result: Result, table: _Table) -> list[dict[str, Any]]:
+    found = []
+    for client, way in sorted(result.trace.ways.items()):
+        stride = max(1, -(-len(way.times) // _WAY))
+        axes = way.axes[:, ::stride]
+        x, y = (axes[1], axes[0]) if result.trace.geographic else (axes[0], axes[1])
+        found.append(
+            {
+                "client": client,
+                "t": [table.seconds(time) for time in way.times[::stride].tolist()],
+                "x": np.round(x, 7 if result.trace.geographic else 2).tolist(),
+                "y": np.round(y, 7 if result.trace.geographic else 2).tolist(),
+            }
+        )
+    return found
+
+
+def _demands(deeds: Sequence[Deed], table: _Table) -> list[dict[str, Any]]:
+    """By template, how many tasks demand it over time."""
+    edges: dict[str, list[tuple[float, int]]] = {}
+    for deed in deeds:
+        if deed.what != "deploy":
+            continue
+        own = edges.setdefault(deed.about.partition(":")[0], [])
+        own.append((table.seconds(deed.begin), 1))
+        if deed.end is not None:
+            own.append((table.seconds(deed.end), -1))
+    found = []
+    for template, changes in sorted(edges.items()):
+        times, counts, count = [0.0], [0], 0
+        for time, change in sorted(changes):
+            count += change
+            if times[-1] == time:
+                counts[-1] = count
+            else:
+                times.append(time)
+                counts.append(count)
+        found.append({"template": template, "t": times, "n": counts})
+    return found

@@ -1,0 +1,77 @@
+"""What one recording came to, for all results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from detector.engine.episodes.events import Event
+from detector.replay.replaying import Outcome
+from detector.results.episodes import Episode, episodes_of
+from detector.results.quality import Arrivals, StreamQuality
+from detector.results.series import Trace
+from detector.results.thresholds import Terms, terms_of
+from detector.results.tracing import Tracer
+from wayside.api import ApplicationTask, EventRule
+from wayside.rules import CompiledRule
+
+
+@dataclass(frozen=True)
+class Result:
+    """One recording."""
+
+    recording: str
+    """Its name."""
+    trace: Trace
+    events: Sequence[Event]
+    tasks: Sequence[ApplicationTask]
+    rules: Mapping[str, CompiledRule]
+    """Those that were evaluated at the end, by name."""
+    documents: Mapping[str, EventRule]
+    """The rules as written, where they are at hand."""
+    terms: Mapping[tuple[str, str], Terms]
+    """By rule and subject, what its conditions compare."""
+    streams: Sequence[StreamQuality]
+    counts: Mapping[str, tuple[int, int, int]]
+    """By rule: evaluations, unknown values, errors."""
+    notes: Sequence[str]
+    """What a person should know of the recording."""
+    samples: int
+
+    @cached_property
+    def episodes(self) -> list[Episode]:
+        """The episodes, in order of their starts."""
+        return episodes_of(self.recording, self.events, self.trace)
+
+
+def result_of(
+    name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals, documents: Mapping[str, EventRule]
+) -> Result:
+    """What a replay came to; `tracer` and `arrivals` looked on at it.
+
+    Raises:
+        ValueError: the tracer saw no engine.
+    """
+    engine = tracer.engine
+    if engine is None:
+        raise ValueError(f"{name} was not looked at")
+    trace = tracer.trace()
+    rules = {rule: run.rule for rule, run in engine.rules.items()}
+    terms = {
+        (each.rule, each.subject): terms_of(rules[each.rule], each) for each in trace.subjects if each.rule in rules
+    }
+    counted = engine.counters.rules
+    return Result(
+        recording=name,
+        trace=trace,
+        events=outcome.events,
+        tasks=[*outcome.tasks.values()],
+        rules=rules,
+        documents=documents,
+        terms=terms,
+        streams=arrivals.by_stream(engine),
+        counts={rule: (each.evaluations, each.unknowns, each.errors) for rule, each in counted.items()},
+        notes=[*map(str, outcome.cuts), *outcome.doubts, *outcome.notes],
+        samples=outcome.samples,
+    )

@@ -1,0 +1,176 @@
+"""The clients, the pairs and the places of a recording in Foxglove's 3D panel."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from foxglove.messages import (
+    Color,
+    Duration,
+    LinePrimitive,
+    LinePrimitiveLineType,
+    Point3,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SceneUpdate,
+    SpherePrimitive,
+    TextPrimitive,
+    Timestamp,
+    Vector3,
+)
+
+from detector.results.places import polygons_of
+from detector.results.result import Result
+from detector.results.series import Doubles
+
+FRAME = "map"
+"""The frame of all positions: that in which the rule's position is."""
+
+_STEP = 200_000_000
+"""Nanoseconds: the scene is written no more often, but at each start and end of an episode."""
+_MOST = 2000
+"""So many updates at most, besides."""
+_KEPT = 1_000_000_000
+"""Nanoseconds: a client is shown for so long after its last place."""
+_EARTH = 6_371_000.0
+_CLIENT, _OPEN, _PLACE = (0.15, 0.45, 0.8, 1.0), (0.85, 0.25, 0.2, 1.0), (0.4, 0.6, 0.3, 0.9)
+
+
+class _Edge(NamedTuple):
+    """An episode starts or ends."""
+
+    time: int
+    starts: bool
+    episode: str
+    rule: str
+    clients: tuple[str, ...]
+
+
+def updates(result: Result) -> Iterator[tuple[int, SceneUpdate]]:
+    """The scene over time; nothing where no position is known. Degrees become metres from the first place."""
+    trace = result.trace
+    if not trace.ways:
+        return
+    origin = next(iter(trace.ways.values())).axes[:, 0]
+    edges = _edges(result)
+    step = max(_STEP, (trace.end - trace.begin) // _MOST)
+    at_edges = np.array([edge.time for edge in edges], np.int64)
+    times = np.unique(np.concatenate((np.arange(trace.begin, trace.end + 1, step), at_edges)))
+    flat = {name: _metres(way.axes, origin, geographic=trace.geographic) for name, way in trace.ways.items()}
+    rows = {name: np.searchsorted(way.times, times, "right") - 1 for name, way in trace.ways.items()}
+    last = {name: int(way.times[-1]) for name, way in trace.ways.items()}
+    yield int(times[0]), SceneUpdate(entities=[*_polygons(result, int(times[0]), origin)])
+    busy: dict[str, _Edge] = {}
+    for at, time in enumerate(times.tolist()):
+        while edges and edges[0].time <= time:
+            edge = edges.popleft()
+            if edge.starts:
+                busy[edge.episode] = edge
+            else:
+                busy.pop(edge.episode, None)
+        there: dict[str, tuple[float, float]] = {}
+        for name, axes in flat.items():
+            row = int(rows[name][at])
+            if row >= 0 and time <= last[name] + _KEPT:
+                there[name] = float(axes[0, row]), float(axes[1, row])
+        named: dict[str, list[str]] = {}
+        pairs = []
+        for each in busy.values():
+            if len(each.clients) == 1:
+                named.setdefault(each.clients[0], []).append(each.rule)
+            elif len(each.clients) == 2 and there.keys() >= {*each.clients}:
+                pairs.append(_pair(each.rule, each.clients, there, time))
+        entities = [_client(name, place, named.get(name, ()), time) for name, place in there.items()] + pairs
+        yield time, SceneUpdate(entities=entities)
+
+
+def _edges(result: Result) -> deque[_Edge]:
+    """Starts and ends of episodes, in order of time."""
+    return deque(
+        _Edge(
+            event.start_time if event.end_time is None else event.end_time,
+            event.started,
+            event.episode,
+            event.rule,
+            event.subjects,
+        )
+        for event in result.events
+    )
+
+
+def _metres(axes: Doubles, origin: Doubles, *, geographic: bool) -> Doubles:
+    if not geographic:
+        return axes
+    north = np.radians(axes[0] - origin[0]) * _EARTH
+    east = np.radians(axes[1] - origin[1]) * _EARTH * math.cos(math.radians(origin[0]))
+    return np.stack((east, north))
+
+
+def _entity(name: str, time: int, **primitives: Any) -> SceneEntity:
+    """It stays until it is written again, at most for two seconds."""
+    return SceneEntity(timestamp=_stamp(time), frame_id=FRAME, id=name, lifetime=Duration(sec=2), **primitives)
+
+
+def _client(name: str, place: tuple[float, float], rules: Sequence[str], time: int) -> SceneEntity:
+    """A client; in an episode it has another colour, and its label names the rules."""
+    color = _OPEN if rules else _CLIENT
+    sphere = SpherePrimitive(pose=_pose(*place), size=Vector3(x=3.0, y=3.0, z=3.0), color=_color(color))
+    text = f"{name}: {', '.join(rules)}" if rules else name
+    return _entity(f"client {name}", time, spheres=[sphere], texts=[_label(text, place, 3.0, color)])
+
+
+def _pair(rule: str, pair: tuple[str, ...], there: Mapping[str, tuple[float, float]], time: int) -> SceneEntity:
+    (x, y), (u, v) = (there[name] for name in pair)
+    line = LinePrimitive(
+        type=LinePrimitiveLineType.LineStrip,
+        pose=_pose(0.0, 0.0),
+        thickness=3.0,
+        scale_invariant=True,
+        points=[Point3(x=x, y=y, z=1.0), Point3(x=u, y=v, z=1.0)],
+        color=_color(_OPEN),
+    )
+    text = _label(f"{rule}: {math.hypot(x - u, y - v):.0f} m", ((x + u) / 2, (y + v) / 2), 4.0, _OPEN)
+    return _entity(f"{rule} {'+'.join(pair)}", time, lines=[line], texts=[text])
+
+
+def _polygons(result: Result, time: int, origin: Doubles) -> Iterator[SceneEntity]:
+    for polygon in polygons_of(result.rules.values()):
+        corners = np.array(polygon.corners, float).T
+        if polygon.geographic != result.trace.geographic:
+            continue
+        flat = _metres(corners, origin, geographic=polygon.geographic)
+        line = LinePrimitive(
+            type=LinePrimitiveLineType.LineLoop,
+            pose=_pose(0.0, 0.0),
+            thickness=2.0,
+            scale_invariant=True,
+            points=[Point3(x=float(x), y=float(y), z=0.0) for x, y in flat.T],
+            color=_color(_PLACE),
+        )
+        text = _label(polygon.name, (float(flat[0].mean()), float(flat[1].mean())), 0.5, _PLACE)
+        yield SceneEntity(
+            timestamp=_stamp(time), frame_id=FRAME, id=f"{polygon.rule} {polygon.name}", lines=[line], texts=[text]
+        )
+
+
+def _label(text: str, place: tuple[float, float], above: float, color: tuple[float, ...]) -> TextPrimitive:
+    return TextPrimitive(
+        pose=_pose(*place, above), billboard=True, font_size=12.0, scale_invariant=True, color=_color(color), text=text
+    )
+
+
+def _pose(x: float, y: float, z: float = 0.0) -> Pose:
+    return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+
+
+def _color(color: tuple[float, ...]) -> Color:
+    return Color(r=color[0], g=color[1], b=color[2], a=color[3])
+
+
+def _stamp(time: int) -> Timestamp:
+    return Timestamp(sec=time // 1_000_000_000, nsec=time % 1_000_000_000)

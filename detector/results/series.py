@@ -1,0 +1,121 @@
+"""What values and conditions were over time. Each holds from its time until the next, as the engine saw it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Integers = NDArray[np.int64]
+Doubles = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+FALSE, TRUE, UNKNOWN, AWAY = 0, 1, 2, 3
+"""What a condition says; AWAY: the rule does not look at the subject, which is out of its scope or reach."""
+
+WORDS = ("false", "true", "unknown", "away")
+
+
+class Kind(StrEnum):
+    """What a series holds."""
+
+    NUMBER = "number"
+    BOOLEAN = "boolean"
+    TEXT = "text"
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One value of a subject."""
+
+    times: Integers
+    """int64[n], nanoseconds since the epoch, rising: where the value changes."""
+    values: Doubles
+    """float64[n]: the number, 1.0 or 0.0 of a boolean, an index into `texts`; NaN: unknown."""
+    kind: Kind = Kind.NUMBER
+    texts: Sequence[str] = ()
+
+    def at(self, times: Integers) -> Doubles:
+        """The values that hold at these times; NaN before the first."""
+        where = np.searchsorted(self.times, times, "right") - 1
+        if not len(self.times):
+            return np.full(len(times), np.nan)
+        found: Doubles = np.where(where < 0, np.nan, self.values[np.maximum(where, 0)])
+        return found
+
+    def plain(self, value: float) -> float | bool | str | None:
+        """A value of the series as JSON has it; None: unknown."""
+        if value != value:  # noqa: PLR0124  NaN alone differs
+            return None
+        match self.kind:
+            case Kind.BOOLEAN:
+                return value != 0
+            case Kind.TEXT:
+                return self.texts[int(value)]
+        return value
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """What one condition said of a subject."""
+
+    times: Integers
+    """int64[n], nanoseconds since the epoch, rising: where it changes."""
+    codes: Bytes
+    """uint8[n]: FALSE, TRUE, UNKNOWN or AWAY."""
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    """By place, why it is unknown from there on."""
+
+    def at(self, times: Integers) -> Bytes:
+        """What it says at these times; AWAY before the first."""
+        where = np.searchsorted(self.times, times, "right") - 1
+        if not len(self.times):
+            return np.full(len(times), AWAY, np.uint8)
+        found: Bytes = np.where(where < 0, np.uint8(AWAY), self.codes[np.maximum(where, 0)])
+        return found
+
+
+@dataclass(slots=True)
+class SubjectTrace:
+    """What a rule saw of one subject."""
+
+    rule: str
+    subject: str
+    clients: tuple[str, ...]
+    signals: dict[str, Series] = field(default_factory=dict)
+    """By the name that expressions use: `speed`, of a pair `distance` and `a.speed`."""
+    conditions: dict[str, Steps] = field(default_factory=dict)
+    """`when`, and `until` where the rule has one."""
+
+    @property
+    def changes(self) -> Integers:
+        """The times at which a condition changes, sorted."""
+        times = [steps.times for steps in self.conditions.values()]
+        return np.unique(np.concatenate(times)) if times else np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Where a client was."""
+
+    times: Integers
+    axes: Doubles
+    """Shape (2, n): x and y in metres, or latitude and longitude in degrees."""
+
+
+@dataclass(slots=True)
+class Trace:
+    """All that a replay of one recording saw."""
+
+    subjects: list[SubjectTrace] = field(default_factory=list)
+    """In order of the rules' names, then of the subjects."""
+    ways: dict[str, Way] = field(default_factory=dict)
+    """By client, where they are known."""
+    geographic: bool = False
+    """Whether ways are in degrees."""
+    begin: int = 0
+    end: int = 0
+    """The first and the last tick, nanoseconds since the epoch."""

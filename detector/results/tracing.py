@@ -1,0 +1,316 @@
+"""Takes the trace of a replay: looks on at the engine's columns, and at the rules that are not in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.engine.columns.block import Block, Track
+from detector.engine.columns.pairs import Sight
+from detector.engine.columns.table import Truths
+from detector.engine.columns.verdicts import Codes
+from detector.engine.engine import Engine
+from detector.engine.episodes.episodes import OUTSIDE
+from detector.results.changes import Changes
+from detector.results.joining import Seen, Waiting, joined_blocks
+from detector.results.pairing import PairLog, WayLog
+from detector.results.reasons import why_unknown
+from detector.results.series import (
+    AWAY,
+    FALSE,
+    TRUE,
+    UNKNOWN,
+    Bytes,
+    Doubles,
+    Integers,
+    Kind,
+    Series,
+    Steps,
+    SubjectTrace,
+    Trace,
+)
+from detector.results.witnessing import Witnessed
+from wayside.expressions.columns.values import Tag
+from wayside.rules import PairSubject
+
+_POINTS = 20_000
+"""So many points, clients and ticks, are noted together."""
+
+
+class _Plan(NamedTuple):
+    """What is noted of the blocks of one group."""
+
+    tracks: Sequence[Track]
+    signals: Sequence[tuple[int, Track, str, Changes]]
+    """The place of each signal in the block, one that has it under a name, and its changes."""
+    conditions: Sequence[tuple[int, Track, str, Changes]]
+    """The row of a track, it, the field and its changes."""
+    seen: set[int]
+    """The clients of the block before."""
+    waiting: list[Waiting]
+    """Small blocks, which are noted together: live and beside rules about pairs, blocks are of few ticks."""
+
+
+class Tracer:
+    """Looks on at a replay. The engine's observer; ask it for the trace at the end."""
+
+    def __init__(self) -> None:
+        self.engine: Engine | None = None
+        """That of the replay, for what it counts."""
+        self._plans: dict[int, _Plan] = {}
+        self._signals: dict[str, Changes] = {}
+        self._aliases: dict[tuple[str, str | None, str], dict[str, Changes]] = {}
+        """By rule, element and signal: where its values are; equal signals of several rules are kept once."""
+        self._conditions: dict[tuple[str, str | None, str], Changes] = {}
+        self._reasons: dict[tuple[str, str | None, str], dict[tuple[int, int], str]] = {}
+        """Of conditions, by client and time, why they are unknown."""
+        self._names: list[str] = []
+        self._numbers: dict[str, int] = {}
+        self._texts: dict[str, int] = {}
+        self._odd: set[tuple[str, str | None, str]] = set()
+        """Signals that have lists or maps: these stand in events only."""
+        self._clients: tuple[Sequence[str], Integers] = ((), np.zeros(0, np.int64))
+        self._pairs: dict[tuple[str, str], PairLog] = {}
+        """By rule and its digest."""
+        self._ways = WayLog()
+        self._witnessed: dict[str, Witnessed] = {}
+        self._begin: int | None = None
+        self._end = 0
+
+    # What happens
+
+    def attend(self, engine: Engine) -> None:
+        """Rules were set: those that are not in columns are looked at by themselves."""
+        self.engine = engine
+        for name, run in engine.rules.items():
+            if name not in engine.in_columns:
+                run.witness = self._witnessed.setdefault(name, Witnessed(run.rule)).saw
+
+    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
+        """Note what changes in a block of rules about clients."""
+        numbers = self._numbers_of(block.clients)
+        self._time(block.ticks[0], block.ticks[-1])
+        plan = self._plans.get(id(tracks))
+        if plan is None:
+            plan = self._plans[id(tracks)] = self._plan(tracks)
+        if looked is None and not _has_texts(block):  # codes of texts may not last
+            plan.waiting.append(Waiting(block, codes, numbers))
+            if sum(len(each.block.ticks) for each in plan.waiting) * len(numbers) >= _POINTS:
+                self._flush(plan)
+            return
+        self._flush(plan)
+        self._note(plan, Seen([block]), codes, numbers, looked)
+
+    def _flush(self, plan: _Plan) -> None:
+        """Note the blocks that wait."""
+        for joined in joined_blocks(plan.waiting):
+            self._note(plan, joined.block, joined.codes, joined.numbers, None)
+        plan.waiting.clear()
+
+    def _note(self, plan: _Plan, block: Seen, codes: Codes, numbers: Integers, looked: Truths | None) -> None:
+        everybody = looked is None
+        at_all: slice | NDArray[np.bool_] = slice(None) if looked is None else np.asarray(looked.any(axis=0))
+        for at, track, name, changes in plan.signals:
+            self._signal(block, track, name, numbers, changes, at, at_all)
+        for row, track, field, changes in plan.conditions:
+            chosen = slice(None) if looked is None else looked[row]
+            self._condition(block, codes, row, track, field, numbers, changes, chosen)
+        if everybody:
+            gone = plan.seen.difference(numbers.tolist())
+            if gone:
+                self._lost(plan, np.array(sorted(gone), np.int64), block.times[:1])
+            plan.seen.clear()
+            plan.seen.update(numbers.tolist())
+
+    def pairs(self, track: Track, sight: Sight) -> None:
+        """Note what a rule about pairs sees at a tick."""
+        time = sight.block.ticks[0]
+        self._time(time, time)
+        numbers = self._numbers_of(sight.block.clients)
+        log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
+        log.add(time, sight, numbers)
+        assert isinstance(track.rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
+        self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, sight, numbers)
+
+    # What came of it
+
+    def trace(self) -> Trace:
+        """All that was seen."""
+        for plan in self._plans.values():
+            self._flush(plan)
+        found: dict[tuple[str, str], SubjectTrace] = {}
+        self._of_clients(found)
+        for (name, _), log in self._pairs.items():
+            for pair in log.subjects(name, self._names):
+                found[name, pair.subject] = pair
+        for name, witnessed in self._witnessed.items():
+            for each in witnessed.subjects():
+                found.setdefault((name, each.subject), each)
+                self._time(*witnessed.span)
+        subjects = [found[key] for key in sorted(found)]
+        ways = self._ways.ways(self._names)
+        return Trace(subjects, ways, self._ways.geographic, self._begin or 0, self._end)
+
+    def _of_clients(self, found: dict[tuple[str, str], SubjectTrace]) -> None:
+        subjects: dict[tuple[str, str | None, int], SubjectTrace] = {}
+        for (rule, element, field), changes in self._conditions.items():
+            reasons = self._reasons[rule, element, field]
+            for client, times, values, _ in changes.by_client():
+                name = self._names[client]
+                text = name if element is None else f"{name}~{element}"
+                subject = found.setdefault((rule, text), SubjectTrace(rule, text, (name,)))
+                subjects[rule, element, client] = subject
+                subject.conditions[field] = _steps(times, values.astype(np.uint8), reasons, client)
+        texts = tuple(self._texts)
+        for (rule, element, signal), parts in self._aliases.items():
+            if (rule, element, signal) in self._odd:
+                continue
+            by_client: dict[int, list[Series]] = {}
+            for changes in parts.values():
+                for client, times, values, tags in changes.by_client():
+                    by_client.setdefault(client, []).append(_series(times, values, tags, texts))
+            for client, series in by_client.items():
+                if (rule, element, client) in subjects:
+                    subjects[rule, element, client].signals[signal] = _joined(series)
+
+    # Blocks
+
+    def _plan(self, tracks: Sequence[Track]) -> _Plan:
+        owners: dict[int, tuple[Track, str]] = {}
+        for track in tracks:
+            for name, at in track.signals.items():
+                if at not in owners or _key(track, name) < _key(*owners[at]):
+                    owners[at] = track, name
+        signals = []
+        for at, (track, name) in owners.items():
+            changes = self._signals.setdefault("/".join(_key(track, name)), Changes())
+            signals.append((at, track, name, changes))
+            for other in tracks:
+                for alias, place in other.signals.items():
+                    if place == at:
+                        parts = self._aliases.setdefault((other.rule.name, other.element.name, alias), {})
+                        parts["/".join(_key(track, name))] = changes
+        conditions = []
+        for row, track in enumerate(tracks):
+            for field, expression in (("when", track.rule.when), ("until", track.rule.until)):
+                if expression is not None:
+                    key = (track.rule.name, track.element.name, field)
+                    self._reasons.setdefault(key, {})
+                    conditions.append((row, track, field, self._conditions.setdefault(key, Changes())))
+        return _Plan(tracks, signals, conditions, set(), [])
+
+    def _signal(
+        self,
+        block: Seen,
+        track: Track,
+        name: str,
+        numbers: Integers,
+        changes: Changes,
+        at: int,
+        chosen: slice | NDArray[np.bool_],
+    ) -> None:
+        column, shape = block.signals[at], block.shape
+        values = column.values.reshape(shape)[chosen]
+        tags = np.full(shape, Tag.NUMBER, np.uint8) if column.tags is None else column.tags.reshape(shape)
+        tags = tags[chosen]
+        present = None if block.present is None else block.present[chosen]
+        if not len(values):
+            return
+        if (tags == Tag.OTHER).any():
+            self._odd.update(key for key, parts in self._aliases.items() if changes in parts.values())
+        found = changes.add(numbers[chosen], block.times, values, tags, present)
+        texts = tags[found.rows, found.ticks] == Tag.TEXT
+        if texts.any():
+            places = np.arange(shape[0])[chosen]
+            for place in np.flatnonzero(texts).tolist():
+                point = int(places[found.rows[place]]) * shape[1] + int(found.ticks[place])
+                text = str(block.at(point)[0].values(track, block.at(point)[1])[name])
+                found.values[place] = self._texts.setdefault(text, len(self._texts))
+
+    def _condition(
+        self,
+        block: Seen,
+        codes: Codes,
+        row: int,
+        track: Track,
+        field: str,
+        numbers: Integers,
+        changes: Changes,
+        chosen: slice | NDArray[np.bool_],
+    ) -> None:
+        shape = block.shape
+        true, false = (each[row].reshape(shape)[chosen] for each in block.verdicts[field])
+        said = np.where(true, float(TRUE), np.where(false, float(FALSE), float(UNKNOWN)))
+        said[codes[row][chosen] & OUTSIDE == OUTSIDE] = AWAY
+        if not len(said):
+            return
+        present = None if block.present is None else block.present[chosen]
+        tags = np.zeros(said.shape, np.uint8)
+        found = changes.add(numbers[chosen], block.times, said, tags, present)
+        expression = track.rule.when if field == "when" else track.rule.until
+        reasons = self._reasons[track.rule.name, track.element.name, field]
+        places = np.arange(shape[0])[chosen]
+        for place in np.flatnonzero(found.values == UNKNOWN).tolist():
+            at, tick = int(places[found.rows[place]]), int(found.ticks[place])
+            why = why_unknown(*block.at(at * shape[1] + tick), track, expression)
+            reasons[int(numbers[at]), block.ticks[tick]] = why
+
+    def _lost(self, plan: _Plan, gone: Integers, times: Integers) -> None:
+        """Clients that were lost: there is nothing to see of them."""
+        shape = (len(gone), 1)
+        for _, _, _, changes in plan.signals:
+            changes.add(gone, times, np.zeros(shape), np.full(shape, Tag.ABSENT, np.uint8), None)
+        for _, _, _, changes in plan.conditions:
+            changes.add(gone, times, np.full(shape, float(AWAY)), np.zeros(shape, np.uint8), None)
+
+    def _numbers_of(self, clients: Sequence[str]) -> Integers:
+        known, numbers = self._clients
+        if known is not clients and known != clients:
+            for client in clients:
+                if client not in self._numbers:
+                    self._numbers[client] = len(self._names)
+                    self._names.append(client)
+            numbers = np.array([self._numbers[client] for client in clients], np.int64)
+            self._clients = clients, numbers
+        return numbers
+
+    def _time(self, first: int, last: int) -> None:
+        self._begin = first if self._begin is None else min(self._begin, first)
+        self._end = max(self._end, last)
+
+
+def _has_texts(block: Block) -> bool:
+    return any(column.tags is not None and bool((column.tags == Tag.TEXT).any()) for column in block.signals)
+
+
+def _key(track: Track, name: str) -> tuple[str, str, str]:
+    return track.rule.name, track.element.name or "", name
+
+
+def _steps(times: Integers, codes: Bytes, reasons: Mapping[tuple[int, int], str], client: int) -> Steps:
+    kept = np.ones(len(codes), bool)
+    kept[1:] = codes[1:] != codes[:-1]
+    times, codes = times[kept], codes[kept]
+    unknown = np.flatnonzero(codes == UNKNOWN).tolist()
+    found = {at: reasons.get((client, int(times[at]))) for at in unknown}
+    return Steps(times, codes, {at: why for at, why in found.items() if why is not None})
+
+
+def _series(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str]) -> Series:
+    known = (tags != Tag.ABSENT) & (tags != Tag.UNREACHABLE)
+    kinds = {Tag.BOOLEAN: Kind.BOOLEAN, Tag.TEXT: Kind.TEXT}
+    kind = next((kinds[tag] for tag in kinds if (tags == tag).any()), Kind.NUMBER)
+    return Series(times, np.where(known, values, np.nan), kind, texts if kind is Kind.TEXT else ())
+
+
+def _joined(parts: Sequence[Series]) -> Series:
+    """The same signal under several plans, which follow each other."""
+    if len(parts) == 1:
+        return parts[0]
+    times = np.concatenate([part.times for part in parts])
+    order = np.argsort(times, kind="stable")
+    values = np.concatenate([part.values for part in parts])
+    return Series(times[order], values[order], parts[0].kind, parts[0].texts)

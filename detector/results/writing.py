@@ -1,0 +1,119 @@
+"""Writes the results of a replay into its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from detector.engine.samples.sample import Arrival
+from detector.replay.replaying import Outcome
+from detector.results.episodes import Episode, write_csv, write_parquet
+from detector.results.kinds import Kind
+from detector.results.quality import Arrivals
+from detector.results.result import Result, result_of
+from detector.results.tracing import Tracer
+from wayside.api import EventRule
+from wayside.inputerror import InputError
+
+_NEEDED = {Kind.REPORT: "bokeh", Kind.MCAP: "foxglove", Kind.EPISODES: "pyarrow"}
+
+
+class MissingExtraError(InputError, RuntimeError):
+    """A result needs a package that is not installed."""
+
+
+def check_installed(kinds: Iterable[Kind]) -> None:
+    """Raises MissingExtraError where a package of the extra is missing: before hours of replay, not after them."""
+    for kind in sorted(kinds):
+        if find_spec(_NEEDED[kind]) is None:
+            raise MissingExtraError(f"--results {kind} needs {_NEEDED[kind]}: pip install 'wayside[results]'")
+
+
+class Look(NamedTuple):
+    """What looks on at the replay of one recording."""
+
+    tracer: Tracer
+    arrivals: Arrivals
+
+
+class Looking:
+    """Looks on at the replay of several recordings, one after another."""
+
+    def __init__(self) -> None:
+        self._looks: dict[str, Look] = {}
+
+    def watch(self, name: str) -> Look:
+        """What looks on at the recording of that name, which comes next."""
+        look = self._looks[name] = Look(Tracer(), Arrivals())
+        return look
+
+    def batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
+        """The batches of the recording that came last, as they are."""
+        return [*self._looks.values()][-1].arrivals.watch_batches(batches)
+
+    def results(self, outcomes: Mapping[str, Outcome], rules: Iterable[EventRule]) -> list[Result]:
+        """What each recording came to."""
+        documents = {rule.name: rule for rule in rules}
+        return [result_of(name, outcome, *self._looks[name], documents) for name, outcome in outcomes.items()]
+
+
+def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Kind]) -> list[Path]:
+    """Write them; returns the files. Each of several recordings has files of its own, but all are in one table."""
+    written: list[Path] = []
+
+    def path(name: str) -> Path:
+        written.append(folder / name)
+        return written[-1]
+
+    episodes = [episode for result in results for episode in result.episodes]
+    if Kind.EPISODES in kinds:
+        write_csv(path("episodes.csv"), episodes)
+        write_parquet(path("episodes.parquet"), episodes)
+    for number, result in enumerate(results, start=1):
+        suffix = f"-{number}" if len(results) > 1 else ""
+        if Kind.MCAP in kinds:
+            from detector.results.foxglove_file import write_mcap  # noqa: PLC0415  an extra
+            from detector.results.layout import layout_of  # noqa: PLC0415
+
+            write_mcap(path(f"results{suffix}.mcap"), result)
+            path(f"layout{suffix}.json").write_text(layout_of(result) + "\n", encoding="utf-8")
+        if Kind.REPORT in kinds:
+            from detector.results.report import write_report  # noqa: PLC0415
+
+            write_report(path(f"report{suffix}.html"), result)
+    return written
+
+
+def show_summary(console: Console, results: Sequence[Result]) -> None:
+    """Print a table of the rules over all recordings."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("rule", overflow="fold")
+    for name in ("episodes", "subjects", "open", "in all", "longest", "unknown", "errors"):
+        table.add_column(name, justify="right")
+    episodes = [episode for result in results for episode in result.episodes]
+    for rule in sorted({rule for result in results for rule in result.rules}):
+        own = [episode for episode in episodes if episode.rule == rule]
+        lasting = [episode.duration for episode in own if episode.duration is not None]
+        counts = [result.counts.get(rule, (0, 0, 0)) for result in results]
+        evaluations = sum(each[0] for each in counts)
+        unknown = sum(each[1] for each in counts)
+        table.add_row(
+            rule,
+            str(len(own)),
+            str(len({(episode.recording, episode.subject) for episode in own})),
+            str(sum(_is_open(episode) for episode in own)),
+            f"{sum(lasting):.1f} s",
+            f"{max(lasting, default=0):.1f} s",
+            f"{unknown} of {evaluations}" if unknown else "0",
+            str(sum(each[2] for each in counts)),
+        )
+    console.print(table)
+
+
+def _is_open(episode: Episode) -> bool:
+    return episode.end_time is None
