@@ -95,7 +95,8 @@ class InstanceWork:
             self.absent(name, decision)
             return
         if instance is not None and instance.metadata.deletion_timestamp is not None:
-            return  # it is waited for: its deletion brings us back
+            self.not_made(name, decision, f"instance {name[1]} is being removed, and is made again once it is gone")
+            return  # its deletion brings us back
         await self._make(name, decision, instance)
 
     async def _make(self, name: Name, decision: Decision, existing: ApplicationInstance | None) -> None:

@@ -95,7 +95,8 @@ def _was_served(task: ApplicationTask) -> bool:
     """Whether the task's status says that its instance ran, or gave way to another."""
     conditions = task.status.conditions if task.status else ()
     accepted = find(conditions, "Accepted")
-    return holds(conditions, "Applied") or (accepted is not None and accepted.reason == PREEMPTED)
+    applied = task.status is not None and task.status.applied_time is not None
+    return applied or holds(conditions, "Applied") or (accepted is not None and accepted.reason == PREEMPTED)
 
 
 def decide_for_all(
