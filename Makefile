@@ -64,6 +64,7 @@ process: $(BIN)/.installed-dev ## the tests with a detector's processes, Zenoh, 
 cluster: $(BIN)/.installed-dev ## the tests against a real control plane; builds it first where it is missing
 	@$(BIN)/python -m tests.cluster.binaries
 	@$(BIN)/python -m tests.helm
+	@$(BIN)/python -m tests.kstatus
 	@$(WAITING) tests/cluster
 
 e2e: $(BIN)/.installed-dev ## the tests on a real node with containers, as root; builds it first where it is missing

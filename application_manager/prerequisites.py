@@ -3,19 +3,53 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping
 from functools import partial
 
-from application_manager.cluster.client import Client, Resource
+from application_manager.cluster.client import ApiError, Client, Resource
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.entitlement import judge, lacking
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.cluster.starting import until_answered
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
 from application_manager.core.objects.rights import lease_rights, rights
-from application_manager.knowledge.world import OWN_KINDS, POD
+from application_manager.knowledge.world import OWN_KINDS, POD, TASK
 
 log = logging.getLogger(__name__)
+
+
+OLDEST = (1, 31)
+"""The oldest Kubernetes that works: 1.30 drops `selectableFields` of CRDs, by which an instance's tasks are listed."""
+
+
+async def recent_enough(client: Client) -> str:
+    """The API server's version. Raises ConfigurationError where it is older than `OLDEST`."""
+    version = await until_answered(client.server_version)
+    found = re.match(r"v?(\d+)\.(\d+)", version)
+    if found is not None and (int(found[1]), int(found[2])) < OLDEST:
+        raise ConfigurationError(
+            f"the API server is Kubernetes {version}, and {'.'.join(map(str, OLDEST))} is the oldest that works: older "
+            "ones drop selectableFields of custom resources, so no application would be released; upgrade the cluster"
+        )
+    return version
+
+
+async def selectable(client: Client, resources: Mapping[KindKey, Resource], namespaces: tuple[str, ...]) -> None:
+    """Look whether tasks can be listed by their template: CRDs of an older release, or a proxy, may not have it.
+
+    Raises ConfigurationError where not.
+    """
+    namespace = next(iter(sorted(namespaces)), None)
+    try:
+        await until_answered(partial(client.list, resources[TASK], namespace, fields="spec.template=none"))
+    except ApiError as error:
+        if error.code != 400:
+            raise
+        raise ConfigurationError(
+            f"ApplicationTasks cannot be selected by spec.template ({error.message}), so no application would ever be "
+            "released: run kubectl apply -f crds/ on Kubernetes 1.31 or newer"
+        ) from None
 
 
 async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:

@@ -30,7 +30,7 @@ from application_manager.knowledge.world import DETECTOR, OWN_KINDS, POD
 from application_manager.measures import Measures
 from application_manager.observability.pages import pages, stalled
 from application_manager.options import Options
-from application_manager.prerequisites import discovered, entitled
+from application_manager.prerequisites import discovered, entitled, recent_enough, selectable
 from application_manager.watchdog import SILENT, watchdog
 from application_manager.watching.detectorwatch import DetectorWatch
 from application_manager.watching.leasewatch import LeaseWatch
@@ -55,10 +55,12 @@ async def serve(options: Options) -> None:
     leadership = Leadership(renewals, options.lease, measures)
     client.may_act = leadership.remaining
     try:
+        version = await recent_enough(client)
         resources = await discovered(client, options.policy)
         runs = options.detectors is not None
         await entitled(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
-        helm = replace(options.helm, kube_version=await until_answered(client.server_version))
+        await selectable(client, resources, options.namespaces)
+        helm = replace(options.helm, kube_version=version)
         await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
     except ApiError as error:
         raise ConfigurationError(

@@ -27,13 +27,20 @@ class Aspect:
 
 
 def updated(
-    known: Iterable[Condition], aspects: Iterable[Aspect], generation: int, now: float
+    known: Iterable[Condition],
+    aspects: Iterable[Aspect],
+    generation: int,
+    now: float,
+    *,
+    only_while: Iterable[str] = (),
 ) -> tuple[Condition, ...]:
     """The conditions that say what the aspects say; one keeps its time of transition while its status stays.
 
-    Conditions of other types are kept. `now` is in seconds since 1970.
+    Conditions of other types are kept, but for those of the types `only_while`. `now` is in seconds since 1970.
     """
-    by_type = {each.type: each for each in known}
+    aspects = list(aspects)
+    gone = set(only_while) - {each.type for each in aspects}
+    by_type = {each.type: each for each in known if each.type not in gone}
     for aspect in aspects:
         old = by_type.get(aspect.type)
         kept = old is not None and old.status == aspect.status

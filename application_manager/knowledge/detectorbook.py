@@ -15,17 +15,20 @@ from application_manager.core.objects.sidecars import SIDECAR_LABEL
 
 @dataclass
 class DetectorBook:
-    """By the Detector's namespace and name.
+    """By the Detector's namespace and name, and its objects by the uid of the Detector that controls them.
+
+    Labels find what may be a Detector's; anybody can copy them. So an object counts by its controller, and a pod by the
+    ReplicaSet of the Deployment that does.
 
     Attributes:
         defaults: what holds for all pods; None: no detector is run.
-        objects: by kind.
+        objects: by the uid of their Detector, and by kind.
         said: the condition Running.
         asking: the pods that ask for it to be in them.
     """
 
     defaults: PodDefaults | None = None
-    objects: dict[Name, dict[str, Object]] = field(default_factory=dict)
+    objects: dict[str, dict[str, Object]] = field(default_factory=dict)
     said: dict[Name, Aspect] = field(default_factory=dict)
     asking: dict[Name, list[Object]] = field(default_factory=dict)
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
@@ -33,11 +36,16 @@ class DetectorBook:
     def take(self, objects: Iterable[Object], pods: Iterable[Object], asking: Iterable[Object] = ()) -> None:
         """Take all objects, their pods, and the pods that ask for detectors, as they were listed just now."""
         self.objects = {}
+        deployments: set[tuple[str, str]] = set()
         for raw in objects:
-            self.objects.setdefault(_detector_of(raw), {})[raw["kind"]] = raw
+            controller = _controller(raw)
+            if controller.get("kind") == "Detector":
+                self.objects.setdefault(str(controller["uid"]), {})[raw["kind"]] = raw
+                if raw["kind"] == "Deployment":
+                    deployments.add((raw["metadata"]["namespace"], raw["metadata"]["name"]))
         found: dict[Name, list[Trouble]] = {}
         for pod in pods:
-            if (each := trouble(pod)) is not None:
+            if _deployment_of(pod) in deployments and (each := trouble(pod)) is not None:
                 found.setdefault(_detector_of(pod), []).append(each)
         self.asking = {}
         for pod in asking:
@@ -45,9 +53,27 @@ class DetectorBook:
             self.asking.setdefault((metadata["namespace"], metadata["labels"][SIDECAR_LABEL]), []).append(pod)
         self._troubles = {name: summary(troubles) for name, troubles in found.items()}
 
+    def owned(self, uid: str) -> dict[str, Object]:
+        """The objects that the Detector of this uid controls, by kind; what is added stays until the next look."""
+        return self.objects.setdefault(uid, {})
+
     def troubles(self, name: Name) -> list[Trouble]:
         """The different troubles of the detector's pods, the most telling first."""
         return self._troubles.get(name, [])
+
+
+def _controller(raw: Object) -> Object:
+    owners: list[Object] = raw["metadata"].get("ownerReferences") or []
+    return next((each for each in owners if each.get("controller")), {})
+
+
+def _deployment_of(pod: Object) -> tuple[str, str] | None:
+    """The Deployment whose ReplicaSet controls the pod: that one's name is the Deployment's with the pod's hash."""
+    metadata, controller = pod["metadata"], _controller(pod)
+    ending = f"-{metadata['labels'].get('pod-template-hash', '')}"
+    if controller.get("kind") != "ReplicaSet" or not str(controller["name"]).endswith(ending):
+        return None
+    return metadata["namespace"], str(controller["name"]).removesuffix(ending)
 
 
 def _detector_of(raw: Object) -> Name:

@@ -41,6 +41,7 @@ class _Known:
     reconcile: TraceContext | None = None
     applied: int = 0
     failure: str = ""
+    unserved: bool = False  # it ended before anything was emitted that an instance did for it
 
 
 class TaskTraces:
@@ -75,22 +76,33 @@ class TaskTraces:
                 self._emit(
                     Span(word, now, now, parent=context, attributes=about, error=f"{each.reason}: {each.message}")
                 )
-            elif each.type == "Ready" and each.status == "True" and not holds(old.conditions, "Ready"):
-                self._ready(task, context, new, now, None)
             elif each.type == "Finished" and each.status == "True":
-                self._finished(task, context, new, now)
+                self._finished(task, context, old, new, now)
+        if new.ready_time is not None and old.ready_time is None:
+            self._ready(task, context, new, now, None)
 
-    def _finished(self, task: ApplicationTask, context: TraceContext, status: ApplicationTaskStatus, now: int) -> None:
-        """The task's demand is over: emit a failed `ready` if an instance served it and was not ready for it.
+    def _finished(
+        self,
+        task: ApplicationTask,
+        context: TraceContext,
+        old: ApplicationTaskStatus,
+        new: ApplicationTaskStatus,
+        now: int,
+    ) -> None:
+        """The task's demand is over: emit a failed `ready` if an instance served it and was never ready for it.
 
         A task may end before its status says anything of an instance; then `reconcile` alone shows that one served it.
         """
-        known, ready = self._known.get(task.metadata.uid), find(status.conditions, "Ready")
-        if ready is not None and ready.status == "False":
-            self._ready(task, context, status, now, f"{ready.reason}: {ready.message}")
-        elif ready is None and known is not None and known.reconcile is not None:
-            self._ready(task, context, status, now, "NotReady: the task ended before its instance was seen ready")
-        self._known.pop(task.metadata.uid, None)
+        known = self._known.get(task.metadata.uid)
+        applied, ready = find(old.conditions, "Applied"), find(old.conditions, "Ready")
+        if old.ready_time is not None:
+            self._known.pop(task.metadata.uid, None)
+        elif applied is not None and ready is not None:
+            self._ready(task, context, new, now, f"{ready.reason}: {ready.message}")
+        elif known is not None and known.reconcile is not None:
+            self._ready(task, context, new, now, "NotReady: the task ended before its instance was seen ready")
+        else:
+            self._remembered(task.metadata.uid).unserved = True
 
     def _reconciled(self, name: Name, began: int, record: Record) -> None:
         ended = time.time_ns()
@@ -113,7 +125,7 @@ class TaskTraces:
         record: Record,
     ) -> None:
         """Tell `reconcile` and `apply` of a task, unless it was applied before, or this failure was told."""
-        if task.status is not None and holds(task.status.conditions, "Applied"):
+        if task.status is not None and task.status.applied_time is not None:
             return
         known = self._remembered(task.metadata.uid)
         aspect, took = record.applied.aspect, record.applied.took
@@ -140,16 +152,15 @@ class TaskTraces:
         if aspect.holds:
             known.applied = ended
         if task.status is not None and holds(task.status.conditions, "Finished"):  # it ended during this work
-            if find(task.status.conditions, "Ready") is None:
-                self._finished(task, context, task.status, ended)
+            if known.unserved:
+                self._finished(task, context, task.status, task.status, ended)
             self._known.pop(task.metadata.uid, None)
 
     def _ready(
         self, task: ApplicationTask, context: TraceContext, status: ApplicationTaskStatus, now: int, failure: str | None
     ) -> None:
         known = self._known.pop(task.metadata.uid, None)
-        applied = find(status.conditions, "Applied")
-        start = round(parse_seconds(applied.last_transition_time) * 1e9) if applied is not None else now
+        start = round(parse_seconds(status.applied_time) * 1e9) if status.applied_time is not None else now
         if known is not None and known.applied:
             start = known.applied
         parent = known.reconcile if known is not None and known.reconcile is not None else context

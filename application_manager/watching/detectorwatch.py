@@ -61,7 +61,6 @@ class DetectorWatch:
         before = set(self.book.asking)
         self.book.take(objects, await self._list(_PODS, SELECTOR), await self._list(_PODS, SIDECAR_LABEL))
         for name in {
-            *self.book.objects,
             *before,
             *self.book.asking,
             *(name for name, _ in self.world.store.all(DETECTOR)),

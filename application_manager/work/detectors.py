@@ -64,7 +64,7 @@ class DetectorWork:
         detector = entry.model
         if detector.spec.mode is None:
             said = None
-            await self._remove(name, entry.uid, self.book.objects.get(name, {}))
+            await self._remove(name, entry.uid, self.book.owned(entry.uid))
         else:
             said = await self._make(name, detector)
         if self.book.said.get(name) == said:
@@ -80,14 +80,14 @@ class DetectorWork:
             return NOT_RUN
         if detector.spec.mode is DetectorMode.SIDECAR:
             return await self._make_rights(name, detector, self.book.defaults)
-        there = self.book.objects.get(name, {}).get("Deployment")
+        there = self.book.owned(detector.metadata.uid).get("Deployment")
         if detector_findings(detector).problems:
             return NOT_ACCEPTED if there is None else running(there, self.book.troubles(name))
         for manifest in detector_objects(detector, self.book.defaults):
             problem = await self._apply(name, detector, manifest)
             if problem is not None:
                 return problem
-        return running(self.book.objects.get(name, {}).get("Deployment"), self.book.troubles(name))
+        return running(self.book.owned(detector.metadata.uid).get("Deployment"), self.book.troubles(name))
 
     async def _make_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> Aspect:
         """Give the accounts of others' pods what the detector needs in them; by the webhook it comes into them.
@@ -96,7 +96,7 @@ class DetectorWork:
         """
         manifests = detector_objects(detector, defaults)
         kinds = {each["kind"] for each in manifests}
-        await self._remove(name, detector.metadata.uid, set(self.book.objects.get(name, {})) - kinds)
+        await self._remove(name, detector.metadata.uid, set(self.book.owned(detector.metadata.uid)) - kinds)
         for manifest in manifests:
             problem = await self._apply(name, detector, manifest)
             if problem is not None:
@@ -110,7 +110,7 @@ class DetectorWork:
         """Make one object as the manifest says; what keeps it from being so, if anything."""
         kind, called = manifest["kind"], manifest["metadata"]["name"]
         what = f"{kind} {called}"
-        known = self.book.objects.setdefault(name, {})
+        known = self.book.owned(detector.metadata.uid)
         live = known.get(kind) or await self.client.get(_RESOURCES[kind], name[0], called)
         digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
         if live is not None:
@@ -143,12 +143,11 @@ class DetectorWork:
     async def _remove(self, name: Name, uid: str, kinds: Iterable[str]) -> None:
         """Remove what the Detector controls of these kinds: with its mode as it is they are not needed."""
         for kind in list(kinds):
-            raw = self.book.objects[name][kind]
-            if controller_uid(raw) == uid:
-                await self.client.delete(_RESOURCES[kind], name[0], raw["metadata"]["name"], raw["metadata"]["uid"])
-                self.book.objects[name].pop(kind, None)
-                self._applied.pop(raw["metadata"]["uid"], None)
-                log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
+            raw = self.book.owned(uid)[kind]
+            await self.client.delete(_RESOURCES[kind], name[0], raw["metadata"]["name"], raw["metadata"]["uid"])
+            self.book.owned(uid).pop(kind, None)
+            self._applied.pop(raw["metadata"]["uid"], None)
+            log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
 
 
 def _foreign(live: Object, detector: Detector, what: str) -> Aspect | None:

@@ -11,12 +11,13 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from application_manager.cluster.apply import Applied, Applier, Known, ObjectKey, references
 from application_manager.cluster.attempts import Attempts
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Name
+from application_manager.core.claims.sizes import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
@@ -95,12 +96,16 @@ class InstanceWork:
             self.absent(name, decision)
             return
         if instance is not None and instance.metadata.deletion_timestamp is not None:
-            return  # it is waited for: its deletion brings us back
+            self.not_made(name, decision, f"instance {name[1]} is being removed, and is made again once it is gone")
+            return  # its deletion brings us back
         await self._make(name, decision, instance)
 
     async def _make(self, name: Name, decision: Decision, existing: ApplicationInstance | None) -> None:
         if decision.paused and existing is not None:
             self._leave(name, decision, existing)
+            return
+        if decision.too_large and existing is None:
+            self.not_made(name, decision, f"instance {name[1]} is not made: {decision.too_large}")
             return
         wanted = drafting.draft(name, decision, existing)
         template = self.world.template((name[0], wanted.spec.template))
@@ -221,6 +226,8 @@ class InstanceWork:
     def _note(
         self, name: Name, instance: ApplicationInstance, decision: Decision, applied: Applied, digest: str | None
     ) -> None:
+        if decision.too_large and applied.aspect.holds:  # what it has is applied, and not what is demanded
+            applied = replace(applied, aspect=Aspect("Applied", False, TOO_LARGE, decision.too_large))
         self.world.records[name] = Record(instance.metadata.uid, decision, applied, digest)
         self.done(name)
 

@@ -78,7 +78,7 @@ class InstanceStatusWork:
         live = self._live(instance, applied)
         troubles = self._troubles(name, live, looked_up)
         suspended = suspension_aspect(instance, record.decision, live.values())
-        ready = _overdue(self._ready(instance, live, troubles), record.decision)
+        ready = _overdue(self._ready(instance, applied.aspect, live, troubles), record.decision)
         new = instance_status(
             instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now, suspended
         )
@@ -177,7 +177,11 @@ class InstanceStatusWork:
         return {key: self.applier.live(instance.namespace, key) for key in keys}
 
     def _ready(
-        self, instance: ApplicationInstance, objects: Mapping[ObjectKey, Object | None], troubles: Sequence[Trouble]
+        self,
+        instance: ApplicationInstance,
+        applied: Aspect,
+        objects: Mapping[ObjectKey, Object | None],
+        troubles: Sequence[Trouble],
     ) -> Aspect:
         missing = []
         for (_, kind, name), live in objects.items():
@@ -186,6 +190,8 @@ class InstanceStatusWork:
                 missing.append(f"{kind} {name} {problem}")
         if not objects:
             return Aspect("Ready", False, "NotApplied", "nothing is applied yet")
+        if not applied.holds:  # what was applied before may run, and is not what is wanted
+            return Aspect("Ready", False, applied.reason, f"not applied: {applied.message}")
         if instance.spec.suspended:
             return Aspect("Ready", False, "Suspended", "the instance is suspended")
         if missing:

@@ -21,6 +21,7 @@ from application_manager.cluster.client import EVENTS, ApiError, Client, Unreach
 from application_manager.core.conditions import changed
 from application_manager.core.health.pods import TroubleReason
 from application_manager.core.statuses.allowance import Allowance
+from application_manager.core.statuses.conclusions import READY, STALLED
 from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
 from wayside.times import format_seconds
@@ -145,9 +146,16 @@ class Recorder:
             self.dropped += 1
 
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
-        """Post an Event for each condition that changed, if it is worth one: not yet being ready is none."""
+        """Post an Event for each condition that changed, if it is worth one: not yet being ready is none.
+
+        Nor is what follows from another condition: Stalled, and Ready of what is not applied or not accepted.
+        """
         was_true = {each.type for each in old if each.status == "True"}
+        is_false = {each.type for each in new if each.status == "False"}
+        concludes = not is_false.isdisjoint(("Applied",)) or any(each.type == "Accepted" for each in new)
         for each in changed(old, new):
+            if each.type == STALLED or (each.type == READY and concludes):
+                continue
             reason = _OF_CONDITION.get((each.type, each.status))
             if each.reason in _OWN_REASONS:
                 reason = Reason(each.reason)

@@ -10,7 +10,13 @@ from dataclasses import dataclass, field
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Entry, Name
 from application_manager.core.objects.policy import KindKey
-from application_manager.core.statuses.rulestatus import detector_status, rule_status, unreadable_status
+from application_manager.core.statuses.rulestatus import (
+    DETECTOR_INVALID,
+    RULE_INVALID,
+    detector_status,
+    rule_status,
+    unreadable_status,
+)
 from application_manager.core.statuses.status import difference
 from application_manager.knowledge.detectorbook import DetectorBook
 from application_manager.knowledge.world import DETECTOR, EVENT_RULE, World
@@ -78,7 +84,7 @@ class RuleWork:
         if kind == EVENT_RULE:
             old, judged = EventRuleStatus.model_validate(written), entry.model
             if not isinstance(judged, EventRule):
-                return old, unreadable_status(old, "RuleInvalid", entry.problem, generation, now)
+                return old, unreadable_status(old, RULE_INVALID, entry.problem, generation, now)
             detectors = self.world.models(DETECTOR, Detector, namespace)
             others = self.world.models(EVENT_RULE, EventRule, namespace) if depends(judged) else []
             invalid, remarks = self.world.invalid(DETECTOR, namespace), self.world.deploy_remarks(judged)
@@ -86,6 +92,6 @@ class RuleWork:
             return old, await asyncio.to_thread(rule_status, judged, detectors, now, invalid, others, remarks)
         old, judged = DetectorStatus.model_validate(written), entry.model
         if not isinstance(judged, Detector):
-            return old, unreadable_status(old, "DetectorInvalid", entry.problem, generation, now)
+            return old, unreadable_status(old, DETECTOR_INVALID, entry.problem, generation, now)
         running = self.detectors.said.get(name)
         return old, detector_status(judged, self.world.models(EVENT_RULE, EventRule, namespace), now, running)

@@ -11,7 +11,7 @@ from application_manager.cluster.client import ApiError, Client, Object, Resourc
 from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict, gathered
-from application_manager.core.conditions import changed, holds
+from application_manager.core.conditions import changed
 from application_manager.core.demand.fallback import FALLEN_BACK, turned
 from application_manager.core.statuses.status import Service, difference, finished_since, task_status, together
 from application_manager.knowledge.world import World
@@ -91,12 +91,13 @@ class TaskWork:
         for each in changed(old.conditions, new.conditions):
             if each.type == "Accepted" and each.status == "False":
                 self.measures.refused(each.reason)
-            elif each.status == "True" and task.spec.event is not None and not holds(old.conditions, each.type):
-                since_start = now - parse_seconds(task.spec.event.start_time)
-                if each.type == "Applied":
-                    self.measures.applied(since_start)
-                elif each.type == "Ready":
-                    self.measures.ready(since_start)
+        if task.spec.event is None:
+            return
+        since_start = now - parse_seconds(task.spec.event.start_time)
+        if new.applied_time is not None and old.applied_time is None:
+            self.measures.applied(since_start)
+        if new.ready_time is not None and old.ready_time is None:
+            self.measures.ready(since_start)
 
     async def _has_template(self, namespace: str, template: str) -> bool:
         found = await self.client.get(self.templates, namespace, template)

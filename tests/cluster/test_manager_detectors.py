@@ -89,6 +89,54 @@ def is_made(api: Api) -> None:
     wait_until(unlike, lambda found: not found, what="its objects are as the Detector says")
 
 
+def copied(labels: dict[str, str], name: str, kind: str = "Deployment") -> Object:
+    """An object of somebody else with all labels of a detector's, whose pods crash."""
+    pod = {
+        "metadata": {"labels": labels},
+        "spec": {"containers": [{"name": "main", "image": "other:1"}]},
+    }
+    spec = {"replicas": 1, "selector": {"matchLabels": labels}, "template": pod}
+    return {"apiVersion": "apps/v1", "kind": kind, "metadata": {"name": name, "labels": labels}, "spec": spec}
+
+
+def test_an_object_of_somebody_else_with_copied_labels_neither_disturbs_nor_is_touched(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    manager = start_manager(processes, namespace, *RUNS)
+    api.create(detector(mode="Standalone"))
+    is_made(api)
+    labels = api.get("Deployment", NAME)["metadata"]["labels"]
+    # Listed before and after the detector's own.
+    others = [api.create(copied(labels, each))["metadata"]["name"] for each in (f"{NAME[:-1]}a", f"{NAME}-other")]
+    own = api.wait_list(
+        "Pod",
+        lambda found: {each["metadata"]["generateName"].rsplit("-", 2)[0] for each in found} >= {NAME, *others},
+        labels=f"wayside.dev/runs={HOLDER}",
+        what="all of them have pods",
+    )
+    for each in own:
+        if not each["metadata"]["generateName"].startswith(f"{NAME}-other"):
+            continue
+        state = {"waiting": {"reason": "ErrImagePull", "message": "not the detector's"}}
+        status = {"name": "main", "image": "other:1", "imageID": "", "ready": False, "restartCount": 0, "state": state}
+        api.patch("Pod", each["metadata"]["name"], {"status": {"containerStatuses": [status]}}, subresource="status")
+
+    manager.restart()  # it knows nothing but what it finds
+    manager.wait_for_output("watching")
+    for seconds in ("30s", "20s"):
+        api.patch("Detector", HOLDER, {"spec": {"clientTimeout": seconds}})
+        is_made(api)
+    told = says(api, "False", "NotReady")
+    assert "not the detector's" not in told["message"]
+    api.patch("Detector", HOLDER, {"spec": {"mode": None}})
+    for kind in KINDS:
+        api.wait_gone(kind, NAME)
+    for each in others:
+        found = api.get("Deployment", each)
+        assert found["metadata"]["generation"] == 1
+        assert "deletionTimestamp" not in found["metadata"]
+
+
 def test_its_objects_come_change_and_go_with_it(api: Api, processes: Processes, namespace: str, kubelet: None) -> None:
     start_manager(processes, namespace, *RUNS)
     api.create(detector(mode="Standalone"))

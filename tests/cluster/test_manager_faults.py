@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from application_manager.core.claims.claims import instance_name
-from tests.cluster.api import Api, Object
+from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import (
     condition,
@@ -316,3 +316,33 @@ def test_a_namespace_that_goes_is_left_quietly(api: Api, manager: Process, names
     assert manager.terminate() == 0
     assert "Traceback" not in manager.output()
     assert "WARNING" not in manager.output()
+
+
+@pytest.mark.own_control_plane
+def test_a_cluster_that_drops_selectable_fields_is_refused_at_the_start(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    """As Kubernetes 1.30 drops them; an instance would never be released there."""
+    kind, name = "CustomResourceDefinition", "applicationtasks.wayside.dev"
+    versions_with = api.get(kind, name)["spec"]["versions"]
+    versions_without = [
+        {key: value for key, value in each.items() if key != "selectableFields"} for each in versions_with
+    ]
+
+    def selects() -> bool:
+        try:
+            api.list("ApplicationTask", fields="spec.template=none")
+        except ApiError as error:
+            return error.code != 400
+        return True
+
+    api.patch(kind, name, {"spec": {"versions": versions_without}})
+    try:
+        wait_until(selects, lambda can: not can, what="the field cannot be selected")
+        manager = processes.start("application-manager", "run", "--namespace", namespace)
+        assert manager.wait() == 2
+        assert "ApplicationTasks cannot be selected by spec.template" in manager.output()
+        assert "Kubernetes 1.31 or newer" in manager.output()
+    finally:
+        api.patch(kind, name, {"spec": {"versions": versions_with}})
+        wait_until(selects, bool, what="the field can be selected again")

@@ -75,7 +75,7 @@ def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api:
     )
 
     api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")
-    wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="was ready")
+    wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="is ready")
     wait_ready_says(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
     ready = [
         each | {"status": "False"}
@@ -83,7 +83,7 @@ def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api:
         if each["type"] != "PodScheduled"
     ]
     kubelet_says(api, pod, containerStatuses=crashed, conditions=ready)
-    wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="now: container main crashes")
+    wait_ready_says(api, "ApplicationTask", "north", reason="CrashLoop", text="container main crashes")
     wait_ready_says(api, "ApplicationInstance", NORTH, reason="CrashLoop", text="has 0 of 1 pods available")
     wait_until(
         lambda: {each["reason"] for each in api.list("Event.events.k8s.io") if each["type"] == "Warning"},

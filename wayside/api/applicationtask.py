@@ -105,8 +105,13 @@ class ApplicationTaskStatus(Model):
         default=None, max_length=512, description="What it waits for or why it does not count; absent when all is well."
     )
     observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
+    applied_time: Time | None = Field(
+        default=None, description="When its instance had its values applied for the first time."
+    )
+    ready_time: Time | None = Field(default=None, description="When its instance was ready for it for the first time.")
     conditions: list[Condition] = conditions_field(
-        "Accepted: the demand counts. Applied, Ready: its instance was, at least once. Finished: it is over."
+        "Accepted: the demand counts. Applied, Ready: its instance is, now. Stalled: it is refused, and waiting does "
+        "not help. Finished: it is over, and Applied and Ready are gone."
     )
 
 

@@ -197,7 +197,9 @@ class ApplicationTemplateStatus(Model):
 
     observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
     instances: int = Field(default=0, description="How many instances there are.")
-    conditions: list[Condition] = conditions_field("Accepted: whether the template can be rendered.")
+    conditions: list[Condition] = conditions_field(
+        "Accepted, Ready: whether the template can be rendered. Stalled: it has to be corrected."
+    )
 
 
 class ApplicationTemplate(Kind):

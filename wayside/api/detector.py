@@ -288,7 +288,8 @@ class DetectorStatus(Model):
     observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
     rules: int = Field(default=0, description="How many EventRules it selects.")
     conditions: list[Condition] = conditions_field(
-        "Accepted: whether the detector can run. Running, with a mode: whether it does, and if not, why."
+        "Accepted: whether the detector can run. Running, with a mode: whether it does, and if not, why. Ready: all of "
+        "these. Stalled: it has to be corrected."
     )
 
 

@@ -215,7 +215,9 @@ class EventRuleStatus(Model):
         description="The Detectors that select the rule.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
-    conditions: list[Condition] = conditions_field("Accepted: whether the rule can be evaluated.")
+    conditions: list[Condition] = conditions_field(
+        "Accepted, Ready: whether the rule can be evaluated. Stalled: it has to be corrected."
+    )
 
 
 class EventRule(Kind):

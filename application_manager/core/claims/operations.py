@@ -14,6 +14,7 @@ from typing import Any
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
 from application_manager.core.claims.merging import Contribution, Merged, merge
 from application_manager.core.claims.parameters import baseline, with_defaults
+from application_manager.core.claims.sizes import too_large
 from wayside.api import ApplicationTemplate
 from wayside.api.operation import Operation
 
@@ -63,6 +64,7 @@ class Settled:
         suspender: the first task that suspends it and is not outbid.
         verdicts: of all tasks, by name.
         capped: a word about each sum that is held at a bound.
+        too_large: why the parameters are beyond their bounds; empty where they are not.
     """
 
     tasks: tuple[str, ...]
@@ -71,6 +73,7 @@ class Settled:
     suspender: str | None
     verdicts: dict[str, Verdict]
     capped: tuple[str, ...]
+    too_large: str = ""
 
 
 def settle(name: str, template: ApplicationTemplate | None, claims: Sequence[Claim], exists: bool) -> Settled:
@@ -97,13 +100,15 @@ def settle(name: str, template: ApplicationTemplate | None, claims: Sequence[Cla
             if each.operation is Operation.RECONFIGURE
             else _stop_verdict(name, each, served, demanded or exists)
         )
+    parameters = with_defaults(declared, base.parameters | layer.parameters) if demanded else None
     return Settled(
         tasks=tuple(each.task.name for each in served),
         baseline=always is not None,
-        parameters=with_defaults(declared, base.parameters | layer.parameters) if demanded else None,
+        parameters=parameters,
         suspender=suspender,
         verdicts=verdicts,
         capped=_capped(base, layer) if demanded else (),
+        too_large=too_large(parameters or {}, _contributions([*served, *changing])),
     )
 
 

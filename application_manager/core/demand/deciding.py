@@ -71,7 +71,7 @@ def decide(
         name=name,
         template=template_name,
         key=key,
-        parameters=None if paused else settled.parameters,
+        parameters=None if paused or settled.too_large else settled.parameters,
         tasks=settled.tasks,
         verdicts=verdicts | settled.verdicts,
         release_time=release_time,
@@ -79,6 +79,7 @@ def decide(
         paused=paused,
         withheld=withheld,
         capped=settled.capped,
+        too_large=settled.too_large,
         baseline=settled.baseline,
         suspended=suspended,
         suspender=settled.suspender,
@@ -95,7 +96,8 @@ def _was_served(task: ApplicationTask) -> bool:
     """Whether the task's status says that its instance ran, or gave way to another."""
     conditions = task.status.conditions if task.status else ()
     accepted = find(conditions, "Accepted")
-    return holds(conditions, "Applied") or (accepted is not None and accepted.reason == PREEMPTED)
+    applied = task.status is not None and task.status.applied_time is not None
+    return applied or holds(conditions, "Applied") or (accepted is not None and accepted.reason == PREEMPTED)
 
 
 def decide_for_all(

@@ -24,6 +24,7 @@ class Decision:
         paused: whether a person wants the instance and its objects left as they are.
         withheld: whether the pause keeps merged values from the instance.
         capped: a word about each merged sum that is held at its parameter's bound.
+        too_large: why the merged values are too large and it keeps those that it has; empty where they are not.
         baseline: whether the template demands it by itself.
         suspended: whether it is to be at zero; None where that stays as it is.
         suspender: the task that suspends it.
@@ -47,6 +48,7 @@ class Decision:
     paused: bool = False
     withheld: bool = False
     capped: tuple[str, ...] = ()
+    too_large: str = ""
     baseline: bool = False
     suspended: bool | None = None
     suspender: str | None = None

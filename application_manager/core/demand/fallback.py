@@ -75,7 +75,10 @@ def overdue(
     was, ready = holds(conditions, TIMED_OUT), find(conditions, "Ready")
     is_ready = ready is not None and ready.status == "True"
     since = ready.last_transition_time if ready is not None else instance.metadata.creation_timestamp
-    if instance.spec.suspended or is_ready != was or not since:
+    applied = find(conditions, "Applied")
+    # What was applied in full before an update was refused is left as it is: it may well be ready.
+    refused = applied is not None and applied.status == "False" and bool(instance.status and instance.status.spec_hash)
+    if instance.spec.suspended or is_ready != was or not since or refused:
         return str(timeout) if was else "", None
     start = parse_seconds(since)
     if not is_ready and (resumed := find(conditions, "Suspended")) is not None:

@@ -11,15 +11,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from application_manager.core.conditions import Aspect, updated
+from application_manager.core.conditions import Aspect
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import detector_findings, rule_findings, selecting, selects
+from application_manager.core.statuses.conclusions import concluded
 from application_manager.core.statuses.running import RUNNING
 from wayside.api import Detector, EventRule
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
 
 Status = TypeVar("Status", EventRuleStatus, DetectorStatus)
+
+RULE_INVALID = "RuleInvalid"
+DETECTOR_INVALID = "DetectorInvalid"
+"""Reasons of the condition Accepted of what cannot be evaluated."""
 
 _AS_FAR_AS = "as far as can be told without the message types; what they show to be wrong, the detector's log says"
 
@@ -49,7 +54,11 @@ def rule_status(
     return EventRuleStatus(
         observed_generation=generation,
         detectors=[each.name for each in selected],
-        conditions=list(updated(old.conditions, (_rule_aspect(findings, bool(selected)),), generation, now)),
+        conditions=list(
+            concluded(
+                old.conditions, [_rule_aspect(findings, bool(selected))], generation, now, stalled=(RULE_INVALID,)
+            )
+        ),
     )
 
 
@@ -65,13 +74,13 @@ def detector_status(
         running: whether it runs, where that is for the manager to say and is known.
     """
     old = detector.status or DetectorStatus()
-    aspects = [_aspect(detector_findings(detector), "DetectorInvalid"), *([] if running is None else [running])]
+    aspects = [_aspect(detector_findings(detector), DETECTOR_INVALID), *([] if running is None else [running])]
     kept = [each for each in old.conditions if detector.spec.mode is not None or each.type != RUNNING]
     generation = detector.metadata.generation
     return DetectorStatus(
         observed_generation=generation,
         rules=sum(1 for each in rules if selects(detector, each)),
-        conditions=list(updated(kept, aspects, generation, now)),
+        conditions=list(concluded(kept, aspects, generation, now, stalled=(DETECTOR_INVALID,))),
     )
 
 
@@ -86,13 +95,13 @@ def unreadable_status(status: Status, reason: str, problem: str, generation: int
         now: seconds since 1970.
     """
     aspect = Aspect("Accepted", False, reason, problem)
-    conditions = list(updated(status.conditions, (aspect,), generation, now))
+    conditions = list(concluded(status.conditions, [aspect], generation, now, stalled=(reason,)))
     return status.model_copy(update={"observed_generation": generation, "conditions": conditions})
 
 
 def _rule_aspect(findings: Findings, selected: bool) -> Aspect:
     if selected or findings.problems:
-        return _aspect(findings, "RuleInvalid")
+        return _aspect(findings, RULE_INVALID)
     return Aspect("Accepted", False, "NotSelected", "; ".join(findings.doubts))
 
 

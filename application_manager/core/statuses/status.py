@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from application_manager.core.claims.operations import ACCEPTED, Standing, Verdict
-from application_manager.core.conditions import Aspect, find, holds, updated
+from application_manager.core.conditions import Aspect, find, updated
 from application_manager.core.demand import byhand, fallback
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.findings.findings import Findings
 from application_manager.core.objects.suspension import autoscalers, pods_left
+from application_manager.core.statuses.conclusions import STALLED, concluded
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
 from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase
@@ -27,6 +28,11 @@ from wayside.times import format_seconds, parse_seconds
 Json = dict[str, Any]
 
 _NAMES_SHOWN = 20
+_PASSING = frozenset({"Retrying", "Paused"})
+"""Reasons of Applied=False beside which an instance's phase is Failed, and that need no change of the template."""
+
+TEMPLATE_INVALID = "TemplateInvalid"
+"""Reason of the condition Accepted of a template that cannot be rendered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +71,12 @@ def together(services: Sequence[Service]) -> Service:
 
 
 def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None, now: float) -> ApplicationTaskStatus:
-    """The task's status; Applied and Ready stay True once they were. `service` is that of the verdict's instance."""
+    """The task's status as it is now; `service` is that of the verdict's instance.
+
+    A finished task has no condition Applied or Ready: nothing is done for it any more.
+    """
     old = task.status or ApplicationTaskStatus()
+    since = format_seconds(now)
     finished = verdict.standing is Standing.FINISHED
     aspects: list[Aspect] = []
     if not finished:
@@ -77,20 +87,32 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
     else:
         aspects.append(Aspect("Finished", True, verdict.reason, verdict.message))
     suspends = task.spec.operation is Operation.SUSPEND
-    if verdict.standing is Standing.COUNTS and service is not None:
-        done = service.stopped if suspends else service.ready
-        word = "suspended" if suspends else "ready"
-        aspects += [
-            _latched(old.conditions, "Applied", service.applied, "Applied", "NotApplied", service),
-            _latched(old.conditions, "Ready", done, "Ready", "NotReady", service, word),
-        ]
-    conditions = updated(old.conditions, aspects, task.metadata.generation, now)
+    applied_time, ready_time = old.applied_time, old.ready_time
+    if verdict.standing is Standing.COUNTS:
+        if service is not None:
+            done = service.stopped if suspends else service.ready
+            word = "suspended" if suspends else "ready"
+            aspects += [
+                _served("Applied", service.applied, "Applied", "NotApplied", service),
+                _served("Ready", done, "Ready", "NotReady", service, word),
+            ]
+            applied_time = applied_time or (since if service.applied else None)
+            ready_time = ready_time or (since if done else None)
+    elif not finished:
+        aspects.append(Aspect("Ready", False, verdict.reason, verdict.message))
+        if verdict.standing is Standing.REFUSED:
+            aspects.append(Aspect(STALLED, True, verdict.reason, verdict.message))
+    # A task that counts keeps what is known of its service while nothing newer is.
+    only_while = (STALLED,) if verdict.standing is Standing.COUNTS else ("Applied", "Ready", STALLED)
+    conditions = updated(old.conditions, aspects, task.metadata.generation, now, only_while=only_while)
     instance = old.instance or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, service, suspends),
         instance=instance,
         message=_task_message(verdict, service, suspends),
         observed_generation=task.metadata.generation,
+        applied_time=applied_time,
+        ready_time=ready_time,
         conditions=list(conditions),
     )
 
@@ -101,18 +123,11 @@ def finished_since(task: ApplicationTask) -> float | None:
     return parse_seconds(condition.last_transition_time) if condition and condition.status == "True" else None
 
 
-def _latched(
-    known: Sequence[Condition],
-    type_: str,
-    now_holds: bool,
-    reason: str,
-    otherwise: str,
-    service: Service,
-    word: str = "applied",
+def _served(
+    type_: str, now_holds: bool, reason: str, otherwise: str, service: Service, word: str = "applied"
 ) -> Aspect:
-    if now_holds or holds(known, type_):
-        since = f"; now: {service.problem}" if service.problem and not now_holds else ""
-        return Aspect(type_, True, reason, f"instance {service.instance} was {word}{since}")
+    if now_holds:
+        return Aspect(type_, True, reason, f"instance {service.instance} is {word}")
     if service.applied and service.reason and word != "suspended":
         otherwise = service.reason
     return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {word} yet")
@@ -191,6 +206,7 @@ def instance_status(
                 (
                     applied,
                     ready,
+                    *_stalled(phase, applied, ready, decision),
                     *([suspended] if suspended else []),
                     *_capped(old.conditions, decision),
                     *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
@@ -198,6 +214,7 @@ def instance_status(
                 ),
                 generation,
                 now,
+                only_while=(STALLED,),
             )
         ),
     )
@@ -219,6 +236,15 @@ def suspension_aspect(
         return Aspect("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
     resting = "".join(f"; HorizontalPodAutoscaler {each} rests until then" for each in autoscalers(there))
     return Aspect("Suspended", True, "Suspended", f"{whose}, and its workloads are at zero{resting}")
+
+
+def _stalled(phase: InstancePhase, applied: Aspect, ready: Aspect, decision: Decision) -> list[Aspect]:
+    """The condition Stalled, where more than time is needed: the objects are refused, or were not ready in time."""
+    if not applied.holds and phase is InstancePhase.FAILED and applied.reason not in _PASSING:
+        return [Aspect(STALLED, True, applied.reason, applied.message)]
+    if decision.overdue and not ready.holds and phase is not InstancePhase.SUSPENDED:
+        return [Aspect(STALLED, True, fallback.READY_TIMEOUT, ready.message)]
+    return []
 
 
 def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:
@@ -261,14 +287,14 @@ def template_status(
 ) -> ApplicationTemplateStatus:
     """The template's status, with why it cannot be rendered, if it cannot."""
     if findings.problems:
-        accepted = Aspect("Accepted", False, "TemplateInvalid", "; ".join(findings.problems))
+        accepted = Aspect("Accepted", False, TEMPLATE_INVALID, "; ".join(findings.problems))
     else:
         but = f", but {'; '.join(findings.remarks)}" if findings.remarks else ""
         accepted = Aspect("Accepted", True, "Accepted", f"the template can be rendered{but}")
     return ApplicationTemplateStatus(
         observed_generation=generation,
         instances=instances,
-        conditions=list(updated(old.conditions, (accepted,), generation, now)),
+        conditions=list(concluded(old.conditions, [accepted], generation, now, stalled=(TEMPLATE_INVALID,))),
     )
 
 

@@ -96,6 +96,14 @@ def test_what_is_suspended_has_all_the_time_and_so_has_what_has_no_timeout() -> 
     assert overdue(runs(Ready=("False", 500)), template("lite", **LITE), NOW) == ("", None)
 
 
+def test_an_update_that_is_refused_makes_nothing_overdue_that_runs() -> None:
+    app = runs(Ready=("False", 500), Applied=("False", 500))
+    assert overdue(app, template(**FULL), NOW)[0] == "60s"
+    assert app.status is not None
+    once = app.model_copy(update={"status": app.status.model_copy(update={"spec_hash": "digest"})})
+    assert overdue(once, template(**FULL), NOW) == ("", None)
+
+
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 100)), min_size=1, max_size=12))
 def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[tuple[bool, int]]) -> None:
     """Each pair says whether the app is ready, and for how many seconds; a new manager looks each second."""

@@ -51,33 +51,50 @@ def test_a_rule_that_a_detector_can_evaluate_is_accepted() -> None:
 
 def test_what_is_wrong_with_a_rule_is_told_with_its_place() -> None:
     status = rule_status(rule(when="sped > 3"), [detector()], NOW)
-    (condition,) = status.conditions
+    condition = status.conditions[0]
     assert (condition.status, condition.reason) == ("False", "RuleInvalid")
     for part in ("spec.when", "column 1", "sped", "speed"):
         assert part in condition.message
 
 
+def test_ready_and_stalled_follow_from_what_is_wrong_and_stalled_goes_with_it() -> None:
+    wrong = rule_status(rule(when="sped > 3"), [detector()], NOW)
+    assert [(each.type, each.status) for each in wrong.conditions] == [
+        ("Accepted", "False"),
+        ("Ready", "False"),
+        ("Stalled", "True"),
+    ]
+    assert rule_status(rule(when="sped > 3").model_copy(update={"status": wrong}), [detector()], NOW + 9) == wrong
+    right = rule_status(rule().model_copy(update={"status": wrong}), [detector()], NOW)
+    assert [(each.type, each.status) for each in right.conditions] == [("Accepted", "True"), ("Ready", "True")]
+    alone = rule_status(rule().model_copy(update={"status": wrong}), [], NOW)
+    assert [(each.type, each.reason) for each in alone.conditions] == [
+        ("Accepted", "NotSelected"),
+        ("Ready", "NotSelected"),
+    ]
+
+
 def test_a_problem_with_one_detector_names_it() -> None:
-    (condition,) = rule_status(rule(), [detector(), detector("blind", stream="odometry")], NOW).conditions
+    condition = rule_status(rule(), [detector(), detector("blind", stream="odometry")], NOW).conditions[0]
     assert condition.status == "False"
     assert condition.message.startswith("with Detector blind: spec.signals[0].stream")
 
 
 def test_a_rule_that_nobody_selects_is_told_which_labels_would_help() -> None:
-    (condition,) = rule_status(rule(), [detector(site="b")], NOW).conditions
+    condition = rule_status(rule(), [detector(site="b")], NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "NotSelected")
     assert "det selects site=b" in condition.message
 
 
 def test_a_detector_counts_its_rules_and_is_told_what_is_wrong_with_its_streams() -> None:
     assert detector_status(detector(), [rule()], NOW).rules == 1
-    (condition,) = detector_status(detector(stamp="msg.t +"), [rule()], NOW).conditions
+    condition = detector_status(detector(stamp="msg.t +"), [rule()], NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "DetectorInvalid")
     assert "spec.streams[0].stamp" in condition.message
 
 
 def test_a_key_that_is_none_is_told_with_its_place() -> None:
-    (condition,) = detector_status(detector(key="v//${client:*}/pose"), [], NOW).conditions
+    condition = detector_status(detector(key="v//${client:*}/pose"), [], NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "DetectorInvalid")
     assert "spec.streams[0].key: key 'v//${client:*}/pose', column 3: two slashes stand in a row" in condition.message
 
@@ -88,7 +105,7 @@ def test_what_is_accepted_is_so_only_as_far_as_can_be_told_here() -> None:
 
 
 def test_a_rule_that_nobody_selects_is_told_of_detectors_that_are_none() -> None:
-    (condition,) = rule_status(rule(), [], NOW, ["det"]).conditions
+    condition = rule_status(rule(), [], NOW, ["det"]).conditions[0]
     assert (condition.status, condition.reason) == ("False", "NotSelected")
     assert "correct Detector det, whose status says what is wrong" in condition.message
 
@@ -128,13 +145,13 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
 
     asyncio.run(reconcile_twice())
     (status,) = written
-    (condition,) = status["conditions"]
+    condition = status["conditions"][0]
     assert (condition["status"], condition["reason"], condition["observedGeneration"]) == ("False", reason, 2)
     assert "spec.odd: there is no such field" in condition["message"]
 
 
 def test_what_may_go_wrong_with_a_good_rule_is_said_and_it_stays_accepted() -> None:
-    (condition,) = rule_status(rule(), [detector()], NOW, remarks=["there is no template"]).conditions
+    condition = rule_status(rule(), [detector()], NOW, remarks=["there is no template"]).conditions[0]
     assert condition.status == "True"
     assert condition.message.endswith("; but there is no template")
 

@@ -1,4 +1,4 @@
-"""Statuses are honest and quiet: conditions keep their time, Applied and Ready of a task latch."""
+"""Statuses are honest and quiet: conditions keep their time, and are those of now."""
 
 from __future__ import annotations
 
@@ -45,12 +45,34 @@ def test_a_tasks_phases_follow_its_instance() -> None:
     assert phases == [TaskPhase.PENDING, TaskPhase.PENDING, TaskPhase.ACTIVE, TaskPhase.READY]
 
 
-def test_applied_and_ready_of_a_task_stay_true_once_they_were() -> None:
+def test_a_task_is_no_more_applied_or_ready_than_its_instance_and_keeps_since_when_it_once_was() -> None:
     ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
     served = task("a").model_copy(update={"status": ready})
     later = task_status(served, COUNTS, Service("app", False, False, "broken"), NOW + 1)
-    assert said(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
+    assert said(later) == {"Accepted": "True", "Applied": "False", "Ready": "False"}
     assert later.phase is TaskPhase.PENDING
+    assert later.applied_time == later.ready_time == format_seconds(NOW)
+    over = task_status(
+        task("a").model_copy(update={"status": later}), Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 2
+    )
+    assert said(over) == {"Accepted": "True", "Finished": "True"}
+    assert over.ready_time == format_seconds(NOW)
+
+
+@pytest.mark.parametrize(
+    ("standing", "stalled"), [(Standing.REFUSED, True), (Standing.WAITING, False), (Standing.LAPSED, False)]
+)
+def test_a_task_that_does_not_count_is_not_ready_for_the_same_reason(standing: Standing, stalled: bool) -> None:
+    served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, Service("app", True, True), NOW)})
+    status = task_status(served, Verdict(standing, "Because", "why"), None, NOW + 1)
+    found = {each.type: (each.status, each.reason) for each in status.conditions}
+    assert found["Ready"] == ("False", "Because")
+    assert "Applied" not in found
+    assert ("Stalled" in found) is stalled
+    again = task_status(
+        task("a").model_copy(update={"status": status}), Verdict(standing, "Because", "why"), None, NOW + 9
+    )
+    assert again == status
 
 
 def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it_was_ready() -> None:
@@ -60,7 +82,7 @@ def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it
     assert (ready.status, ready.reason, ready.message) == ("False", "ImagePullFailed", pulling.problem)
     served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, Service("app", True, True), NOW)})
     later = next(each for each in task_status(served, COUNTS, pulling, NOW).conditions if each.type == "Ready")
-    assert (later.status, later.message) == ("True", f"instance app was ready; now: {pulling.problem}")
+    assert (later.status, later.reason, later.message) == ("False", "ImagePullFailed", pulling.problem)
 
 
 def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:

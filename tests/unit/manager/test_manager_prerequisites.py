@@ -1,0 +1,38 @@
+"""The manager ends at its start on a Kubernetes on which it could never release an application."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import cast
+
+import pytest
+
+from application_manager.cluster.client import Client
+from application_manager.cluster.connection import ConfigurationError
+from application_manager.prerequisites import recent_enough
+
+
+class Server:
+    """An API server of a version."""
+
+    def __init__(self, version: str) -> None:
+        self._version = version
+
+    async def server_version(self) -> str:
+        return self._version
+
+
+def checked(version: str) -> str:
+    return asyncio.run(recent_enough(cast("Client", Server(version))))
+
+
+@pytest.mark.parametrize("version", ["v1.31.0", "v1.36.3-eks-1", "v1.31.9+k3s1", "v2.0.0", "of its own"])
+def test_recent_versions_and_unknown_ones_are_let_through(version: str) -> None:
+    assert checked(version) == version
+
+
+@pytest.mark.parametrize("version", ["v1.30.14", "v1.9.11", "v1.30.0-gke.1"])
+def test_older_ones_are_refused_with_the_reason_and_the_remedy(version: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"1\.31 is the oldest that works: .*upgrade the cluster") as refused:
+        checked(version)
+    assert version in str(refused.value)
