@@ -26,9 +26,11 @@ from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import settle
 from wayside.expressions.growth import MOST, growth
 from wayside.expressions.handles import begin, end, value_of
+from wayside.expressions.lexer import tokens
 from wayside.expressions.numbers import MAX_EXACT, doubled
 from wayside.expressions.projection import Leaf, missing_path, no_member, normalise, project, tree
-from wayside.expressions.syntax import Node, Path, arguments, nothing_but_arguments, parse, paths
+from wayside.expressions.regex import LARGEST_PATTERN, pattern_size
+from wayside.expressions.syntax import Constant, Node, Path, arguments, calls, nothing_but_arguments, parse, paths
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
 
 Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int | bool, "Value"]
@@ -80,6 +82,7 @@ RESERVED_WORDS: Final = frozenset(_WORDS.split())
 """Words that CEL's grammar keeps for itself: no variable can have one as its name."""
 
 
+_LITERAL: Final = "write it in quotes, not as a parameter, a field or a sum"
 _SMALLER: Final = "a loop within a loop multiplies what it joins with `+`: join less"
 
 
@@ -128,6 +131,7 @@ class Environment:
             typed = program if self._typed is None or "has(" in rewritten.text else self._typed.compile(rewritten.text)
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
             raise diagnose(str(error), source, rewritten, self.variables) from None
+        _check_patterns(parsed, source)
         if growth(parsed) > MOST:
             raise ExpressionError(
                 f"a value in it would hold more than {MOST} copies of others", source=source, hint=_SMALLER
@@ -273,6 +277,25 @@ def _check_static(actual: cel.Type, wanted: Kind, source: str) -> None:
     line, column = position(source, start)
     is_text = kind.value if kind else name.lower()
     raise ExpressionError(f"must be {wanted.value}, is {is_text}", source=source, line=line, column=column)
+
+
+def _check_patterns(node: Node, source: str) -> None:
+    """Raise ExpressionError where the pattern of `matches` is no literal, or a large one."""
+    found = list(calls(node, "matches"))
+    names = [each.start for each in tokens(source) if each.text == "matches"] if found else []
+    for index, call in enumerate(found):
+        pattern = call.arguments[-1] if call.arguments else None
+        literal = pattern.value if isinstance(pattern, Constant) else None
+        if not isinstance(literal, str):
+            message, hint = "the pattern of `matches` is no literal text", _LITERAL
+        elif (size := pattern_size(literal)) > LARGEST_PATTERN:
+            cut = literal if len(literal) <= 80 else f"{literal[:79]}…"
+            message = f"the pattern {cut!r} takes {size} steps, more than the {LARGEST_PATTERN} of `matches`"
+            hint = "repeat less in it, or use smaller classes"
+        else:
+            continue
+        line, column = position(source, names[index] if len(names) == len(found) else 0)
+        raise ExpressionError(message, source=source, line=line, column=column, hint=hint)
 
 
 def _not_text(source: object) -> ExpressionError:

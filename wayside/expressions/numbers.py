@@ -4,12 +4,14 @@
     size(points) / 2          →  double(size(points)) / 2.0
     ranges[0] + ranges[i + 1] →  ranges[0] + ranges[dyn(i + 1.0)]
     string(msg.station)       →  string(digits(msg.station))
+    name.matches('a+')        →  bounded(name).matches('a+')
 
 Integer literals become doubles, and so do the results of functions that count, and of `int(x)`, which cuts off the
 fraction. A literal index stays an integer; any other index is wrapped in `dyn()`, because a list takes an integral
 double as its index at run time, but not when types are checked. Integers stay where only integers work: beside `%`,
 as the argument of `timestamp` and of `string`, and beyond 2^53, where a double would be another number. `digits` makes
-a whole double an integer again, since `string` writes large doubles with an exponent. Strings, comments and `3u` are
+a whole double an integer again, since `string` writes large doubles with an exponent; `bounded` (see `regex`) takes
+part in the same pass. Strings, comments and `3u` are
 left alone.
 """
 
@@ -18,6 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from wayside.expressions.lexer import Token, TokenKind, tokens
+from wayside.expressions.regex import BOUNDED
 
 MAX_EXACT = 2**53
 """Up to here every integer is a double as well."""
@@ -82,6 +85,11 @@ def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int,
                 wrap(_operand_start(line, matches, i - 2), matches[i + 1], "double")
             elif token.text == "size":
                 wrap(i, matches[i + 1], "double")
+        elif token.text == "matches" and i + 1 in matches and line[i + 1].text == "(":
+            if i > 1 and line[i - 1].text == ".":
+                wrap(_operand_start(line, matches, i - 2), i - 2, BOUNDED)
+            elif (comma := _first_comma(line, matches, i + 1)) > i + 2:
+                wrap(i + 2, comma - 1, BOUNDED)
         elif token.text == "string" and i + 1 in matches and _is_call(line, i) and matches[i + 1] > i + 2:
             wrap(i + 2, matches[i + 1] - 1, DIGITS)
         elif (
@@ -105,6 +113,16 @@ def _matches(line: list[Token]) -> dict[int, int]:
             partner = pending.pop()
             result[partner], result[i] = i, partner
     return result
+
+
+def _first_comma(line: list[Token], matches: dict[int, int], opening: int) -> int:
+    """The comma behind the first argument of a call; 0 where it has only one."""
+    i = opening + 1
+    while i < matches[opening]:
+        if line[i].text == ",":
+            return i
+        i = matches.get(i, i) + 1
+    return 0
 
 
 def _stays_integer(line: list[Token], matches: dict[int, int], i: int, last: int) -> bool:

@@ -123,6 +123,24 @@ def _paths(node: Node, free: frozenset[str], caller: str = "") -> Iterator[tuple
             yield from _paths(result, free - {accumulator})
 
 
+def calls(node: Node, function: str) -> Iterator[Call]:
+    """The calls of the function, wherever they stand."""
+    match node:
+        case Select(operand):
+            yield from calls(operand, function)
+        case Call(name, target, arguments):
+            if name == function:
+                yield node
+            for part in (*([] if target is None else [target]), *arguments):
+                yield from calls(part, function)
+        case Collection(_, elements):
+            for part in elements:
+                yield from calls(part, function)
+        case Loop(over, _, _, initial, body, result):
+            for part in (over, initial, *body, result):
+                yield from calls(part, function)
+
+
 def path_of(node: Node, free: frozenset[str]) -> Path | None:
     """The literal path that the node is, below the variables `free`; None if it is something else."""
     match node:

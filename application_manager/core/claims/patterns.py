@@ -5,20 +5,29 @@ Pure. Python's own would let a template's pattern and a task's text hold up the 
 
 from __future__ import annotations
 
+import json
 from functools import lru_cache
 from typing import Any
 
 from application_manager.core.claims import values
-from wayside.expressions import Environment, Expression, Kind
+from wayside.expressions import Environment, Expression, ExpressionError, Kind
 from wayside.expressions.errors import EvaluationError
+from wayside.expressions.regex import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
+
+_ENVIRONMENT = Environment({"text": Kind.STRING})
 
 
 def pattern_problem(pattern: str) -> str | None:
     """Why the pattern is none, or None if it is."""
+    if (size := pattern_size(pattern)) > LARGEST_PATTERN:
+        return (
+            f"{values.shown(pattern)} takes {size} steps, more than {LARGEST_PATTERN}: repeat less in it, or use "
+            "smaller classes"
+        )
     try:
-        _matcher().evaluate({"text": "", "pattern": pattern})
-    except EvaluationError as error:
-        return f"{values.shown(pattern)} is no regular expression: {error}: correct it (RE2 syntax)"
+        _matcher(pattern).evaluate({"text": ""})
+    except (EvaluationError, ExpressionError) as error:
+        return f"{values.shown(pattern)} is no regular expression: {error.message}: correct it (RE2 syntax)"
     return None
 
 
@@ -27,13 +36,16 @@ def mismatch(pattern: str, value: Any) -> str | None:
     if pattern_problem(pattern):
         return None  # the template is told, and not the task
     for index, text in enumerate(value if isinstance(value, list) else [value]):
+        which = f"item {index}, {values.shown(text)}," if isinstance(value, list) else values.shown(text)
+        if (size := len(text.encode(errors="replace"))) > LONGEST_INPUT:
+            return f"{which} has {size} bytes, more than the {LONGEST_INPUT} that a pattern is matched with"
         # CEL would see only what is before a NUL.
-        if "\0" in text or not _matcher().evaluate({"text": text, "pattern": pattern}):
-            which = f"item {index}, {values.shown(text)}," if isinstance(value, list) else values.shown(text)
+        if "\0" in text or not _matcher(pattern).evaluate({"text": text}):
             return f"{which} does not match the pattern {pattern}"
     return None
 
 
-@lru_cache(maxsize=1)
-def _matcher() -> Expression:
-    return Environment({"text": Kind.STRING, "pattern": Kind.STRING}).compile("text.matches(pattern)", result=Kind.BOOL)
+@lru_cache(maxsize=256)
+def _matcher(pattern: str) -> Expression:
+    literal = json.dumps(pattern, ensure_ascii=False)
+    return _ENVIRONMENT.compile(f"text.matches({literal})", result=Kind.BOOL)

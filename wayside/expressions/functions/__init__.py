@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from wayside.expressions.functions import angles, comparing, digits, motion, numbers, octets, places
+from wayside.expressions.functions import angles, bounded, comparing, digits, motion, numbers, octets, places
 from wayside.expressions.functions.declaring import Function
 
 FUNCTIONS: Final[Mapping[str, Function]] = MappingProxyType(
@@ -22,7 +22,11 @@ FUNCTIONS: Final[Mapping[str, Function]] = MappingProxyType(
 )
 """By name."""
 
-DECLARATIONS: Final = [digits.DECLARATION, *(function.declaration() for function in FUNCTIONS.values())]
+DECLARATIONS: Final = [
+    digits.DECLARATION,
+    bounded.DECLARATION,
+    *(function.declaration() for function in FUNCTIONS.values()),
+]
 """As CEL takes them."""
 
 TAKING_HANDLES: Final = frozenset(name for name, function in FUNCTIONS.items() if function.takes_handles)
