@@ -146,7 +146,7 @@ class Knowledge:
         """Whether the buffer takes in the arrivals without pushing anything out."""
         buffer = self.buffer
         room = buffer.maximum_bytes - buffer.bytes - SAMPLE_OVERHEAD * len(arrivals)
-        return room >= sum([len(arrival[3]) for arrival in arrivals])
+        return room >= sum([len(arrival.payload) for arrival in arrivals])
 
     def new_tables(self) -> None:
         """Begin with new tables: rules that are evaluated in columns have to be set again."""

@@ -83,7 +83,7 @@ def read_intake(path: Path) -> Iterator[Arrival | Control]:
                 yield Control(time, {"kind": "cut", "reason": str(error) or type(error).__name__})
                 return
             if item is not None:
-                time = item[0]
+                time = item.time
                 yield item
 
 

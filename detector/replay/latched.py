@@ -10,6 +10,8 @@ from collections.abc import Hashable, Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from detector.assembly import inlets
 from detector.engine.buffering.lanes import latched_topics
 from detector.engine.buffering.latched import Topic
@@ -65,7 +67,7 @@ def latched_first(
 
     for number, arrivals in enumerate(recorded):
         if not number and first:
-            yield [arrival._replace(received=arrivals[0].received) for arrival in first.values()]
+            yield [replace(arrival, received=arrivals[0].received) for arrival in first.values()]
         if rest := [each for each in arrivals if each.stream not in topics or not is_taken(each)]:
             yield rest
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
-from operator import itemgetter
+from operator import attrgetter
 
 from detector.engine.samples.sample import Arrival
 
@@ -17,7 +17,7 @@ _BYTES = 64 << 20
 _STEP = 4096
 """A part is cut to within as many arrivals."""
 
-_received = itemgetter(0)
+_received = attrgetter("received")
 
 
 def parts_of(batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
@@ -32,14 +32,14 @@ def parts_of(batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]
             yield part
             part, size = [], 0
         part += piece
-        size += sum([len(arrival[3]) for arrival in piece])
+        size += sum([len(arrival.payload) for arrival in piece])
         if len(part) >= _ARRIVALS or size >= _BYTES:
             # What has the last time waits: more of that time may follow.
             cut = bisect_left(part, part[-1].received, key=_received)
             if cut:
                 yield part[:cut]
                 part = part[cut:]
-                size = sum([len(arrival[3]) for arrival in part])
+                size = sum([len(arrival.payload) for arrival in part])
     if part:
         yield part
 

@@ -11,6 +11,7 @@ import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from rosbags.rosbag2 import Writer as BagWriter
 
 from detector.assembly import inlets, make_engine
@@ -193,7 +194,7 @@ def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
     for step in range(30):
         for index, node in enumerate(nodes):
             node.publish(cdr(pose_stamped((step + 3 * index) % 20)))
-    arrivals = [arrival._replace(received=at(1 + number / 10)) for number, arrival in enumerate(drained(receiver, 60))]
+    arrivals = [replace(arrival, received=at(1 + number / 10)) for number, arrival in enumerate(drained(receiver, 60))]
     detector, name = receiver.detector, receiver.detector.name
     live = make_engine(detector, inlets(detector), holder=name, start=arrivals[0].received - 1)
     events = live.set_rules(compiled(detector, MOVED)) + live.advance(arrivals, arrivals[-1].received)

@@ -114,7 +114,7 @@ class Lane:
     def expire(self, now: int) -> int:
         """Forget what is older than the duration, but never the newest; returns the bytes freed."""
         samples, horizon, freed = self.samples, now - self.duration, 0
-        while len(samples) > 1 and samples[0][0] <= horizon:  # its time, whatever its kind
+        while len(samples) > 1 and samples[0].received <= horizon:
             freed += len(samples.popleft().payload) + SAMPLE_OVERHEAD
         self.bytes -= freed
         return freed

@@ -7,7 +7,7 @@ costs no more memory than the bounds allow, and does not push out the clients th
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from operator import itemgetter
+from operator import attrgetter
 
 from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.buffering.clients import Clients
@@ -28,7 +28,7 @@ MAXIMUM_KEYS = 200_000
 MAXIMUM_LOST = 1_000
 """Of so many lost clients the newest samples are kept, for the case that they return; those lost first go first."""
 
-_STREAM = itemgetter(1)
+_STREAM = attrgetter("stream")
 
 _BY_CLIENT = "/"
 """Begins what lanes are remembered under that no key stands for: no key begins with a slash."""
@@ -72,14 +72,15 @@ class Inflow:
         if times is None:
             self._insert_in_order(arrivals)
             return
-        for time, (_, stream, key, payload) in zip(times, arrivals, strict=True):
+        for time, arrival in zip(times, arrivals, strict=True):
+            stream, key, payload = arrival.stream, arrival.key, arrival.payload
             lane = self._lane(stream, key, time, payload)
             if lane is None:
                 if stream == LIVELINESS:
                     self._token(key, payload, time)
             else:
                 self._number += 1
-                sample = Stamped(time, self._number, payload, time, key)
+                sample = Stamped(time, self._number, payload, key)
                 self._buffer.grew(lane.insert(sample))
                 if self.noting:
                     self.came.append(sample)
@@ -93,14 +94,14 @@ class Inflow:
         if self.noting:
             self.came += arrivals
         for arrival in arrivals:
-            time, stream, key, payload = arrival
+            time = arrival.received
             try:
-                lane = lanes[stream][key]
+                lane = lanes[arrival.stream][arrival.key]
             except KeyError:
-                found = self._lane(stream, key, time, payload)
+                found = self._lane(arrival.stream, arrival.key, time, arrival.payload)
                 if found is None:
-                    if stream == LIVELINESS:
-                        self._token(key, payload, time)
+                    if arrival.stream == LIVELINESS:
+                        self._token(arrival.key, arrival.payload, time)
                     note(None)
                     continue
                 lane = found
@@ -108,7 +109,7 @@ class Inflow:
             if time >= lane.latest and not lane.capped:
                 lane.latest = time
                 lane.samples.append(arrival)
-                size = len(payload) + SAMPLE_OVERHEAD
+                size = len(arrival.payload) + SAMPLE_OVERHEAD
                 lane.bytes += size
             else:
                 size = lane.insert(arrival)

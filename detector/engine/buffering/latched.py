@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 
+from msgspec.structs import replace
+
 from detector.engine.buffering.buffer import NEVER, Lane
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample, Stamped
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample
 
 Topic = Callable[[str, bytes], Hashable]
 """What a sample with that key and payload speaks of: a newer one about the same takes its place."""
@@ -107,6 +109,5 @@ class LatchedLane(Lane):
 def _not_after(sample: Sample, time: int) -> Sample:
     if sample.time <= time:
         return sample
-    if isinstance(sample, Stamped):
-        return sample._replace(time=time, received=time)
-    return sample._replace(received=time)
+    moved: Sample = replace(sample, received=time)
+    return moved

@@ -7,7 +7,7 @@ that is forgotten, leaves the tables as well.
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from operator import itemgetter
+from operator import attrgetter
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from wayside.api.stream import Stream
 from wayside.expressions.columns.values import Texts
 from wayside.rules import CompiledSignal
 
-_TIME = itemgetter(0)
+_TIME = attrgetter("received")
 
 _MAXIMUM_TEXTS = 1_000_000
 """Beyond so many different texts, tables are built anew: texts are never forgotten one by one."""

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import msgspec
+
 from wayside.expressions.columns.values import MISSING
 
 __all__ = ["MISSING"]
 
 SAMPLE_OVERHEAD = 160
-"""What a sample costs in memory beside its payload, in bytes: its tuple, its numbers and its place in a queue."""
+"""What a sample costs in memory beside its payload, in bytes: its object, its numbers and its places in queues."""
 
 
-class Arrival(NamedTuple):
+class Arrival(msgspec.Struct, frozen=True, gc=False, order=True):
     """One message as the intake queued it, before the engine has looked at it."""
 
     received: int
@@ -31,19 +33,22 @@ class Arrival(NamedTuple):
         return self.received
 
 
-class Stamped(NamedTuple):
+class Stamped(msgspec.Struct, frozen=True, gc=False, order=True):
     """One message in the buffer, with clock Data: its time is the sender's stamp."""
 
-    time: int
-    """Its place on the engine's time axis, in nanoseconds: the stamp."""
+    received: int
+    """The stamp, in nanoseconds: with clock Data there is no other time."""
     number: int
     """The order of arrival; tells apart samples of the same time."""
     payload: bytes
     """The message as it came, undecoded."""
-    received: int
-    """The stamp as well: with clock Data there is no other time."""
     key: str
     """The full key it came on."""
+
+    @property
+    def time(self) -> int:
+        """Its place on the engine's time axis; nanoseconds."""
+        return self.received
 
 
 Sample = Arrival | Stamped

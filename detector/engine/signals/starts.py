@@ -95,7 +95,7 @@ class Starts:
             if lane is None:
                 lane = self.buffer.add(Lane(client, stream, self._durations[stream]))
             self._number += 1
-            sample = Stamped(event.start_time, self._number, payload, event.start_time, event.key)
+            sample = Stamped(event.start_time, self._number, payload, event.key)
             self.buffer.grew(lane.insert(sample))
 
     def settle(self, now: int) -> None:

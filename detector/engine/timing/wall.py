@@ -7,13 +7,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from operator import itemgetter
 
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
 from detector.engine.timing.ticks import Ticks
-
-_RECEIVED = itemgetter(0)
 
 
 class WallTimeline:
@@ -81,7 +78,7 @@ def _first_after(arrivals: Sequence[Arrival], time: int, low: int) -> int:
     high = len(arrivals)
     while low < high:
         middle = (low + high) // 2
-        if _RECEIVED(arrivals[middle]) <= time:
+        if arrivals[middle].received <= time:
             low = middle + 1
         else:
             high = middle

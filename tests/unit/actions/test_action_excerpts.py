@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from detector.engine.consequences.consequences import REPLACED, Begun, Completed, Consequence, Over, Run, Sampled
 from detector.engine.engine import Engine
@@ -108,9 +109,9 @@ def test_each_sample_of_a_window_is_told_once_and_no_other(
         for tick, client, stream, value, late in drawn
     ]
     arrivals.sort(key=lambda each: each.received)
-    arrivals = [each._replace(received=each.received + index) for index, each in enumerate(arrivals)]
+    arrivals = [replace(each, received=each.received + index) for index, each in enumerate(arrivals)]
     if on_data:  # time goes on with the stamps
-        arrivals.append(message(11.0, "car2", "load", 0.0)._replace(received=at(12)))
+        arrivals.append(replace(message(11.0, "car2", "load", 0.0), received=at(12)))
     edges = sorted({0, *(cut for cut in cuts if cut < len(arrivals)), len(arrivals)})
     batches = [arrivals[first:last] for first, last in pairwise(edges) if last > first]
     engine = an_engine(DATA if on_data else WALL, RULE)

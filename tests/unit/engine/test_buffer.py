@@ -19,7 +19,7 @@ def a_lane(client: str = "car", stream: str = "s", duration: int = 10**9, maximu
 
 
 def a_sample(time: int, number: int = 0, payload: bytes = b"") -> Sample:
-    return Stamped(time, number, payload, time, "k")
+    return Stamped(time, number, payload, "k")
 
 
 def held(buffer: Buffer) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.buffering.latched import LatchedLane, by_key
@@ -34,7 +35,7 @@ def a_latched_lane(duration: int = 10) -> LatchedLane:
 
 
 def a_sample(time: int, key: str = "k", number: int = 0) -> Sample:
-    return Stamped(time, number, b"x", time, key)
+    return Stamped(time, number, b"x", key)
 
 
 @given(st.lists(st.tuples(st.integers(0, 50), st.sampled_from("abc"))), st.integers(0, 70))
@@ -81,7 +82,7 @@ def test_samples_that_are_equal_to_the_byte_and_of_one_time_are_so_many_samples(
     lane = LatchedLane("car", "map", 10, None, 2, topic=by_key)
     said = arrival(1, "car", {}, "map")
     for _ in range(3):
-        lane.insert(said._replace())
+        lane.insert(replace(said))
     assert (len(lane.samples), lane.evicted) == (2, 1)
     assert lane.expire(at(60)) == lane.bytes == len(said.payload) + SAMPLE_OVERHEAD
 
@@ -127,7 +128,7 @@ def test_a_replay_takes_first_what_is_latched_wherever_it_was_recorded(tmp_path:
 
 
 def _tile(seconds: float, tile: str, *, ice: bool) -> Any:
-    return arrival(seconds, "a", {"ice": ice}, "map")._replace(key=f"vehicles/a/map/{tile}")
+    return replace(arrival(seconds, "a", {"ice": ice}, "map"), key=f"vehicles/a/map/{tile}")
 
 
 def _line(seconds: float, place: str, value: object) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
@@ -138,7 +139,7 @@ def test_with_clock_data_the_order_of_arrival_makes_no_difference_within_the_lat
     arrivals = arrivals_of(drive)
     # Shifted by less than the lateness and then sorted, no sample comes after one that is 400 ms newer.
     shifted = [(each.received + data.draw(st.integers(0, 399)) * 10**6, each) for each in arrivals]
-    shuffled = [each._replace(received=START + n) for n, (_, each) in enumerate(sorted(shifted, key=lambda s: s[0]))]
+    shuffled = [replace(each, received=START + n) for n, (_, each) in enumerate(sorted(shifted, key=lambda s: s[0]))]
     end = Arrival(at(11), "pose", "vehicles/z/pose", json.dumps({"t": at(10.5) / SECOND}).encode())
     assert in_one_go(DATA, [*shuffled, end], 0) == in_one_go(DATA, [*arrivals, end], 0)
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
@@ -246,7 +247,7 @@ def stamped(step: int, value: float) -> Arrival:
 def test_an_intake_file_that_does_not_say_its_order_replays_as_it_was() -> None:
     arrivals = [stamped(step, value) for step, value in SENT]
     for number, each in enumerate(arrivals):
-        arrivals[number] = each._replace(received=each.received + number)
+        arrivals[number] = replace(each, received=each.received + number)
     assert recorded_before(detector_of(LATE), BRIEF, *arrivals) == []
     # With a lateness of zero, a tick ran with the first stamp of its time.
     tick = a_rule("tick", signals=[V], when="v > 10", evaluation={"every": "1s"})

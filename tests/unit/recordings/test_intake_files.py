@@ -155,7 +155,7 @@ while True:
     *arrivals, last = read_intake(path)
     assert isinstance(last, Control)
     assert last.kind == "cut"
-    assert [arrival[0] for arrival in arrivals] == list(range(len(arrivals)))
+    assert [arrival.received for arrival in arrivals] == list(range(len(arrivals)))
     due = [number for when, number in taken if when < killed - 1.5 - 5 * longest]
     assert len(arrivals) > due[-1]
 

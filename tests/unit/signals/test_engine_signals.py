@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from detector.engine.samples.sample import Arrival
 from tests.driving import SECOND, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled, told
@@ -19,7 +20,7 @@ def test_what_is_received_exactly_at_a_tick_counts_and_what_comes_a_nanosecond_l
     assert drive.take(arrival(1, "car", {}), until=1) == ["r car started 1"]
     late = Drive(a_detector(), rule)
     sample = arrival(1, "car", {})
-    assert late.note(late.engine.advance([sample._replace(received=sample.received + 1)], at(1.5))) == []
+    assert late.note(late.engine.advance([replace(sample, received=sample.received + 1)], at(1.5))) == []
     assert late.take(until=3) == ["r car started 2"]
     assert late.take(until=4) == ["r car Until 4"]  # (2, 4] begins behind what came a nanosecond after 1 s
 
