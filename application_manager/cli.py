@@ -146,6 +146,14 @@ def run(
         str,
         typer.Option(metavar="DURATION", help="After how long without progress the watchdog ends this manager."),
     ] = "5m",
+    watch_timeout: Annotated[
+        str,
+        typer.Option(
+            metavar="DURATION",
+            help="After how long without an event or a bookmark a watch is restarted; after twice that time this "
+            "manager ends.",
+        ),
+    ] = "90s",
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
     ] = None,
@@ -218,6 +226,7 @@ def run(
         resync=_seconds("--resync", resync),
         ttl_after_finished=_seconds("--ttl-after-finished", ttl_after_finished),
         stalled_after=_seconds("--stalled-after", stalled_after),
+        watch_timeout=_seconds("--watch-timeout", watch_timeout),
         metrics_port=metrics_port,
         zenoh=settings(zenoh) if zenoh else None,
         helm=Helm(helm),

@@ -34,6 +34,7 @@ class Options:
         admission: where the API server's questions about objects are answered; None: nowhere.
         lease: by which one of several managers is active.
         stalled_after: seconds after which the watchdog ends a manager whose work has stalled.
+        watch_timeout: seconds without an event or a bookmark after which a watch is restarted.
         detectors: what holds for the pods of detectors; None: no detector is run.
     """
 
@@ -50,4 +51,5 @@ class Options:
     admission: Serving | None = None
     lease: LeaseKey = field(default_factory=lambda: LeaseKey("default"))
     stalled_after: float = STALLED_AFTER
+    watch_timeout: float = 90.0
     detectors: PodDefaults | None = None

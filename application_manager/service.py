@@ -36,6 +36,7 @@ from application_manager.watching.detectorwatch import DetectorWatch
 from application_manager.watching.leasewatch import LeaseWatch
 from application_manager.watching.listing import Listing
 from application_manager.watching.operator import watch
+from application_manager.watching.pulse import Pulse
 from application_manager.work.acting import acting, ended
 from wayside.tracing import Tracing, tracing
 
@@ -103,6 +104,8 @@ class Manager:
             every=options.resync,
             measures=measures,
         )
+        self._pulse = Pulse(options.watch_timeout, lambda: work.world.healthy.elapsed)
+        measures.registry.register(self._pulse)
         self._detector_watch = DetectorWatch(work.world, client, work.book, options.namespaces, work.detectors.add)
         self._leases = LeaseWatch(work.world, client, own[0], options.namespaces, work.router.look_at)
         self._admission = Admission(
@@ -132,7 +135,11 @@ class Manager:
         }
         _on_signals(stop)
         limit = self._options.stalled_after
-        healthy = stalled(self._measures, self._options.resync, self._work.queues, limit)
+        stall = stalled(self._measures, self._options.resync, self._work.queues, limit)
+
+        def healthy() -> str | None:
+            return stall() or self._pulse.dead()
+
         ready = partial(self._lacks, watching)
         async with (
             watchdog(healthy, min(SILENT, limit)),
@@ -207,6 +214,7 @@ class Manager:
             connect=self._connection,
             namespaces=self._options.namespaces,
             ready=watching,
+            pulse=self._pulse,
         )
 
     async def _connection(self) -> kopf.ConnectionInfo:

@@ -15,6 +15,7 @@ import kopf
 
 from application_manager.cluster.client import LEASES, Object, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.watching.pulse import NEVER, Pulse, pulsing
 from wayside.leases import holder_of
 
 News = Callable[[Object], None]
@@ -41,11 +42,12 @@ async def watch(
     connect: Callable[[], Awaitable[kopf.ConnectionInfo]],
     namespaces: Collection[str],
     ready: asyncio.Event,
+    pulse: Pulse,
 ) -> None:
     """Hand on the news of our own kinds, of Leases, and of what bears an instance's label, until cancelled.
 
-    `namespaces` empty: all. `ready` is set once kopf has started. `connect` is asked for credentials at the start, and
-    again when the API server no longer takes them.
+    `namespaces` empty: all. `pulse` takes each watch's signs of life. `ready` is set once kopf has started. `connect`
+    is asked for credentials at the start, and again when the API server no longer takes them.
     """
     logging.getLogger("kopf").setLevel(logging.WARNING)
     registry = kopf.OperatorRegistry()
@@ -55,6 +57,7 @@ async def watch(
     settings.networking.error_backoffs = _Pauses()
     settings.networking.request_timeout = 15
     settings.networking.connect_timeout = 5
+    settings.watching.inactivity_timeout = NEVER  # see pulse
     settings.process.ultimate_exiting_timeout = None
     settings.queueing.exit_timeout = 0.1  # s; what is lost by stopping at once is seen again at the next start
 
@@ -80,12 +83,13 @@ async def watch(
         settings.watching.label_selectors[resource.group, resource.version, resource.plural] = INSTANCE_LABEL
 
     identity: Any = "application-manager"  # else kopf asks for the user's name, and a container's may have none
-    await kopf.operator(
-        registry=registry,
-        settings=settings,
-        identity=identity,
-        standalone=True,
-        clusterwide=not namespaces,
-        namespaces=namespaces,
-        ready_flag=ready,
-    )
+    with pulsing(pulse):
+        await kopf.operator(
+            registry=registry,
+            settings=settings,
+            identity=identity,
+            standalone=True,
+            clusterwide=not namespaces,
+            namespaces=namespaces,
+            ready_flag=ready,
+        )

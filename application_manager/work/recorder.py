@@ -11,6 +11,7 @@ import hashlib
 import logging
 import os
 import socket
+import time
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from wayside.times import format_seconds
 
 COMPONENT = "wayside.dev/application-manager"
 _WAITING = 1000  # Events that may wait; further ones are dropped and counted, since work goes before words
+_REPORT_EVERY = 60.0  # s between two lines in the log about Events that were dropped
 _NAME_LENGTH = 236  # characters of the object's name, for a pod's may have as many as the Event's
 _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
 
@@ -114,6 +116,31 @@ class _Said:
     once: bool = False
 
 
+@dataclass(slots=True)
+class _Drops:
+    """Events that were dropped and not reported yet; reported at once, and then once a minute."""
+
+    count: int = 0
+    why: str = ""
+    reported: float | None = None  # on the monotonic clock
+
+    def note(self, why: str) -> None:
+        """One was dropped."""
+        self.count += 1
+        self.why = why
+
+    def due_in(self, now: float) -> float | None:
+        """Seconds until a report is due; None where there is nothing to report."""
+        if not self.count:
+            return None
+        return 0 if self.reported is None else max(0.0, self.reported + _REPORT_EVERY - now)
+
+    def report(self, now: float) -> None:
+        """Log how many there were, and why the last one was dropped."""
+        log.warning("%d Events were dropped since the last report, the last one: %s", self.count, self.why)
+        self.count, self.reported = 0, now
+
+
 class Recorder:
     """Takes Events at once and posts them in the background."""
 
@@ -124,7 +151,7 @@ class Recorder:
         self._waiting: asyncio.Queue[_Said | None] = asyncio.Queue(_WAITING)
         self._ending = False
         self._instance = f"{socket.gethostname()}-{os.getpid()}"[:128]
-        self.dropped = 0
+        self._drops = _Drops()
 
     def say(self, regarding: Kind, reason: Reason, note: str, now: float, *, once: bool = False) -> None:
         """Post an Event about the object, unless there were too many of it.
@@ -143,7 +170,7 @@ class Recorder:
             self._waiting.put_nowait(_Said(regarding, reason, note, format_seconds(now), once))
         except asyncio.QueueFull:
             self._measures.unposted("full")
-            self.dropped += 1
+            self._drops.note("more than could be posted")
 
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
         """Post an Event for each condition that changed, if it is worth one: not yet being ready is none.
@@ -173,9 +200,13 @@ class Recorder:
 
     async def run(self) -> None:
         """Post until cancelled, or told to finish. An Event that cannot be posted is dropped."""
-        told = 0
         while not (self._ending and self._waiting.empty()):
-            said = await self._waiting.get()
+            try:
+                async with asyncio.timeout(self._drops.due_in(time.monotonic())):
+                    said = await self._waiting.get()
+            except TimeoutError:
+                self._drops.report(time.monotonic())
+                continue
             if said is None:
                 continue
             try:
@@ -186,13 +217,14 @@ class Recorder:
                     continue
                 self._measures.unposted("failed")
                 if not error.terminating:
-                    log.warning("the Event %s about %s is lost: %s", said.reason, said.regarding.name, error)
-            except Unreachable:
+                    self._drops.note(f"{said.reason} about {said.regarding.name}: {error}")
+            except Unreachable as error:
                 self._measures.unposted("failed")
-                self.dropped += 1
-            if self.dropped > told:
-                log.warning("%d Events were dropped so far: more than could be posted", self.dropped)
-                told = self.dropped
+                self._drops.note(str(error))
+            if self._drops.due_in(now := time.monotonic()) == 0:
+                self._drops.report(now)
+        if self._drops.count:
+            self._drops.report(time.monotonic())
 
     def _manifest(self, said: _Said) -> dict[str, Any]:
         regarding = said.regarding

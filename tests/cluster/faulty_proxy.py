@@ -56,6 +56,7 @@ class Proxy:
     most: int = 0
     under_way: int = 0
     slow: float = 0.0  # s by which every answer is late
+    hushed: frozenset[int] = frozenset()  # indexes in `seen` of watches whose connection stands and brings nothing
 
     def writes(self) -> list[Seen]:
         """The requests that change anything but a Lease; a question about rights changes nothing."""
@@ -97,12 +98,13 @@ async def _serve(proxy: Proxy, target: str, ready: threading.Event, over: asynci
 
         async def handle(request: web.Request) -> web.StreamResponse:
             seen = Seen(request.method, request.path_qs, time.monotonic())
+            index = len(proxy.seen)
             proxy.seen.append(seen)
             watches = "watch=true" in request.path_qs
             proxy.under_way += not watches
             proxy.most = max(proxy.most, proxy.under_way)
             try:
-                return await _answer(proxy, session, target, request, seen)
+                return await _answer(proxy, session, target, request, seen, index)
             finally:
                 proxy.under_way -= not watches
 
@@ -122,7 +124,7 @@ async def _serve(proxy: Proxy, target: str, ready: threading.Event, over: asynci
 
 
 async def _answer(
-    proxy: Proxy, session: aiohttp.ClientSession, target: str, request: web.Request, seen: Seen
+    proxy: Proxy, session: aiohttp.ClientSession, target: str, request: web.Request, seen: Seen, index: int
 ) -> web.StreamResponse:
     await _while_cut(proxy)
     refusal = proxy.refuse(request.method, request.path_qs)
@@ -149,7 +151,8 @@ async def _answer(
         await _while_cut(proxy)
         await response.prepare(request)
         async for chunk in _chunks(proxy, answer):
-            await response.write(chunk)
+            if index not in proxy.hushed:
+                await response.write(chunk)
         seen.status = answer.status
         await response.write_eof()
         return response

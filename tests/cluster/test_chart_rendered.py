@@ -319,3 +319,68 @@ def test_common_labels_are_on_every_object_and_every_pod(helm: Helm) -> None:
         "mobility"
     }
     assert rendered.one("Deployment")["spec"]["template"]["metadata"]["labels"]["team"] == "mobility"
+
+
+def test_a_cluster_that_gives_users_and_has_one_registry_gets_what_it_takes(helm: Helm) -> None:
+    nobody = dict.fromkeys(("runAsUser", "runAsGroup", "fsGroup"))
+    given: Values = {
+        "imageRegistry": "registry.example:5000/mirror/",
+        "podSecurityContext": {**nobody, "supplementalGroups": [7]},
+        "containerSecurityContext": {"runAsUser": 1234},
+        "router": {"enabled": True, "tls": {"enabled": False}, "accessControl": {"enabled": False}},
+    }
+    pods = list(helm.rendered(given).pods())
+    assert len(pods) >= 2
+    for pod in pods:
+        assert pod["securityContext"] == {
+            "runAsNonRoot": True,
+            "seccompProfile": {"type": "RuntimeDefault"},
+            "supplementalGroups": [7],
+        }
+        for container in pod["containers"]:
+            assert container["image"].startswith("registry.example:5000/mirror/")
+            assert container["securityContext"]["runAsUser"] == 1234
+            assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+    manager = helm.rendered(given).one("Deployment", "wayside-manager")["spec"]["template"]["spec"]["containers"][0]
+    assert f"--detector-image={manager['image']}" in manager["args"]
+
+
+def test_the_deployment_and_the_webhooks_are_as_the_values_say(helm: Helm) -> None:
+    given: Values = {
+        "manager": {
+            "annotations": {"reloader/auto": "true"},
+            "revisionHistoryLimit": 2,
+            "strategy": {"type": "Recreate"},
+            "probes": {"liveness": {"periodSeconds": 60}},
+        },
+        "webhook": {"failurePolicy": "Fail", "timeoutSeconds": 9, "injection": {"failurePolicy": "Fail"}},
+        "extraObjects": [
+            {
+                "apiVersion": "v1",
+                "kind": "ConfigMap",
+                "metadata": {"name": "more"},
+                "data": {"of": "{{ .Release.Name }}"},
+            }
+        ],
+    }
+    rendered = helm.rendered(given)
+    deployment = rendered.one("Deployment", "wayside-manager")
+    assert deployment["metadata"]["annotations"] == {"reloader/auto": "true"}
+    assert (deployment["spec"]["revisionHistoryLimit"], deployment["spec"]["strategy"]) == (2, {"type": "Recreate"})
+    (container,) = deployment["spec"]["template"]["spec"]["containers"]
+    assert container["livenessProbe"] == {
+        "httpGet": {"path": "/healthz", "port": "metrics"},
+        "periodSeconds": 60,
+        "timeoutSeconds": 5,
+        "failureThreshold": 3,
+    }
+    assert container["readinessProbe"]["httpGet"]["path"] == "/readyz"
+    (validating,) = rendered.one("ValidatingWebhookConfiguration")["webhooks"]
+    (mutating,) = rendered.one("MutatingWebhookConfiguration")["webhooks"]
+    assert [(each["failurePolicy"], each["timeoutSeconds"]) for each in (validating, mutating)] == [
+        ("Fail", 9),
+        ("Fail", 5),
+    ]
+    assert rendered.one("ConfigMap", "more")["data"] == {"of": "wayside"}
+    with pytest.raises(HelmError, match="failurePolicy"):
+        helm.rendered({"webhook": {"failurePolicy": "Sometimes"}})

@@ -42,27 +42,15 @@ app.kubernetes.io/part-of: wayside
 {{- end -}}
 {{- end -}}
 
+{{/* Of an image with repository, tag and digest, behind the registry that all images come from. */}}
 {{- define "wayside.image" -}}
-{{- if .digest -}}{{ .repository }}@{{ .digest }}{{- else -}}{{ .repository }}:{{ .tag }}{{- end -}}
+{{- $repository := .image.repository -}}
+{{- with .Values.imageRegistry -}}{{- $repository = printf "%s/%s" (trimSuffix "/" .) $repository -}}{{- end -}}
+{{- if .image.digest -}}{{ $repository }}@{{ .image.digest }}{{- else -}}{{ $repository }}:{{ .image.tag }}{{- end -}}
 {{- end -}}
 
 {{- define "wayside.ownImage" -}}
-{{- include "wayside.image" (dict "repository" .Values.image.repository "digest" .Values.image.digest "tag" (default .Chart.AppVersion .Values.image.tag)) -}}
-{{- end -}}
-
-{{/* The restricted Pod Security Standard, and a root that cannot be written. */}}
-{{- define "wayside.podSecurity" -}}
-runAsNonRoot: true
-runAsUser: 65532
-runAsGroup: 65532
-fsGroup: 65532
-seccompProfile: {type: RuntimeDefault}
-{{- end -}}
-
-{{- define "wayside.containerSecurity" -}}
-allowPrivilegeEscalation: false
-readOnlyRootFilesystem: true
-capabilities: {drop: [ALL]}
+{{- include "wayside.image" (dict "Values" .Values "image" (dict "repository" .Values.image.repository "digest" .Values.image.digest "tag" (default .Chart.AppVersion .Values.image.tag))) -}}
 {{- end -}}
 
 {{/* Who the program is: by these it owns its Lease, and takes it again after a restart of the container. */}}
@@ -76,9 +64,13 @@ capabilities: {drop: [ALL]}
 {{- end -}}
 
 {{- define "wayside.probes" -}}
-startupProbe: {httpGet: {path: /healthz, port: metrics}, periodSeconds: 2, failureThreshold: 60}
-readinessProbe: {httpGet: {path: /readyz, port: metrics}, periodSeconds: 5, timeoutSeconds: 3}
-livenessProbe: {httpGet: {path: /healthz, port: metrics}, periodSeconds: 20, timeoutSeconds: 5, failureThreshold: 3}
+{{- range $name, $path := dict "startup" "/healthz" "readiness" "/readyz" "liveness" "/healthz" }}
+{{ $name }}Probe:
+  httpGet: {path: {{ $path }}, port: metrics}
+  {{- with index $.Values.manager.probes $name }}
+  {{- toYaml . | nindent 2 }}
+  {{- end }}
+{{- end }}
 {{- end -}}
 
 {{- define "wayside.webhookSecret" -}}

@@ -20,6 +20,7 @@ from application_manager.measures import PREFIX, Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.pages import STALLED_AFTER, pages, stalled
 from application_manager.observability.tracing import LostSpans
+from application_manager.watching.pulse import Pulse
 from application_manager.work.recorder import Reason
 from application_manager.work.workqueue import WorkQueue
 from tests.guides import guide
@@ -148,6 +149,7 @@ def test_the_guide_describes_every_metric() -> None:
     measures = Measures()
     measures.registry.register(Overview(World(Policy()), list))
     measures.registry.register(LostSpans(cast("Tracing", SimpleNamespace(dropped=0, failed=0))))
+    measures.registry.register(Pulse(90, lambda: 0.0))
     names = {each.name + ("_total" if each.type == "counter" else "") for each in measures.registry.collect()}
     own = {each.removeprefix(PREFIX) for each in names if each.startswith(PREFIX)}
     assert len(own) > 12

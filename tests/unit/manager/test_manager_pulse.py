@@ -1,0 +1,77 @@
+"""kopf's watches give signs of life, and one that gives none is begun again: around kopf's own function."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from types import SimpleNamespace
+from typing import Any
+
+import kopf
+import pytest
+from kopf._cogs.clients import api, watching
+
+from application_manager.watching.pulse import NEVER, Pulse, pulsing
+
+TASKS = SimpleNamespace(plural="applicationtasks", get_url=lambda **_: "")
+
+
+def streaming(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Let kopf's API bring so many events, and then nothing any more."""
+
+    async def stream(**_: Any) -> AsyncIterator[Any]:
+        for version in range(count):
+            yield {"type": "ADDED", "object": {"metadata": {"resourceVersion": str(version)}}}
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(api, "stream", stream)
+    monkeypatch.setattr(kopf.OperatorSettings().watching.label_selectors.__class__, "collect", lambda *_: [])
+
+
+async def read(settings: kopf.OperatorSettings, pause: float) -> int:
+    """Read a watch until it ends, pausing after each event; how many came."""
+    count = 0
+    resource: Any = TASKS
+    stopper: Any = asyncio.get_running_loop().create_future()
+    async for _ in watching.watch_objs(
+        settings=settings, resource=resource, namespace="town", operator_pause_waiter=stopper
+    ):
+        count += 1
+        await asyncio.sleep(pause)
+    return count
+
+
+def test_kopfs_own_timeout_cancels_who_reads_and_ours_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def kopfs() -> int:
+        settings = kopf.OperatorSettings()
+        settings.watching.inactivity_timeout = 0.01
+        return await asyncio.create_task(read(settings, 0.1))
+
+    async def ours() -> tuple[int, Pulse]:
+        settings = kopf.OperatorSettings()
+        settings.watching.inactivity_timeout = NEVER
+        pulse = Pulse(0.05, lambda: 0.0)
+        with pulsing(pulse):
+            return await asyncio.create_task(read(settings, 0.1)), pulse
+
+    streaming(monkeypatch, 3)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(kopfs())
+    count, pulse = asyncio.run(ours())
+    assert count == 3
+    assert pulse.dead() is None
+    samples = {each.name: each.samples for each in pulse.collect()}
+    assert [each.labels for each in samples["wayside_manager_watch_age_seconds"]] == [{"resource": "applicationtasks"}]
+    assert [each.value for each in samples["wayside_manager_watch_restarts"]] == [1]
+
+
+def test_only_time_in_which_the_api_server_answers_counts_against_a_watch() -> None:
+    healthy = [0.0]
+    pulse = Pulse(90, lambda: healthy[0])
+    pulse.beat(("applicationtasks", "town"))
+    healthy[0] = 180
+    assert pulse.dead() is None
+    healthy[0] = 181
+    assert pulse.dead() == "the watch of applicationtasks has had neither events nor bookmarks for 181 s"
+    pulse.forget(("applicationtasks", "town"))
+    assert pulse.dead() is None

@@ -1,0 +1,71 @@
+"""Kubernetes Events that are dropped are reported at once, then once a minute, with a count."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Any, cast
+
+import pytest
+
+from application_manager.cluster.client import ApiError, Client
+from application_manager.work import recorder
+from application_manager.work.recorder import Reason, Recorder
+from tests.unit.manager_objects import NOW, task
+
+
+class Refusing:
+    """An API server that takes no Event."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    async def create(self, *_: Any) -> None:
+        self.asked += 1
+        raise ApiError(403, "events are forbidden")
+
+
+def say(events: Recorder, first: int, count: int) -> None:
+    for each in range(first, first + count):
+        about = task(f"t{each}")
+        about = about.model_copy(update={"metadata": about.metadata.model_copy(update={"uid": f"u{each}"})})
+        events.say(about, Reason.ACCEPTED, "counts", NOW)
+
+
+def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [each.getMessage() for each in caplog.records if "were dropped" in each.getMessage()]
+
+
+def test_thousands_that_do_not_fit_are_two_lines_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
+    server = Refusing()
+    events = Recorder(cast("Client", server))
+
+    async def flood() -> None:
+        say(events, 0, 3135)
+        events.finish()
+        await events.run()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(flood())
+    assert server.asked == 1000
+    first, last = lines(caplog)
+    assert first.startswith("2136 Events were dropped since the last report, the last one: Accepted about t0: ")
+    assert last.startswith("999 Events were dropped since the last report, the last one: Accepted about t999: ")
+
+
+def test_what_is_dropped_later_is_reported_when_its_time_has_come_though_no_further_event_comes(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "_REPORT_EVERY", 0.2)
+    events = Recorder(cast("Client", Refusing()))
+
+    async def trickle() -> None:
+        running = asyncio.create_task(events.run())
+        say(events, 0, 5)
+        while len(lines(caplog)) < 2:  # noqa: ASYNC110  a log has no event to wait for
+            await asyncio.sleep(0.01)
+        running.cancel()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(trickle())
+    assert [each.partition(" ")[0] for each in lines(caplog)] == ["1", "4"]
