@@ -14,6 +14,7 @@ from application_manager.cluster.leadership import LeaseKey
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Policy
 from application_manager.observability.pages import STALLED_AFTER
+from application_manager.workers.pool import CPU_TIME
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,7 @@ class Options:
         lease: by which one of several managers is active.
         stalled_after: seconds after which the watchdog ends a manager whose work has stalled.
         detectors: what holds for the pods of detectors; None: no detector is run.
+        cpu_time: seconds of CPU time that one evaluation of a template's or rule's expressions may take.
     """
 
     policy: Policy = field(default_factory=Policy)
@@ -51,3 +53,4 @@ class Options:
     lease: LeaseKey = field(default_factory=lambda: LeaseKey("default"))
     stalled_after: float = STALLED_AFTER
     detectors: PodDefaults | None = None
+    cpu_time: float = CPU_TIME
