@@ -163,7 +163,7 @@ def run(
             help="CPU time that one evaluation of a template's or rule's expressions may take, in processes of their "
             "own.",
         ),
-    ] = "2s",
+    ] = "3s",
     lease: Annotated[
         str | None,
         typer.Option(

@@ -21,7 +21,7 @@ from application_manager.workers.child import Child, EndedError, pickled
 from application_manager.workers.process import FAILED, Job
 
 PROCESSES = 2
-CPU_TIME = 2.0
+CPU_TIME = 3.0
 """Seconds of CPU time that a job may take, by default."""
 
 _ATTEMPTS = 2  # at a job whose process ended for another reason than its CPU time
