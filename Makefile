@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests that wait on other processes: three a core keep it busy.
 WAITING := $(BIN)/python -m pytest -n 6 --dist loadgroup
 
-.PHONY: help demo demo-cluster tutorial examples test unit process cluster e2e lint bench mutants soak requirements crds clean
+.PHONY: help demo demo-cluster tutorial examples test unit process cluster e2e lint bench load mutants soak requirements crds clean
 
 help: ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -78,6 +78,9 @@ bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its basel
 
 mutants: $(BIN)/.installed-dev ## small wrong changes, one by one: for each, a test must fail
 	@$(BIN)/python -m tests.mutants
+
+load: $(BIN)/.installed-dev ## attacks on the manager from one namespace, while a task of another is measured
+	@$(BIN)/python -m benchmarks.attacks.load
 
 soak: $(BIN)/.installed-dev ## an hour of traffic, faster than it happens: nothing grows, every loss is counted
 	@$(BIN)/python -m benchmarks.soak

@@ -16,6 +16,7 @@ from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
 from application_manager.cluster.store import Name
+from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey
 from application_manager.knowledge.detectorbook import DetectorBook
 from application_manager.knowledge.world import DETECTOR, INSTANCE, TASK, TEMPLATE, World
@@ -30,17 +31,22 @@ from application_manager.work.instances import InstanceWork
 from application_manager.work.instancestatus import InstanceStatusWork
 from application_manager.work.publishing import Publisher
 from application_manager.work.recorder import Recorder
+from application_manager.work.rendering import Renderings
 from application_manager.work.rulework import RuleKey, RuleWork
 from application_manager.work.sidecars import SidecarNews
 from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork
 from application_manager.work.templates import TemplateWork
 from application_manager.work.workqueue import Key, WorkQueue
+from application_manager.workers.claiming import Claiming
+from application_manager.workers.desk import Desk
+from application_manager.workers.pool import Pool
 from wayside.tracing import Tracing
 
 _JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
 _INSTANCE_WORKERS = 16
 _CONFIGURATION_WORKERS = 4
+_JUDGING_WORKERS = 4  # one a namespace: they mostly wait for worker processes
 _STATUS_WORKERS = 2  # few: what runs goes before what is said of it
 
 
@@ -55,6 +61,7 @@ class Assembly:
         publisher: publishes configurations.
         router: takes news.
         charts: renders charts.
+        pool: runs users' expressions.
         detectors: the queue of Detectors that are run.
         queues: all of them.
     """
@@ -83,8 +90,12 @@ class Assembly:
         self._tasks: WorkQueue[Name] = WorkQueue(
             "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measures
         )
-        self._templates: WorkQueue[Name] = WorkQueue("template", self._reconcile_template, 1, self._instances, measures)
-        self._rules: WorkQueue[RuleKey] = WorkQueue("rule", self._reconcile_rule, 1, self._instances, measures)
+        self._templates: WorkQueue[Name] = WorkQueue(
+            "template", self._reconcile_template, _JUDGING_WORKERS, self._instances, measures, share=1
+        )
+        self._rules: WorkQueue[RuleKey] = WorkQueue(
+            "rule", self._reconcile_rule, _JUDGING_WORKERS, self._instances, measures, share=1
+        )
         self.book = DetectorBook(options.detectors)
         detectors = DetectorWork(
             self.world,
@@ -104,6 +115,10 @@ class Assembly:
             measures=measures,
         )
         self.queues = (*queues, self._configurations)
+        self.pool = Pool(measures, options.cpu_time)
+        self._desk = Desk(self.pool)
+        self._claiming = Claiming(self._desk, self._claimed)
+        self.world.claims.claim_of = self._claiming
         self.router = Router(
             self.world,
             applier,
@@ -113,6 +128,7 @@ class Assembly:
             self._judge,
             self._configurations.add,
         )
+        self.world.claims.settled = self.router.settled
         self._status_work = InstanceStatusWork(
             world=self.world,
             client=client,
@@ -127,6 +143,9 @@ class Assembly:
         )
         cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
         self.charts = ChartDesk(options.helm, cache, self._instances.add_at)
+        self._renderings = Renderings(
+            self.world, self._desk, self.charts.outcome, lambda name, _: self._instances.add(name), self._templates.add
+        )
         self._instance_work = InstanceWork(
             world=self.world,
             client=client,
@@ -137,11 +156,11 @@ class Assembly:
             tasks=resources[TASK],
             again=self._instances.add_at,
             done=self._statuses.add,
-            absent=lambda name, decision: self._status_work.tell(name, decision, None),
+            absent=self._absent,
             not_made=self._status_work.tell_why_not_made,
             observe=self.router.observe,
             configured=self._configurations.add,
-            charts=self.charts.outcome,
+            objects=self._renderings.objects,
         )
         self._task_work = TaskWork(
             world=self.world,
@@ -161,6 +180,7 @@ class Assembly:
             recorder=self.recorder,
             templates=resources[TEMPLATE],
             observe=self.router.observe,
+            pool=self.pool,
         )
         self._rule_work = RuleWork(
             world=self.world,
@@ -168,8 +188,22 @@ class Assembly:
             recorder=self.recorder,
             resources=resources,
             observe=self.router.observe,
+            pool=self.pool,
             detectors=self.book,
         )
+
+    async def close(self) -> None:
+        """End what works in the background."""
+        await self._desk.close()
+        await self.pool.close()
+        await self.charts.close()
+
+    def _absent(self, name: Name, decision: Decision | None) -> None:
+        self._renderings.forget(name)
+        self._status_work.tell(name, decision, None)
+
+    def _claimed(self, name: Name) -> None:
+        self.router.claimed(name)
 
     def begin_anew(self, children: Iterable[Resource]) -> None:
         """Forget what we did: others may have acted since. `children` are the kinds of what templates create."""

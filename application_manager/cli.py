@@ -164,6 +164,14 @@ def run(
             "(repeatable), or as a Zenoh configuration file says (its name ends with .json5)."
         ),
     ] = None,
+    expression_cpu_time: Annotated[
+        str,
+        typer.Option(
+            metavar="DURATION",
+            help="CPU time that one evaluation of a template's or rule's expressions may take, in processes of their "
+            "own.",
+        ),
+    ] = "3s",
     lease: Annotated[
         str | None,
         typer.Option(
@@ -228,6 +236,7 @@ def run(
         stalled_after=_seconds("--stalled-after", stalled_after),
         watch_timeout=_seconds("--watch-timeout", watch_timeout),
         metrics_port=metrics_port,
+        cpu_time=_seconds("--expression-cpu-time", expression_cpu_time),
         zenoh=settings(zenoh) if zenoh else None,
         helm=Helm(helm),
         chart_cache=chart_cache or default_folder(),

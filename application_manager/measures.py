@@ -42,6 +42,8 @@ class Measures:
         self._reviews = self._counter(
             "reviews", "Questions of the API server about objects to be stored", "kind", "answer"
         )
+        self._jobs = self._histogram("job_seconds", "Time that a worker process took for a job", _WORK)
+        self._exceeded = self._counter("jobs_exceeded", "Jobs that were ended for what they take")
         self._resynced = Gauge(
             f"{PREFIX}resync_time_seconds", "When everything was last listed again, since 1970", registry=self.registry
         )
@@ -87,6 +89,14 @@ class Measures:
     def reviewed(self, kind: str, answer: str) -> None:
         """A question of the API server was `allowed`, `warned` of or `refused`; or `failed`, then of no kind."""
         self._reviews.labels(kind, answer).inc()
+
+    def job_done(self, seconds: float) -> None:
+        """A worker process did a job."""
+        self._jobs.observe(seconds)
+
+    def job_exceeded(self) -> None:
+        """A job was ended, and its worker process with it."""
+        self._exceeded.inc()
 
     def active(self, active: bool) -> None:
         """Whether this manager is the active one."""

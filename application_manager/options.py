@@ -14,6 +14,7 @@ from application_manager.cluster.leadership import LeaseKey
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Policy
 from application_manager.observability.pages import STALLED_AFTER
+from application_manager.workers.pool import CPU_TIME
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,7 @@ class Options:
         stalled_after: seconds after which the watchdog ends a manager whose work has stalled.
         watch_timeout: seconds without an event or a bookmark after which a watch is restarted.
         detectors: what holds for the pods of detectors; None: no detector is run.
+        cpu_time: seconds of CPU time that one evaluation of a template's or rule's expressions may take.
     """
 
     policy: Policy = field(default_factory=Policy)
@@ -53,3 +55,4 @@ class Options:
     stalled_after: float = STALLED_AFTER
     watch_timeout: float = 90.0
     detectors: PodDefaults | None = None
+    cpu_time: float = CPU_TIME

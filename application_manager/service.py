@@ -114,6 +114,7 @@ class Manager:
             resources=resources,
             observe=work.router.observe,
             measures=measures,
+            pool=work.pool,
             namespaces=options.namespaces,
         )
         self._injecting = Injecting(
@@ -146,10 +147,13 @@ class Manager:
             pages(self._options.metrics_port, self._measures, healthy, ready, lambda: self._leadership.role),
             webhook(self._options.admission, desks),
         ):
-            if await _until(stop, self._first()):
-                await self._watch_and_act(watching, stop)
-            else:
-                await self._leadership.release()
+            try:
+                if await _until(stop, self._first()):
+                    await self._watch_and_act(watching, stop)
+                else:
+                    await self._leadership.release()
+            finally:
+                await self._work.close()
 
     async def _first(self) -> None:
         """Learn whether we are active, then list everything, so that who is active decides on what it saw since."""
@@ -175,7 +179,6 @@ class Manager:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             await ended(*tasks)
-            await self._work.charts.close()
         for task in done:
             task.result()
         log.info("stopped")
@@ -197,6 +200,7 @@ class Manager:
             self._work.begin_anew(self._listing.children)
             await self._listing.first()
             self._work.publish_all()
+        self._work.world.claims.begin()
 
     async def _announce(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         await watching.wait()

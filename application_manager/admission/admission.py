@@ -10,30 +10,32 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar, TypeVarTuple, Unpack
+from typing import Any
 
 from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
 from application_manager.core.findings.findings import Findings
-from application_manager.core.findings.reviews import Request, Weight, answer, read
-from application_manager.core.findings.rulefindings import detector_findings, newly_wrong, rule_findings
-from application_manager.core.findings.templatefindings import template_findings
+from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
 from application_manager.core.objects.policy import KindKey
+from application_manager.knowledge.surroundings import surroundings
 from application_manager.knowledge.world import DETECTOR, EVENT_RULE, TEMPLATE, World
 from application_manager.measures import Measures
+from application_manager.workers.jobs import DetectorJob, RuleJob, Surroundings, TemplateJob
+from application_manager.workers.pool import ExceededError, Runs
+from application_manager.workers.process import Job
 from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
-from wayside.rules import depends, own_problems
+from wayside.rules import depends
+
+AT_ONCE = 8
+"""Questions about one namespace that are answered at the same time; those beyond get no answer."""
 
 LOOKING_UP = 3.0  # s for what is asked of the API server, which waits for us meanwhile
 LOOKING_AT_RULES = 1.0  # s for the rules of a Detector that changes
-_JUDGES = 2  # threads of their own, so that an object that takes long to judge holds up other questions alone
-
-Given = TypeVarTuple("Given")
-Found = TypeVar("Found")
+_RULES_AT_ONCE = 20  # of these in one job, so that the limit of CPU time is each some rules'
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +47,7 @@ class Admission:
     Attributes:
         resources: where EventRules and Detectors live.
         observe: takes an object that was read.
+        pool: where objects are judged.
         namespaces: those that the manager looks after; empty: all.
     """
 
@@ -53,8 +56,9 @@ class Admission:
     resources: Mapping[KindKey, Resource]
     observe: Callable[[Object], None]
     measures: Measures
+    pool: Runs
     namespaces: Collection[str] = ()
-    _judges: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(_JUDGES, "admission"))
+    _asked: Counter[str] = field(default_factory=Counter)
 
     async def review(self, asked: Any) -> Object:
         """The answer to an AdmissionReview. Raises ReviewError where it is none."""
@@ -62,7 +66,7 @@ class Admission:
         looked_after = not self.namespaces or request.namespace in self.namespaces
         findings = Findings()
         if request.weight is not Weight.NONE and looked_after:
-            findings = await self._findings(request)
+            findings = await self._in_turn(request)
         response = answer(request, findings)
         told = response["response"]
         verdict = "refused" if not told["allowed"] else "warned" if "warnings" in told else "allowed"
@@ -73,6 +77,18 @@ class Admission:
             log.info("%s %s/%s is refused: %s", request.kind, request.namespace, name, status["message"])
         return response
 
+    async def _in_turn(self, request: Request) -> Findings:
+        """The findings, unless the namespace has too many questions: the others' are answered all the same."""
+        if self._asked[request.namespace] >= AT_ONCE:
+            raise ReviewError(f"{AT_ONCE} questions of namespace {request.namespace} are being answered")
+        self._asked[request.namespace] += 1
+        try:
+            return await self._findings(request)
+        finally:
+            self._asked.subtract((request.namespace,))
+            if not self._asked[request.namespace]:
+                del self._asked[request.namespace]
+
     async def _findings(self, request: Request) -> Findings:
         try:
             model = parse_object(request.object)
@@ -80,7 +96,7 @@ class Admission:
             return Findings((str(error),))
         match model:
             case ApplicationTemplate():
-                return await self._beside(template_findings, model, self.world.policy)
+                return await self._run(request.namespace, TemplateJob(model, self.world.policy))
             case EventRule():
                 return await self._of_rule(model)
             case Detector():
@@ -91,9 +107,8 @@ class Admission:
         findings = await self._judged(rule)
         if not findings.all:
             return findings
-        own = await self._beside(own_problems, rule)
-        if own:
-            return findings
+        if (await self._run(rule.namespace, RuleJob(rule, Surroundings()))).problems:
+            return findings  # it has them by itself
         try:
             async with asyncio.timeout(LOOKING_UP):
                 await self._look_up(DETECTOR, rule.namespace)
@@ -107,14 +122,14 @@ class Admission:
         return await self._judged(rule)
 
     async def _judged(self, rule: EventRule) -> Findings:
-        detectors = self.world.models(DETECTOR, Detector, rule.namespace)
-        others = self.world.models(EVENT_RULE, EventRule, rule.namespace) if depends(rule) else []
-        invalid, remarks = self.world.invalid(DETECTOR, rule.namespace), tuple(self.world.deploy_remarks(rule))
-        return replace(await self._beside(rule_findings, rule, detectors, invalid, others), remarks=remarks)
+        return await self._run(rule.namespace, RuleJob(rule, surroundings(self.world, rule)))
 
-    async def _beside(self, judge: Callable[[Unpack[Given]], Found], *given: *Given) -> Found:
-        """Judge in a thread, few at a time: what runs goes before what may come."""
-        return await asyncio.get_running_loop().run_in_executor(self._judges, judge, *given)
+    async def _run(self, namespace: str, job: Job[Findings]) -> Findings:
+        """What a worker process finds; that it takes too much is a problem as well."""
+        try:
+            return await self.pool.run(namespace, job)
+        except ExceededError as error:
+            return Findings((f"spec: to judge it {error}",))
 
     async def _look_up(self, kind: KindKey, namespace: str) -> None:
         for raw in (await self.client.list(self.resources[kind], namespace))[0]:
@@ -122,12 +137,15 @@ class Admission:
 
     async def _of_detector(self, detector: Detector, old: Kind | None) -> Findings:
         """What is wrong with the detector; that rules of it no longer compile is a remark, since they may follow."""
-        findings = await self._beside(detector_findings, detector)
+        before = old if isinstance(old, Detector) else None
+        findings = await self._run(detector.namespace, DetectorJob(detector))
         remarks: list[str] = []
         until = time.monotonic() + LOOKING_AT_RULES
-        for rule in self.world.models(EVENT_RULE, EventRule, detector.namespace):
-            remarks += await self._beside(newly_wrong, rule, detector, old if isinstance(old, Detector) else None)
-            if time.monotonic() > until:
+        rules = self.world.models(EVENT_RULE, EventRule, detector.namespace)
+        for first in range(0, len(rules), _RULES_AT_ONCE):
+            some = rules[first : first + _RULES_AT_ONCE]
+            remarks += (await self._run(detector.namespace, DetectorJob(detector, before, some))).remarks
+            if time.monotonic() > until and first + _RULES_AT_ONCE < len(rules):
                 remarks.append("not all of its rules were looked at: their statuses will say whether they are in order")
                 break
         return replace(findings, remarks=tuple(remarks))

@@ -5,7 +5,7 @@ It saves asking every task again whenever one changes. What it holds follows fro
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from application_manager.cluster.store import Entry, Name
@@ -15,11 +15,27 @@ from application_manager.core.demand.demand import claim_or_verdict
 from application_manager.core.holders.leases import HolderKey
 from wayside.api import ApplicationTask, ApplicationTemplate
 
+Claims = Callable[[ApplicationTemplate | InvalidTemplate | None, ApplicationTask], Claim | Verdict | None]
+"""What a task claims of a template, or its verdict; None while that is being worked out."""
+
 
 class ClaimBook:
-    """Claims of all tasks, and the verdicts of those that claim nothing."""
+    """Claims of all tasks, and the verdicts of those that claim nothing.
 
-    def __init__(self) -> None:
+    A task whose claim is being worked out keeps the one that it had, if any. Those that were there before this process
+    began to act may well have instances: until their claims are known, their templates are unsettled, and what runs of
+    them stays as it is.
+
+    Attributes:
+        claim_of: what a task claims.
+        settled: called with a template that is unsettled no more.
+    """
+
+    def __init__(self, claim: Claims = claim_or_verdict) -> None:
+        self.claim_of = claim
+        self.settled: Callable[[Name], None] = lambda _: None
+        self._pending: dict[Name, set[Name]] = {}  # template → tasks
+        self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that were there at the beginning
         self._claims: dict[Name, Claim] = {}
         self._verdicts: dict[Name, Verdict] = {}
         self._by_instance: dict[Name, dict[Name, Claim]] = {}
@@ -27,31 +43,74 @@ class ClaimBook:
         self._templates: dict[Name, Name] = {}  # task → template
 
     def note(self, name: Name, entry: Entry, template: ApplicationTemplate | InvalidTemplate | None) -> set[Name]:
-        """Note a task as it is now; returns the instances that it claimed or claims."""
+        """Note a task as it is now; returns the instances that it claimed or claims, none while that is worked out."""
         before = self._claims.get(name)
-        touched = self.forget(name)
         task = entry.model
+        claimed: Claim | Verdict | None = None
+        if isinstance(task, ApplicationTask):
+            claimed = self.claim_of(template, task)
+            if claimed is None:
+                return self._wait(name, task, before)
+        touched = self._drop(name)
+        self._resolve(name, claimed)
         if not isinstance(task, ApplicationTask):
             problem = f"{entry.problem}: correct the task, or delete it and create another"
             self._verdicts[name] = Verdict(Standing.REFUSED, Refused.INVALID_TASK, problem)
             return touched
-        of = (name[0], task.spec.template)
-        self._templates[name] = of
-        self._by_template.setdefault(of, {})[name] = task
-        claimed = claim_or_verdict(template, task)
+        self._file(name, task)
         if isinstance(claimed, Verdict):
             served = before is not None and template_of_all(before.instance) is None
             if claimed.standing is Standing.FINISHED and before is not None and served:  # its status may not say so yet
                 claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched
+        assert claimed is not None  # noqa: S101  what is being worked out has returned above
         instance = (name[0], claimed.instance)
         self._claims[name] = claimed
         self._by_instance.setdefault(instance, {})[name] = claimed
         return touched | {instance}
 
+    def _wait(self, name: Name, task: ApplicationTask, before: Claim | None) -> set[Name]:
+        """Note that a task's claim is being worked out: until then, a task that had one keeps it."""
+        touched = set() if before is not None and before.task.metadata.uid == task.metadata.uid else self._drop(name)
+        self._file(name, task)
+        self._pending.setdefault((name[0], task.spec.template), set()).add(name)
+        return touched
+
+    def _file(self, name: Name, task: ApplicationTask) -> None:
+        of = (name[0], task.spec.template)
+        self._templates[name] = of
+        self._by_template.setdefault(of, {})[name] = task
+
+    def _resolve(self, name: Name, found: Claim | Verdict | None) -> None:
+        """Note that a task's claim is known; one that takes too much to work out is as unknown as before."""
+        still = isinstance(found, Verdict) and found.reason == Refused.EXPRESSION_LIMIT
+        for waiting in (self._pending,) if still else (self._pending, self._unsettled):
+            for template in [each for each, names in waiting.items() if name in names]:
+                waiting[template].discard(name)
+                if not waiting[template]:
+                    del waiting[template]
+                    if waiting is self._unsettled:
+                        self.settled(template)
+
+    def pending(self, template: Name) -> bool:
+        """Whether claims of the template's tasks are being worked out."""
+        return template in self._pending
+
+    def begin(self) -> None:
+        """Everything is listed: what is being worked out now was there before."""
+        self._unsettled = {template: set(names) for template, names in self._pending.items()}
+
+    def unsettled(self, template: Name) -> bool:
+        """Whether tasks that were there at the beginning may claim instances of the template that are not known yet."""
+        return template in self._unsettled
+
     def forget(self, name: Name) -> set[Name]:
         """Forget a task; returns the instances that it claimed."""
+        self._resolve(name, None)
+        return self._drop(name)
+
+    def _drop(self, name: Name) -> set[Name]:
         self._verdicts.pop(name, None)
         of = self._templates.pop(name, None)
         if of is not None:

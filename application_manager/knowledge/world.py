@@ -1,4 +1,4 @@
-"""What the manager knows, in one place: the store, the index of claims, the Leases, and the compiled templates."""
+"""What the manager knows, in one place: the store, the index of claims, the Leases, and what was found of templates."""
 
 from __future__ import annotations
 
@@ -17,17 +17,15 @@ from application_manager.core.demand.fallback import Fallback, fallback_of, over
 from application_manager.core.demand.lingering import written_deadline
 from application_manager.core.demand.places import Candidate, Limits
 from application_manager.core.demand.placing import candidate, limits, placed
-from application_manager.core.findings.demanding import deploy_remarks
 from application_manager.core.findings.findings import Findings
 from application_manager.core.holders.leases import HealthyTime, LeaseBook, LeaseView
 from application_manager.core.objects.policy import KindKey, Policy
-from application_manager.core.objects.rendering import Renderer, RenderError
 from application_manager.core.statuses.status import Service
 from application_manager.knowledge.claimbook import ClaimBook
 from application_manager.knowledge.placebook import PlaceBook
 from application_manager.knowledge.podbook import PodBook
 from application_manager.knowledge.turnbook import TurnBook
-from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, EventRule, Kind
+from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 
 Model = TypeVar("Model", bound=Kind)
 
@@ -77,6 +75,7 @@ class World:
         deadlines: by instance, its uid and the release time last decided; ahead of its status as well, since a status
             may be written long after what it says was decided.
         limit: how many instances a namespace may have; None: any number.
+        exceeded: by template, the instances whose rendering takes more than it may, and what is said of it.
     """
 
     policy: Policy
@@ -92,7 +91,7 @@ class World:
     turns: TurnBook = field(default_factory=TurnBook)
     places: PlaceBook = field(init=False)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
-    _renderers: dict[Name, tuple[tuple[str, int], Renderer | RenderError]] = field(default_factory=dict)
+    exceeded: dict[Name, dict[Name, str]] = field(default_factory=dict)
     _findings: dict[Name, tuple[tuple[str, int], Findings]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -253,24 +252,6 @@ class World:
         at = self.healthy.elapsed
         return {each: self.leases.view((namespace, each), at) for each in set(holders) if each is not None}
 
-    def renderer(self, template: ApplicationTemplate) -> Renderer:
-        """The template, compiled once for each generation. Raises RenderError where it cannot be."""
-        name = (template.namespace, template.name)
-        version = _version(template)
-        known = self._renderers.get(name)
-        if known is None or known[0] != version:
-            known = (version, self._compiled(template))
-            self._renderers[name] = known
-        if isinstance(known[1], RenderError):
-            raise known[1]
-        return known[1]
-
-    def _compiled(self, template: ApplicationTemplate) -> Renderer | RenderError:
-        try:
-            return Renderer(template, self.policy)
-        except RenderError as error:
-            return error
-
     def known_findings(self, template: ApplicationTemplate) -> Findings | None:
         """What was noted of this generation of the template; None where nothing was yet."""
         known = self._findings.get((template.namespace, template.name))
@@ -287,17 +268,10 @@ class World:
         self.deadlines.clear()
         self.places.forget()
 
-    def deploy_remarks(self, rule: EventRule) -> list[str]:
-        """What the rule's tasks would be refused for by the templates that there are."""
-        if all(each.deploy is None for each in rule.spec.actions):
-            return []
-        templates = self.models(TEMPLATE, ApplicationTemplate, rule.namespace)
-        return deploy_remarks(rule, templates, self.invalid(TEMPLATE, rule.namespace))
-
     def forget_template(self, name: Name) -> None:
-        """Drop the compiled template, and what was found of it."""
-        self._renderers.pop(name, None)
+        """Drop what was found of a template."""
         self._findings.pop(name, None)
+        self.exceeded.pop(name, None)
 
 
 def _version(template: ApplicationTemplate) -> tuple[str, int]:

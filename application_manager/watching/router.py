@@ -125,6 +125,20 @@ class Router:
             self._ask_all(touched)
         self.task(name)
 
+    def claimed(self, name: Name) -> None:
+        """Take the news that it is known what a task claims."""
+        entry = self.world.store.get(TASK, name)
+        if entry is None:
+            return
+        of = (name[0], entry.raw["spec"].get("template", ""))
+        self._ask_all(self.world.claims.note(name, entry, self.world.template(of)))
+        self.task(name)
+
+    def settled(self, template: Name) -> None:
+        """Take the news that it is known what all tasks of a template claim."""
+        for name in self.world.instances_of(template):
+            self.instance(name)
+
     def _template(self, name: Name, old: Entry | None, entry: Entry) -> None:
         self.template(name)
         self.world.note_limits(name)

@@ -22,7 +22,6 @@ from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.health.refusals import reason_of, with_remedy
-from application_manager.core.objects.charts import Charts, no_charts
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.rendering import Rendering, object_key
 from application_manager.knowledge.world import Record, World
@@ -47,7 +46,8 @@ class InstanceWork:
         absent: told what was decided of an instance that neither exists nor should.
         observe: takes an object that was read.
         configured: told when an instance's configuration was applied.
-        charts: renders charts, and asks for an instance again once its chart is rendered.
+        objects: the objects of an instance, or why it has none; None: they are being worked out, and the instance is
+            asked again once they are.
         attempts: knows what was refused, and when it is tried again.
         not_made: told why an instance cannot be made that should be.
     """
@@ -64,7 +64,7 @@ class InstanceWork:
     absent: Callable[[Name, Decision | None], None]
     observe: Callable[[Object], None]
     configured: Callable[[Name], None]
-    charts: Charts = no_charts
+    objects: Callable[[ApplicationInstance, drafting.TemplateState], Rendering | Aspect | None]
     attempts: Attempts = field(default_factory=Attempts)
     not_made: Callable[[Name, Decision, str], None] = lambda *_: None
 
@@ -82,6 +82,8 @@ class InstanceWork:
             raise
 
     async def _reconcile(self, name: Name) -> None:
+        if self._is_unsettled(name):
+            return  # what runs stays: who demands it is being worked out, and that brings us back
         await self._know_whether_it_was_made(name)
         if await self._released(name):
             return
@@ -109,7 +111,9 @@ class InstanceWork:
             return
         wanted = drafting.draft(name, decision, existing)
         template = self.world.template((name[0], wanted.spec.template))
-        rendering = drafting.objects(wanted, template, self.world.renderer, self.charts)
+        rendering = self.objects(wanted, template)
+        if rendering is None:
+            return
         manifest = drafting.manifest(wanted, existing, template)
         looked: dict[ObjectKey, Object | None] = {}
         if manifest is not None:
@@ -244,11 +248,18 @@ class InstanceWork:
         over = self._over(name)
         if over is None:
             return False
+        if self.world.claims.pending((name[0], instance.spec.template)):
+            self.again(name, time.time() + _LOOK_AGAIN)  # one of the tasks that were listed may demand it
+            return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)
         why = over.yields or "no demand came within its linger"
         self.recorder.say(instance, Reason.PREEMPTED if over.yields else Reason.RELEASED, why, time.time())
         log.info("instance %s/%s: released: %s", *name, why)
         return True
+
+    def _is_unsettled(self, name: Name) -> bool:
+        instance = self.world.instance(name)
+        return instance is not None and self.world.claims.unsettled((name[0], instance.spec.template))
 
     def _over(self, name: Name) -> Decision | None:
         """The decision, where it is that the instance goes now: its linger is over, or another has its place."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,22 +9,18 @@ from dataclasses import dataclass, field
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Entry, Name
 from application_manager.core.objects.policy import KindKey
-from application_manager.core.statuses.rulestatus import (
-    DETECTOR_INVALID,
-    RULE_INVALID,
-    detector_status,
-    rule_status,
-    unreadable_status,
-)
+from application_manager.core.statuses.rulestatus import DETECTOR_INVALID, RULE_INVALID, unreadable_status
 from application_manager.core.statuses.status import difference
 from application_manager.knowledge.detectorbook import DetectorBook
-from application_manager.knowledge.world import DETECTOR, EVENT_RULE, World
+from application_manager.knowledge.surroundings import surroundings
+from application_manager.knowledge.world import EVENT_RULE, World
 from application_manager.work.recorder import Recorder
+from application_manager.workers.jobs import DetectorStatusJob, RuleJob, RuleStatusJob
+from application_manager.workers.pool import ExceededError, Runs
 from wayside.api import Detector, EventRule
 from wayside.api.base import Kind, Metadata
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
-from wayside.rules import depends
 
 RuleKey = tuple[KindKey, Name]
 """An EventRule or a Detector."""
@@ -40,6 +35,7 @@ class RuleWork:
     Attributes:
         resources: where EventRules and Detectors live.
         observe: takes an object that was read.
+        pool: where they are judged.
         detectors: what is known of those that the manager runs.
     """
 
@@ -48,6 +44,7 @@ class RuleWork:
     recorder: Recorder
     resources: dict[KindKey, Resource]
     observe: Callable[[Object], None]
+    pool: Runs
     detectors: DetectorBook = field(default_factory=DetectorBook)
 
     async def reconcile(self, key: RuleKey) -> None:
@@ -85,13 +82,17 @@ class RuleWork:
             old, judged = EventRuleStatus.model_validate(written), entry.model
             if not isinstance(judged, EventRule):
                 return old, unreadable_status(old, RULE_INVALID, entry.problem, generation, now)
-            detectors = self.world.models(DETECTOR, Detector, namespace)
-            others = self.world.models(EVENT_RULE, EventRule, namespace) if depends(judged) else []
-            invalid, remarks = self.world.invalid(DETECTOR, namespace), self.world.deploy_remarks(judged)
-            # Beside the event loop: with many detectors it may take seconds.
-            return old, await asyncio.to_thread(rule_status, judged, detectors, now, invalid, others, remarks)
+            job = RuleStatusJob(RuleJob(judged, surroundings(self.world, judged)), now)
+            try:
+                return old, await self.pool.run(namespace, job)
+            except ExceededError as error:
+                return old, unreadable_status(old, RULE_INVALID, f"spec: to judge the rule {error}", generation, now)
         old, judged = DetectorStatus.model_validate(written), entry.model
         if not isinstance(judged, Detector):
             return old, unreadable_status(old, DETECTOR_INVALID, entry.problem, generation, now)
-        running = self.detectors.said.get(name)
-        return old, detector_status(judged, self.world.models(EVENT_RULE, EventRule, namespace), now, running)
+        rules, running = self.world.models(EVENT_RULE, EventRule, namespace), self.detectors.said.get(name)
+        try:
+            return old, await self.pool.run(namespace, DetectorStatusJob(judged, rules, now, running))
+        except ExceededError as error:
+            problem = f"spec: to judge the detector {error}"
+            return old, unreadable_status(old, DETECTOR_INVALID, problem, generation, now)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
-from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.statuses.status import difference, template_status
 from application_manager.knowledge.world import TEMPLATE, World
 from application_manager.work.recorder import Recorder
+from application_manager.workers.jobs import TemplateJob
+from application_manager.workers.pool import ExceededError, Runs
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
 from wayside.api.base import Kind, Metadata
 
@@ -26,6 +26,7 @@ class TemplateWork:
     Attributes:
         templates: where ApplicationTemplates live.
         observe: takes an object that was read.
+        pool: where templates are judged.
     """
 
     world: World
@@ -33,6 +34,7 @@ class TemplateWork:
     recorder: Recorder
     templates: Resource
     observe: Callable[[Object], None]
+    pool: Runs
 
     async def reconcile(self, name: Name) -> None:
         """Write the template's status if it is news.
@@ -66,7 +68,14 @@ class TemplateWork:
         if template is None:
             return Findings()
         found = self.world.known_findings(template)
-        if found is None:  # beside the event loop: a template may take a second
-            found = await asyncio.to_thread(template_findings, template, self.world.policy)
+        if found is None:
+            try:
+                found = await self.pool.run(name[0], TemplateJob(template, self.world.policy))
+            except ExceededError as error:
+                found = Findings((f"spec: to render the template {error}",))
             self.world.note_findings(template, found)
+        exceeded = self.world.exceeded.get(name)
+        if exceeded:
+            instance, why = min(exceeded.items())
+            return replace(found, problems=(*found.problems, f"spec: to render instance {instance[1]} {why}"))
         return found

@@ -1,5 +1,7 @@
 """Keys to reconcile: each at most once at a time, several at once, again after a failure.
 
+Namespaces take turns, and none may have all workers where a `share` is given: a flood of keys in one delays no other.
+
 A key that is asked for while it waits is not added again; asked for while it runs, it runs once more afterwards. So
 there are never more entries than objects, and the queue needs no other bound. A failure is tried again after a growing,
 jittered pause, or after what the API server asks for.
@@ -11,7 +13,7 @@ import asyncio
 import logging
 import random
 import time
-from collections import deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Hashable
 from typing import Any, Generic, TypeVar
 
@@ -41,13 +43,26 @@ class WorkQueue(Generic[Key]):
         concurrency: int,
         after: WorkQueue[Any] | None = None,
         measures: Measures | None = None,
+        share: int | None = None,
     ) -> None:
+        """Make it.
+
+        Args:
+            name: for logs and metrics.
+            work: reconciles a key.
+            concurrency: how many keys are worked on at a time.
+            after: the queue that goes first.
+            measures: told of each reconciliation.
+            share: how many keys of one namespace are worked on at a time; None: any number.
+        """
         self.name = name
         self._measures = measures or Measures()
         self._after = after
         self._work = work
         self._concurrency = concurrency
-        self._waiting: deque[Key] = deque()
+        self._share = share
+        self._waiting: OrderedDict[str, deque[Key]] = OrderedDict()  # by namespace; the first has the next turn
+        self._at_work: Counter[str] = Counter()  # keys by namespace
         self._queued: set[Key] = set()
         self._running: dict[Key, float] = {}  # and since when, on the monotonic clock
         self._again: set[Key] = set()
@@ -59,7 +74,7 @@ class WorkQueue(Generic[Key]):
     @property
     def depth(self) -> tuple[int, int]:
         """How many keys wait for a worker, and how many for their time."""
-        return len(self._waiting), len(self._timers)
+        return len(self._queued), len(self._timers)
 
     @property
     def busy(self) -> bool:
@@ -80,7 +95,7 @@ class WorkQueue(Generic[Key]):
             self._again.add(key)
         elif key not in self._queued:
             self._queued.add(key)
-            self._waiting.append(key)
+            self._waiting.setdefault(_namespace(key), deque()).append(key)
             self._wake.set()
 
     def add_at(self, key: Key, when: float) -> None:
@@ -119,22 +134,42 @@ class WorkQueue(Generic[Key]):
     async def _worker(self) -> None:
         while not self._ending:
             await self._let_others_go_first()
-            while not self._waiting and not self._ending:
+            while (key := self._next()) is None and not self._ending:
                 self._wake.clear()
                 await self._wake.wait()
-            if self._ending:
+            if self._ending or key is None:
                 return
-            key = self._waiting.popleft()
             self._queued.discard(key)
             self._running[key] = time.monotonic()
+            namespace = _namespace(key)
+            self._at_work[namespace] += 1
             try:
                 await self._once(key)
             finally:
                 del self._running[key]
+                self._at_work[namespace] -= 1
+                if not self._at_work[namespace]:
+                    del self._at_work[namespace]
+                if self._share is not None:
+                    self._wake.set()  # another worker may have let this namespace wait
             if key in self._again:
                 self._again.discard(key)
                 self.add(key)
             _heed_cancellation()
+
+    def _next(self) -> Key | None:
+        """The key whose turn it is, out of those that wait; None where there is none, or none that may begin."""
+        if self._ending:
+            return None
+        for namespace, keys in self._waiting.items():
+            if self._share is None or self._at_work[namespace] < self._share:
+                key = keys.popleft()
+                if keys:
+                    self._waiting.move_to_end(namespace)
+                else:
+                    del self._waiting[namespace]
+                return key
+        return None
 
     async def _let_others_go_first(self) -> None:
         for _ in range(_TURNS):
@@ -171,6 +206,14 @@ def _heed_cancellation() -> None:
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
+
+
+def _namespace(key: object) -> str:
+    """The namespace of a name, or of a kind with a name; a key of another form has none."""
+    match key:
+        case (str(namespace), str()) | (_, (str(namespace), str())):
+            return namespace
+    return ""
 
 
 def _text(key: object) -> str:

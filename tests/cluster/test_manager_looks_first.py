@@ -24,6 +24,7 @@ from application_manager.work.recorder import Recorder
 from application_manager.work.suspending import Suspending
 from tests.cluster.api import Api
 from tests.cluster.managed_world import deployment, task, template
+from tests.inprocess import objects
 from wayside.api import API_VERSION
 
 INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
@@ -54,6 +55,7 @@ def work_on(world: World, client: Client) -> tuple[Router, InstanceWork]:
         absent=absent,
         observe=router.observe,
         configured=ignore,
+        objects=objects,
     )
     return router, work
 

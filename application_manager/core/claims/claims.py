@@ -40,6 +40,7 @@ class Refused(StrEnum):
     OUTBID = "Outbid"
     INSTANCE_NOT_MANAGED = "InstanceNotManaged"
     INVALID_TASK = "InvalidTask"
+    EXPRESSION_LIMIT = "ExpressionLimit"
 
 
 @dataclass(frozen=True, slots=True)

@@ -145,11 +145,22 @@ def has_baseline(template: ApplicationTemplate | InvalidTemplate | None) -> bool
 
 def claim_or_verdict(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Verdict:
     """What the task claims, or its verdict where it claims nothing, because it has ended or is refused."""
+    over = finished(task)
+    if over is not None:
+        return over
+    claimed = claim(template, task)
+    return refused(claimed) if isinstance(claimed, Refusal) else claimed
+
+
+def finished(task: ApplicationTask) -> Verdict | None:
+    """The verdict of a task that has ended; None where it has not."""
     if task.spec.end_time is not None:
         return Verdict(Standing.FINISHED, "Ended", f"the demand ended at {task.spec.end_time}")
     if task.metadata.deletion_timestamp is not None:
         return Verdict(Standing.FINISHED, "Deleted", "the task is being deleted")
-    claimed = claim(template, task)
-    if isinstance(claimed, Refusal):
-        return Verdict(Standing.REFUSED, claimed.reason, claimed.message)
-    return claimed
+    return None
+
+
+def refused(refusal: Refusal) -> Verdict:
+    """The verdict of a task that is refused."""
+    return Verdict(Standing.REFUSED, refusal.reason, refusal.message)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.lingering import LINGER_ANNOTATION, linger_of
-from application_manager.core.objects.charts import Charts, no_charts
-from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
+from application_manager.core.objects.charts import ChartRequest
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationinstance import ApplicationInstanceSpec
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
@@ -19,9 +17,6 @@ Name = tuple[str, str]
 """Namespace and name."""
 
 TemplateState = ApplicationTemplate | InvalidTemplate | None
-
-RendererOf = Callable[[ApplicationTemplate], Renderer]
-"""Compiles a template, or raises RenderError."""
 
 
 def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) -> ApplicationInstance:
@@ -77,10 +72,12 @@ CHART_PENDING = "ChartPending"
 """The reason of the condition Applied while a chart is being rendered."""
 
 
-def objects(
-    wanted: ApplicationInstance, template: TemplateState, renderer: RendererOf, charts: Charts = no_charts
-) -> Rendering | Aspect:
-    """The instance's objects, or why it has none, as the condition Applied says it."""
+EXPRESSION_LIMIT = "ExpressionLimit"
+"""The reason of the condition Applied where the expressions of the template take more than they may."""
+
+
+def lacking(wanted: ApplicationInstance, template: TemplateState) -> Aspect | None:
+    """Why the instance has no objects, where that is for want of a template, as the condition Applied says it."""
     of = wanted.spec.template
     if template is None:
         message = (
@@ -90,9 +87,14 @@ def objects(
         return Aspect("Applied", False, "TemplateNotFound", message)
     if isinstance(template, InvalidTemplate):
         return Aspect("Applied", False, "TemplateInvalid", f"ApplicationTemplate {of}: {template.problem}")
-    try:
-        return renderer(template).render(wanted, charts)
-    except ChartPending as pending:
-        return Aspect("Applied", False, CHART_PENDING, f"ApplicationTemplate {of}: {pending}")
-    except RenderError as error:
-        return Aspect("Applied", False, error.reason, f"ApplicationTemplate {of}: {error}")
+    return None
+
+
+def problem(template: ApplicationTemplate, reason: str, message: str) -> Aspect:
+    """Why the instance cannot be rendered, as the condition Applied gives it."""
+    return Aspect("Applied", False, reason, f"ApplicationTemplate {template.name}: {message}")
+
+
+def chart_pending(template: ApplicationTemplate, request: ChartRequest) -> Aspect:
+    """That the instance's chart is being rendered, as the condition Applied gives it."""
+    return problem(template, CHART_PENDING, f"chart {request.source} is being rendered")

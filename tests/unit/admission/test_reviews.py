@@ -18,6 +18,7 @@ from application_manager.core.findings.webhooks import Place, webhook_configurat
 from application_manager.core.objects.policy import Policy
 from application_manager.knowledge.world import DETECTOR, EVENT_RULE, TEMPLATE, World
 from application_manager.measures import Measures
+from tests.inprocess import InProcess
 from tests.unit.manager_objects import template
 from tests.unit.templates.test_findings import counting, deploying, detector, rule
 from wayside.api import API_VERSION, Kind
@@ -176,7 +177,7 @@ def reviewed(
             kind: Resource(API_VERSION, kind[1], f"{kind[1].lower()}s") for kind in (DETECTOR, EVENT_RULE, TEMPLATE)
         }
         client = Cluster(*live)
-        admission = Admission(world, client, resources, world.store.put, Measures(), namespaces)
+        admission = Admission(world, client, resources, world.store.put, Measures(), InProcess(), namespaces)
         asked = question("CREATE" if old is None else "UPDATE", new.to_json(), old and old.to_json(), new.kind)
         try:
             return await admission.review(asked)

@@ -13,6 +13,7 @@ from application_manager.knowledge.world import World
 from application_manager.work.instances import InstanceWork
 from application_manager.work.recorder import Recorder
 from application_manager.work.suspending import Suspending
+from tests.inprocess import objects
 from wayside.api import ApplicationTask, Kind
 from wayside.api.base import API_VERSION
 
@@ -87,6 +88,7 @@ def work_on(world: World, server: object, absent: list[Name]) -> InstanceWork:
         absent=lambda name, decision: absent.append(name),
         observe=world.store.put,
         configured=lambda name: None,
+        objects=objects,
     )
 
 

@@ -189,3 +189,58 @@ async def test_a_worker_whose_cancellation_is_lost_to_an_error_ends_all_the_same
     await asyncio.wait({running}, timeout=60)
     assert running.cancelled()
     assert times == 1
+
+
+def test_namespaces_take_turns() -> None:
+    done: list[tuple[str, str]] = []
+
+    async def scenario() -> None:
+        finished = asyncio.Event()
+
+        async def work(key: tuple[str, str]) -> None:
+            done.append(key)
+            if len(done) == 6:
+                finished.set()
+
+        queue = WorkQueue("q", work, 1)
+        for key in [("a", "1"), ("a", "2"), ("a", "3"), ("a", "4"), ("b", "1"), ("c", "1")]:
+            queue.add(key)
+        async with running(queue):
+            await finished.wait()
+
+    asyncio.run(scenario())
+    assert done == [("a", "1"), ("b", "1"), ("c", "1"), ("a", "2"), ("a", "3"), ("a", "4")]
+
+
+def test_no_namespace_has_more_workers_than_its_share() -> None:
+    done: list[tuple[str, str]] = []
+
+    async def scenario() -> None:
+        free, served = asyncio.Event(), asyncio.Event()
+        at_work = 0
+
+        async def work(key: tuple[str, str]) -> None:
+            nonlocal at_work
+            if key[0] == "b":
+                served.set()
+                return
+            at_work += 1
+            assert at_work == 1
+            await free.wait()
+            at_work -= 1
+            done.append(key)
+            if len(done) == 3:
+                served.set()
+
+        queue = WorkQueue("q", work, 4, share=1)
+        for name in "123":
+            queue.add(("a", name))
+        queue.add(("b", "1"))
+        async with running(queue):
+            await served.wait()
+            served.clear()
+            free.set()
+            await served.wait()
+
+    asyncio.run(scenario())
+    assert done == [("a", "1"), ("a", "2"), ("a", "3")]

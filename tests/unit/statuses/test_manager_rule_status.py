@@ -14,6 +14,7 @@ from application_manager.core.statuses.rulestatus import detector_status, rule_s
 from application_manager.knowledge.world import World
 from application_manager.work.recorder import Recorder
 from application_manager.work.rulework import RuleWork
+from tests.inprocess import InProcess
 from tests.unit.manager_objects import NOW
 from wayside.api import API_VERSION, Detector, EventRule
 
@@ -138,7 +139,7 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
     async def reconcile_twice() -> None:
         client = Accepting(Configuration())
         resources = {(API_VERSION, kind): Resource(API_VERSION, kind, f"{kind.lower()}s")}
-        work = RuleWork(world, client, Recorder(client), resources, observe)
+        work = RuleWork(world, client, Recorder(client), resources, observe, InProcess())
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await client.close()

@@ -1,0 +1,29 @@
+"""What a rule is judged with: what the world has beside it in its namespace."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from application_manager.knowledge.world import DETECTOR, EVENT_RULE, TEMPLATE, World
+from application_manager.workers.jobs import Surroundings
+from wayside.api import ApplicationTemplate, Detector, EventRule
+from wayside.rules import depends
+
+
+def surroundings(world: World, rule: EventRule) -> Surroundings:
+    """As far as they matter to the rule: other rules where it names any, templates where it deploys."""
+    namespace = rule.namespace
+    deploys = any(each.deploy is not None for each in rule.spec.actions)
+    return Surroundings(
+        detectors=world.models(DETECTOR, Detector, namespace),
+        invalid_detectors=world.invalid(DETECTOR, namespace),
+        rules=world.models(EVENT_RULE, EventRule, namespace) if depends(rule) else [],
+        templates=[_bare(each) for each in world.models(TEMPLATE, ApplicationTemplate, namespace)] if deploys else [],
+        invalid_templates=world.invalid(TEMPLATE, namespace) if deploys else [],
+    )
+
+
+def _bare(template: ApplicationTemplate) -> ApplicationTemplate:
+    """The template without its objects, which may be large: a rule gives parameters alone."""
+    less: dict[str, Any] = {"manifests": [], "configuration": {}, "helm": None}
+    return template.model_copy(update={"spec": template.spec.model_copy(update=less), "status": None})

@@ -1,0 +1,131 @@
+"""The objects of instances, worked out in the worker processes.
+
+What is not there yet is asked for, and the instance asked again once it is. A rendering that takes too much is a
+problem of its template, whose status gives it; what runs of the instance stays as it is.
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import partial
+
+from application_manager.cluster.store import Name
+from application_manager.core.conditions import Aspect
+from application_manager.core.demand import drafting
+from application_manager.core.objects.charts import ChartFailure, ChartOutcome, ChartRequest, Charts
+from application_manager.core.objects.rendering import Rendering
+from application_manager.knowledge.world import World
+from application_manager.workers.desk import Desk, Exceeded
+from application_manager.workers.jobs import Problem, RenderJob
+from wayside.api import ApplicationInstance, ApplicationTemplate
+
+_PICKLED = 64  # templates that are kept as bytes
+
+
+class Renderings:
+    """Takes requests. Only the event loop's thread uses it."""
+
+    def __init__(
+        self,
+        world: World,
+        desk: Desk,
+        charts: Charts,
+        again: Callable[[Name, float], None],
+        template_changed: Callable[[Name], None],
+    ) -> None:
+        """Make it.
+
+        Args:
+            world: the policy, and what exceeded.
+            desk: has the renderings worked out.
+            charts: knows what became of a chart.
+            again: asks for an instance at a time, in seconds since 1970.
+            template_changed: asks for a template whose renderings exceed the limit, or do so no more.
+        """
+        self._world = world
+        self._desk = desk
+        self._charts = charts
+        self._again = again
+        self._template_changed = template_changed
+        self._pickled: OrderedDict[tuple[str, int], bytes] = OrderedDict()
+
+    def objects(self, wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
+        """The instance's objects, or why it has none, as the condition Applied gives it; None: it is asked again."""
+        lacking = drafting.lacking(wanted, template)
+        if lacking is not None or not isinstance(template, ApplicationTemplate):
+            return lacking
+        found = self._answer("rendering", wanted, template, None)
+        if isinstance(found, ChartRequest):
+            outcome = self._charts(found)
+            if outcome is None:
+                return drafting.chart_pending(template, found)
+            if isinstance(outcome, ChartFailure):
+                return drafting.problem(template, outcome.reason, outcome.message)
+            found = self._answer("chart", wanted, template, outcome)
+        name = (wanted.namespace, wanted.name)
+        self._note(name, (template.namespace, template.name), found)
+        match found:
+            case Rendering():
+                return found
+            case Problem(reason, message):
+                return drafting.problem(template, reason, message)
+            case Exceeded(message):
+                return drafting.problem(template, drafting.EXPRESSION_LIMIT, f"to render this instance {message}")
+        return None
+
+    def forget(self, name: Name) -> None:
+        """Drop what is known of an instance that is gone."""
+        for kind in ("rendering", "chart"):
+            self._desk.forget((kind, *name))
+        for template in [each for each, instances in self._world.exceeded.items() if name in instances]:
+            self._note(name, template, Problem("", ""))
+
+    def _answer(
+        self, kind: str, wanted: ApplicationInstance, template: ApplicationTemplate, chart: ChartOutcome | None
+    ) -> object | None:
+        name = (wanted.namespace, wanted.name)
+        metadata = template.metadata
+        bare = wanted.model_copy(update={"status": None})
+        return self._desk.answer(
+            key=(kind, *name),
+            question=(metadata.uid, metadata.generation, wanted.spec, chart),
+            namespace=wanted.namespace,
+            job=lambda: RenderJob(
+                metadata.uid, metadata.generation, self._bytes(template), self._world.policy, bare, chart
+            ),
+            done=partial(self._done, name),
+        )
+
+    def _done(self, name: Name) -> None:
+        self._again(name, time.time())
+
+    def _bytes(self, template: ApplicationTemplate) -> bytes:
+        key = (template.metadata.uid, template.metadata.generation)
+        known = self._pickled.get(key)
+        if known is None:
+            bare = template.model_copy(update={"status": None})
+            known = self._pickled[key] = pickle.dumps(bare, pickle.HIGHEST_PROTOCOL)
+            while len(self._pickled) > _PICKLED:
+                self._pickled.popitem(last=False)
+        self._pickled.move_to_end(key)
+        return known
+
+    def _note(self, name: Name, template: Name, found: object | None) -> None:
+        """Note whether the instance's rendering exceeds the limit; nothing while it is being worked out."""
+        if found is None:
+            return
+        known = self._world.exceeded.get(template, {})
+        before = known.get(name)
+        after = found.message if isinstance(found, Exceeded) else None
+        if before == after:
+            return
+        if after is None:
+            del known[name]
+            if not known:
+                del self._world.exceeded[template]
+        else:
+            self._world.exceeded.setdefault(template, {})[name] = after
+        self._template_changed(template)

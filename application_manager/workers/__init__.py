@@ -1,0 +1,1 @@
+"""Where users' expressions run: in at most two processes beside the manager's, with a limit of CPU time."""

@@ -1,0 +1,78 @@
+"""What tasks ask for, worked out in a worker process where that runs an expression or a pattern of the template.
+
+A key that only puts parameters together (`${parameters.region}-${parameters.lane}`) is worked out at once: it costs no
+more than to write it down.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, Refused
+from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.demand.demand import claim_or_verdict, finished, refused
+from application_manager.workers.desk import Desk, Exceeded
+from application_manager.workers.jobs import ClaimJob
+from wayside.api import ApplicationTask, ApplicationTemplate
+
+Name = tuple[str, str]
+"""Namespace and name."""
+
+_PLAIN = re.compile(r"\$\{\s*parameters(?:\.[A-Za-z_]\w*)+\s*\}")
+
+
+class Claiming:
+    """Works out claims."""
+
+    def __init__(self, desk: Desk, done: Callable[[Name], None]) -> None:
+        """`done` is called with a task once its claim is there."""
+        self._desk = desk
+        self._done = done
+
+    def __call__(
+        self, template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask
+    ) -> Claim | Verdict | None:
+        """What the task claims, or its verdict where it claims nothing; None while that is being worked out."""
+        if not isinstance(template, ApplicationTemplate) or _is_plain(template):
+            return claim_or_verdict(template, task)
+        over = finished(task)
+        if over is not None:
+            return over
+        name = (task.namespace, task.name)
+        metadata, spec = template.metadata, task.spec
+        found = self._desk.answer(
+            key=("claim", *name),
+            question=(metadata.uid, metadata.generation, task.metadata.uid, spec.operation, spec.parameters),
+            namespace=task.namespace,
+            job=lambda: ClaimJob(_without_objects(template), task),
+            done=partial(self._done, name),
+        )
+        match found:
+            case Claim():
+                return replace(found, task=task)
+            case Refusal():
+                return refused(found)
+            case Exceeded(message):
+                what = f"spec.parameters: to check them by template {template.name}"
+                return Verdict(Standing.REFUSED, Refused.EXPRESSION_LIMIT, f"{what} {message}")
+        return None
+
+    def forget(self, name: Name) -> None:
+        """Drop what is known of a task that is gone."""
+        self._desk.forget(("claim", *name))
+
+
+def _is_plain(template: ApplicationTemplate) -> bool:
+    """Whether what a task of the template claims takes no expression but plain reads of parameters."""
+    key = template.spec.key or ""
+    return "${" not in _PLAIN.sub("", key) and all(each.pattern is None for each in template.spec.parameters.values())
+
+
+def _without_objects(template: ApplicationTemplate) -> ApplicationTemplate:
+    """The template without what plays no part in claims, and may be large."""
+    less: dict[str, Any] = {"manifests": [], "configuration": {}, "helm": None}
+    return template.model_copy(update={"spec": template.spec.model_copy(update=less)})

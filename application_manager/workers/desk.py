@@ -1,0 +1,119 @@
+"""Answers of the worker processes: asked for at once, worked out in the background, kept while their question stays.
+
+Who asks for an answer that is not there gets None, and is called once it is; nobody waits, so no queue's worker is held
+by an expression that takes long. Each key has one answer, that to its latest question, so there are as many as there
+are objects; those not used for longest are dropped beyond a number of bytes, and worked out again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+
+from application_manager.workers.pool import ExceededError, JobError, Pool, unpickled
+from application_manager.workers.process import Job
+
+KEPT = 64 * 1024 * 1024  # bytes of answers
+FIRST_PAUSE = 60.0  # s until what was ended is tried again, doubled with each further time
+LONGEST_PAUSE = 3600.0  # s
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Exceeded:
+    """The answer to a question whose job was ended; the text says by which limit."""
+
+    message: str
+
+
+@dataclass(slots=True)
+class _Kept:
+    question: object
+    answer: bytes | Exceeded
+    until: float = float("inf")  # on the monotonic clock
+    times: int = 0
+
+    @property
+    def size(self) -> int:
+        return len(self.answer) if isinstance(self.answer, bytes) else 200
+
+
+class Desk:
+    """Takes questions. Only the event loop's thread uses it."""
+
+    def __init__(self, pool: Pool, kept: int = KEPT) -> None:
+        """`kept`: bytes of answers that are kept."""
+        self._pool = pool
+        self._limit = kept
+        self._size = 0
+        self._kept: OrderedDict[Hashable, _Kept] = OrderedDict()
+        self._asked: dict[Hashable, asyncio.Task[None]] = {}
+
+    def answer(
+        self, key: Hashable, question: object, namespace: str, job: Callable[[], Job[object]], done: Callable[[], None]
+    ) -> object | None:
+        """The answer, `Exceeded` where it takes too long; None at first, and then `done` is called once it is there.
+
+        Args:
+            key: the object that it is about.
+            question: what the answer follows from; compared with that of the answer that is there.
+            namespace: whose CPU time it takes.
+            job: makes the job.
+            done: called once, however the job ends; who still wants the answer asks again.
+        """
+        known = self._kept.get(key)
+        if known is not None and known.question == question and time.monotonic() < known.until:
+            self._kept.move_to_end(key)
+            return known.answer if isinstance(known.answer, Exceeded) else unpickled(known.answer)
+        if key not in self._asked:
+            work = self._work(key, question, namespace, job(), done)
+            self._asked[key] = asyncio.create_task(work, name="answer of a worker process")
+        return None
+
+    def forget(self, key: Hashable) -> None:
+        """Drop the answer of an object that is gone."""
+        known = self._kept.pop(key, None)
+        if known is not None:
+            self._size -= known.size
+
+    async def close(self) -> None:
+        """End all work."""
+        tasks = list(self._asked.values())
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _work(
+        self, key: Hashable, question: object, namespace: str, job: Job[object], done: Callable[[], None]
+    ) -> None:
+        try:
+            answer: bytes | Exceeded = await self._pool.answer(namespace, job)
+        except ExceededError as error:
+            answer = Exceeded(str(error))
+        except JobError as error:
+            log.error("%s: %s; tried again", key, error)
+            await asyncio.sleep(1.0)
+            del self._asked[key]
+            done()
+            return
+        self._keep(key, question, answer)
+        del self._asked[key]
+        done()
+
+    def _keep(self, key: Hashable, question: object, answer: bytes | Exceeded) -> None:
+        before = self._kept.get(key)
+        kept = _Kept(question, answer)
+        if isinstance(answer, Exceeded):
+            kept.times = before.times + 1 if before is not None and before.question == question else 1
+            pause = min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** min(kept.times - 1, 10))
+            kept.until = time.monotonic() + pause
+        self.forget(key)
+        self._kept[key] = kept
+        self._size += kept.size
+        while self._size > self._limit and len(self._kept) > 1:
+            self.forget(next(iter(self._kept)))

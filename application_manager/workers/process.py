@@ -1,0 +1,90 @@
+"""The process that runs users' expressions: one job after the other, each within its CPU time.
+
+CEL runs in C++ and holds the interpreter's lock meanwhile, so no thread, and no exception, could end it. The kernel
+can: a timer of the process's own CPU time (ITIMER_PROF) ends it by SIGPROF when a job takes longer. The manager sees by
+the signal what has happened, and starts another process. It is CPU time, so a busy machine makes no job fail.
+
+Frames are a length and a pickle, on standard input and output. The process ends when its input does.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import resource
+import signal
+import struct
+import sys
+import time
+from typing import Any, BinaryIO, Protocol, TypeVar
+
+LENGTH = struct.Struct("<I")
+
+MEMORY = 512 * 1024 * 1024
+"""Bytes of data that the process may have; it has 40 MB when it starts."""
+
+_NICENESS = 5  # the manager's own work goes first
+
+
+Result_co = TypeVar("Result_co", covariant=True)
+
+
+class Job(Protocol[Result_co]):
+    """Something to work out that follows from its own content alone."""
+
+    def run(self) -> Result_co:
+        """The result."""
+
+
+FAILED = -1.0
+"""In place of the CPU time: the job raised an error, a defect of ours, and the answer is its text."""
+
+
+def main() -> None:
+    """Answer until the input ends. The first frame is the limit of CPU time of each job, in seconds."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a library prints belongs to the log
+    os.nice(_NICENESS)
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: the manager ends us
+    import application_manager.workers.jobs  # noqa: F401, PLC0415  before the first job, which is to be fast
+
+    questions = sys.stdin.buffer
+    limit = _frame(questions)
+    if limit is None:
+        return
+    allowed = float(limit)
+    while (frame := _frame(questions)) is not None:
+        began = time.process_time()
+        signal.setitimer(signal.ITIMER_PROF, allowed)
+        answer, well = _answer(frame)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        used = time.process_time() - began if well else FAILED
+        answers.write(LENGTH.pack(len(answer)))
+        answers.write(struct.pack("<d", used))
+        answers.write(answer)
+        answers.flush()
+
+
+def _answer(frame: bytes) -> tuple[bytes, bool]:
+    try:
+        job: Job[Any] = pickle.loads(frame)  # noqa: S301  from the manager, which started us
+        return pickle.dumps(job.run(), pickle.HIGHEST_PROTOCOL), True
+    except MemoryError:  # as CEL does in C++: the expression takes more than there is
+        os.abort()
+    except Exception as error:  # noqa: BLE001  a defect in one job must not end the others
+        return f"{type(error).__name__}: {error}".encode(), False
+
+
+def _frame(source: BinaryIO) -> bytes | None:
+    head = source.read(LENGTH.size)
+    if len(head) < LENGTH.size:
+        return None
+    (size,) = LENGTH.unpack(head)
+    frame = source.read(size)
+    return frame if len(frame) == size else None
+
+
+if __name__ == "__main__":
+    main()

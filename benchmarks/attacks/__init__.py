@@ -1,0 +1,1 @@
+"""Attacks from one namespace while another is served."""

@@ -1,0 +1,38 @@
+"""In place of the worker processes, for tests that are about something else: jobs run where they are asked for."""
+
+from __future__ import annotations
+
+import pickle
+from typing import TypeVar
+
+from application_manager.core.conditions import Aspect
+from application_manager.core.demand import drafting
+from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.rendering import Rendering
+from application_manager.workers.jobs import Problem, RenderJob
+from application_manager.workers.process import Job
+from wayside.api import ApplicationInstance, ApplicationTemplate
+
+Result = TypeVar("Result")
+
+
+class InProcess:
+    """Runs jobs."""
+
+    async def run(self, namespace: str, job: Job[Result]) -> Result:
+        """What the job gives."""
+        return job.run()
+
+
+def objects(wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
+    """The instance's objects, or why it has none."""
+    if not isinstance(template, ApplicationTemplate):
+        return drafting.lacking(wanted, template)
+    metadata = template.metadata
+    found = RenderJob(
+        f"{metadata.uid} {template.to_json()}", metadata.generation, pickle.dumps(template), Policy(), wanted
+    ).run()
+    if isinstance(found, Problem):
+        return drafting.problem(template, found.reason, found.message)
+    assert isinstance(found, Rendering)
+    return found

@@ -1,0 +1,164 @@
+"""Users' expressions run in worker processes: what takes too long is ended there, and harms nobody else."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+
+from application_manager.measures import Measures
+from application_manager.workers.desk import Desk, Exceeded
+from application_manager.workers.pool import ExceededError, JobError, Pool
+from tests.worker_jobs import Defective, Evaluation, Greedy, KilledOnce, Where
+
+LIMIT = 0.5
+"""Seconds of CPU time; what is not to exceed it takes a fiftieth of that."""
+
+BOMB = Evaluation(100_000)
+
+
+def with_pool(work: Callable[[Pool], Awaitable[None]], cpu_time: float = LIMIT) -> None:
+    async def run() -> None:
+        pool = Pool(Measures(), cpu_time)
+        try:
+            await work(pool)
+        finally:
+            await pool.close()
+
+    asyncio.run(run())
+
+
+def alive(pid: int) -> bool:
+    """Whether the process is there."""
+    return Path(f"/proc/{pid}").exists()
+
+
+def test_what_takes_too_much_cpu_time_is_ended_and_its_process_replaced() -> None:
+    async def work(pool: Pool) -> None:
+        before = await pool.run("a", Where())
+        with pytest.raises(ExceededError, match=r"takes more than 0\.5 s of CPU time and was ended"):
+            await pool.run("a", BOMB)
+        after = await pool.run("a", Where())
+        assert after != before
+        assert await pool.run("a", Evaluation(1)) == 0
+        assert await pool.run("a", Where()) == after
+
+    with_pool(work)
+
+
+def test_the_event_loop_goes_on_while_an_expression_holds_the_interpreters_lock() -> None:
+    async def work(pool: Pool) -> None:
+        bomb = asyncio.create_task(pool.run("a", BOMB))
+        turns = 0
+        while not bomb.done():
+            turns += 1
+            await asyncio.sleep(0.01)
+        assert turns > 3  # with the lock held there would be one
+        with pytest.raises(ExceededError):
+            await bomb
+
+    with_pool(work)
+
+
+def test_a_namespace_full_of_bombs_leaves_a_process_to_the_others() -> None:
+    async def work(pool: Pool) -> None:
+        bombs = [asyncio.create_task(pool.run("a", BOMB)) for _ in range(6)]
+        others = [await pool.run(namespace, Where()) for namespace in "bcdbcd"]
+        assert len(set(others)) == 1
+        assert not bombs[-1].done()
+        for bomb in bombs:
+            bomb.cancel()
+        await asyncio.gather(*bombs, return_exceptions=True)
+
+    with_pool(work)
+
+
+def test_there_are_never_more_than_two_processes() -> None:
+    async def work(pool: Pool) -> None:
+        places = await asyncio.gather(*(pool.run(str(index % 7), Where()) for index in range(50)))
+        assert len(set(places)) <= 2
+
+    with_pool(work)
+
+
+def test_a_job_whose_process_is_killed_from_outside_is_done_by_another(tmp_path: Path) -> None:
+    async def work(pool: Pool) -> None:
+        assert await pool.run("a", KilledOnce(tmp_path / "killed")) == "done"
+
+    with_pool(work)
+
+
+def test_what_takes_too_much_memory_is_ended_too() -> None:
+    async def work(pool: Pool) -> None:
+        with pytest.raises(ExceededError, match="was ended, since its process was ended by SIGABRT"):
+            await pool.run("a", Greedy())
+        assert await pool.run("a", Evaluation(1)) == 0
+
+    with_pool(work)
+
+
+def test_a_defect_is_an_error_of_its_job_alone() -> None:
+    async def work(pool: Pool) -> None:
+        with pytest.raises(JobError, match="RuntimeError: a defect"):
+            await pool.run("a", Defective())
+        assert await pool.run("a", Evaluation(1)) == 0
+
+    with_pool(work)
+
+
+def test_at_the_end_the_processes_go_whatever_they_do() -> None:
+    async def work(pool: Pool) -> None:
+        pid = await pool.run("a", Where())
+        bomb = asyncio.create_task(pool.run("a", BOMB))
+        await asyncio.sleep(0)
+        await pool.close()
+        with pytest.raises(asyncio.CancelledError):
+            await bomb
+        assert not alive(pid)
+
+    with_pool(work, cpu_time=600.0)
+
+
+def test_an_answer_is_kept_for_its_question_and_one_that_exceeds_is_not_worked_out_again() -> None:
+    async def work(pool: Pool) -> None:
+        desk = Desk(pool)
+        done = asyncio.Event()
+
+        async def answer(question: object, job: Evaluation | Where) -> object:
+            done.clear()
+            found = desk.answer("key", question, "a", lambda: job, done.set)
+            if found is None:
+                await done.wait()
+                found = desk.answer("key", question, "a", Defective, done.set)
+            return found
+
+        first = await answer(1, Where())
+        assert await answer(1, Defective()) == first  # type: ignore[arg-type]  it is not even looked at
+        exceeded = await answer(2, BOMB)
+        assert isinstance(exceeded, Exceeded)
+        assert await answer(2, Where()) == exceeded
+        assert await answer(3, Evaluation(1)) == 0
+        await desk.close()
+
+    with_pool(work)
+
+
+def test_answers_are_dropped_beyond_their_bytes_those_longest_unused_first() -> None:
+    async def work(pool: Pool) -> None:
+        desk, done = Desk(pool, kept=40), asyncio.Event()
+
+        async def answer(key: str) -> object:
+            done.clear()
+            if desk.answer(key, 1, "a", Where, done.set) is None:
+                await done.wait()
+            return desk.answer(key, 1, "a", Where, done.set)
+
+        assert await answer("first") is not None
+        for index in range(20):
+            assert await answer(f"later {index}") is not None
+        assert desk.answer("first", 1, "a", Where, done.set) is None
+        await desk.close()
+
+    with_pool(work)

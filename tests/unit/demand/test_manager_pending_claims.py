@@ -1,0 +1,119 @@
+"""While it is worked out what a task claims, nothing is decided for want of knowing it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from application_manager.cluster.store import Entry
+from application_manager.core.claims.claims import Claim, Refused
+from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.demand.demand import claim_or_verdict
+from application_manager.knowledge.claimbook import ClaimBook
+from application_manager.workers.claiming import Claiming
+from application_manager.workers.desk import Exceeded
+from wayside.api import ApplicationTask, ApplicationTemplate
+
+NAME = ("site", "a")
+OF = ("site", "app")
+CONFIG = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "${instance.name}"}}
+
+
+def template(key: str = "${parameters.region}", **parameter: Any) -> ApplicationTemplate:
+    spec = {"parameters": {"region": {"type": "string", **parameter}}, "key": key, "manifests": [CONFIG]}
+    metadata = {"name": "app", "namespace": "site", "uid": "t", "generation": 1}
+    made = {"kind": "ApplicationTemplate", "metadata": metadata, "spec": spec}
+    return ApplicationTemplate.model_validate(made)
+
+
+def task(region: str = "north", *, ended: bool = False) -> ApplicationTask:
+    spec: dict[str, Any] = {"template": "app", "parameters": {"region": region}}
+    if ended:
+        spec["endTime"] = "2026-01-01T00:00:00Z"
+    return ApplicationTask.model_validate(
+        {"kind": "ApplicationTask", "metadata": {"name": "a", "namespace": "site", "uid": "u"}, "spec": spec}
+    )
+
+
+class Answers:
+    """In place of a desk: has the answer that is put in."""
+
+    def __init__(self) -> None:
+        self.found: object | None = None
+        self.asked = 0
+
+    def answer(self, **_: object) -> object | None:
+        self.asked += 1
+        return self.found
+
+
+def book_of(answers: Answers) -> ClaimBook:
+    return ClaimBook(Claiming(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
+
+
+def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_elsewhere() -> None:
+    for key in ("${parameters.region}", "lane-${ parameters.region }", "fixed"):
+        answers = Answers()
+        book_of(answers).note(NAME, Entry({}, task()), template(key))
+        assert not answers.asked
+    for made in (
+        template("${parameters.region + 'x'}"),
+        template("${[parameters.region].filter(x, x.matches('a'))[0]}"),
+        template(pattern="^[a-z]+$"),
+    ):
+        answers = Answers()
+        book_of(answers).note(NAME, Entry({}, task()), made)
+        assert answers.asked
+
+
+def test_a_task_keeps_the_claim_that_it_had_until_the_new_one_is_known() -> None:
+    answers = Answers()
+    book, made = book_of(answers), template(pattern="^[a-z]+$")
+    first = claim_or_verdict(made, task())
+    assert isinstance(first, Claim)
+    assert book.note(NAME, Entry({}, task()), made) == set()
+    assert book.pending(OF)
+    answers.found = first
+    assert book.note(NAME, Entry({}, task()), made) == {("site", first.instance)}
+    assert not book.pending(OF)
+    answers.found = None
+    book.note(NAME, Entry({}, task()), made)
+    assert book.claim(NAME) == first
+    assert book.pending(OF)
+    book.note(NAME, Entry({}, task(ended=True)), made)
+    verdict = book.verdict(NAME)
+    assert verdict is not None
+    assert (verdict.standing, book.claim(NAME), book.pending(OF)) == (Standing.FINISHED, None, False)
+
+
+def test_a_template_is_unsettled_until_all_tasks_that_were_there_are_known() -> None:
+    answers = Answers()
+    settled: list[tuple[str, str]] = []
+    book, made = book_of(answers), template(pattern="^[a-z]+$")
+    book.settled = settled.append
+    book.note(NAME, Entry({}, task()), made)
+    book.note(("site", "b"), Entry({}, task("south")), made)
+    book.begin()
+    book.note(("site", "later"), Entry({}, task("west")), made)
+    assert book.unsettled(OF)
+    answers.found = claim_or_verdict(made, task())
+    book.note(NAME, Entry({}, task()), made)
+    assert book.unsettled(OF)
+    book.forget(("site", "b"))
+    assert (book.unsettled(OF), settled) == (False, [OF])
+    assert book.pending(OF)  # the later one, which nothing can run for yet
+
+
+def test_a_claim_that_takes_too_much_is_refused_and_settles_nothing() -> None:
+    answers = Answers()
+    book, made = book_of(answers), template(pattern="^[a-z]+$")
+    book.note(NAME, Entry({}, task()), made)
+    book.begin()
+    answers.found = Exceeded("takes more than 2 s of CPU time and was ended")
+    book.note(NAME, Entry({}, task()), made)
+    verdict = book.verdict(NAME)
+    assert isinstance(verdict, Verdict)
+    assert (verdict.standing, verdict.reason) == (Standing.REFUSED, Refused.EXPRESSION_LIMIT)
+    assert "by template app takes more than 2 s" in verdict.message
+    assert book.unsettled(OF)
+    book.note(NAME, Entry({}, task(ended=True)), made)
+    assert not book.unsettled(OF)

@@ -1,0 +1,69 @@
+"""Jobs for worker processes, as light as can be to import: what a job does, a template's expression could do."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+from wayside.expressions import Environment, Kind
+
+BOMB = 'l.filter(x, s.matches("([ab]*a[ab]{50}){3}z")).size()'
+"""Takes some 15 ms for each item of `l`, where `s` has 4 KiB, in C++ and with the interpreter's lock held."""
+
+TEXT = "".join(random.Random(1).choices("ab", k=4000))  # without a pattern, so that RE2 remembers nothing
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The bomb, on so many items."""
+
+    items: int
+
+    def run(self) -> object:
+        """The number of items that match."""
+        expression = Environment({"l": Kind.LIST, "s": Kind.STRING}).compile(BOMB)
+        return expression.evaluate({"l": [0.0] * self.items, "s": TEXT})
+
+
+@dataclass(frozen=True)
+class Where:
+    """Which process it is."""
+
+    def run(self) -> int:
+        """The process id."""
+        return os.getpid()
+
+
+@dataclass(frozen=True)
+class KilledOnce:
+    """Is killed from outside at the first attempt, as by a node that lacks memory."""
+
+    marker: Path
+
+    def run(self) -> str:
+        """Where it was not killed."""
+        if not self.marker.exists():
+            self.marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return "done"
+
+
+@dataclass(frozen=True)
+class Greedy:
+    """Takes more memory than a process may have."""
+
+    def run(self) -> int:
+        """A number that never comes."""
+        return len(b" " * (2 * 1024**3))
+
+
+@dataclass(frozen=True)
+class Defective:
+    """Raises what no job should."""
+
+    def run(self) -> object:
+        """Nothing."""
+        raise RuntimeError("a defect")
