@@ -158,13 +158,28 @@ def replay(
 
 
 @app.command()
+def topics(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these.")
+    ],
+    as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a Detector with streams that take all of it.")] = False,
+) -> None:
+    """Say what recordings hold: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
+    with importing():
+        from detector.commands.topics import list_topics
+
+    list_topics(recordings, as_yaml=as_yaml)
+
+
+@app.command()
 def check(
     files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
     recordings: Annotated[
         list[Path] | None,
         typer.Option(
             "--recording",
-            help="Also replay this recording, and warn where rules use old samples; may be repeated.",
+            help="Also look at this recording and replay it: warn of fields and streams that are not in it, and where "
+            "rules use old samples; may be repeated.",
         ),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where there is a warning, too.")] = False,

@@ -18,7 +18,7 @@ from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.errors import RecordingError
-from detector.replay.gathering import intake_file_of, name_of, recordings_of
+from detector.replay.gathering import Recording, intake_file_of, name_of, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.playing import Played, play
 from detector.replay.progress import Progress
@@ -28,6 +28,8 @@ from detector.results.kinds import Kind
 from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
 from detector.rules.files import load_rules
 from detector.rules.selection import select
+from detector.topics.doubts import topic_doubts
+from detector.topics.survey import survey
 from detector.tracing import episode_traces
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document
@@ -122,8 +124,8 @@ def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> tupl
     intake = intake_file_of(recordings)
     gathered = [] if intake is not None else recordings_of(recordings)
     rules = [document.object for document in documents if isinstance(document.object, EventRule)]
-    found: list[str] = []
     errors: dict[str, RecordingError] = {}
+    found = [] if intake is not None else [*_topic_doubts(documents, gathered, errors)]
     for detector in (document.object for document in documents if isinstance(document.object, Detector)):
         selected = select(detector, rules).rules
         if intake is not None:
@@ -135,6 +137,21 @@ def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> tupl
             found += [*map(str, outcome.cuts), *outcome.doubts]
         errors.update((str(error), error) for error in played.errors)
     return list(dict.fromkeys(found)), list(errors.values())
+
+
+def _topic_doubts(
+    documents: Sequence[Document], gathered: Sequence[Recording], errors: dict[str, RecordingError]
+) -> Iterator[str]:
+    """What the messages show before anything is replayed; errors of recordings are noted."""
+    readable = []
+    for recording in gathered:
+        try:
+            readable.append(survey([recording]).topics)
+        except RecordingError as error:
+            errors[str(error)] = error
+    topics = [topic for each in readable for topic in each]
+    if topics:
+        yield from (str(doubt) for doubt in topic_doubts(documents, topics))
 
 
 def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:
