@@ -147,6 +147,24 @@ def replay(
             "Parquet and CSV; or all. May be repeated."
         ),
     ] = None,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="RULE.FIELD=VALUE",
+            help="Also play the rule with another value of a field, e.g. close.when='distance < 120', and compare the "
+            "two; may be repeated.",
+        ),
+    ] = None,
+    sweeps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sweep",
+            metavar="RULE.FIELD=FIRST:LAST:STEP",
+            help="The same with several values in one pass, e.g. close.parameters.distance=80:200:20, or 80,120; "
+            "may be repeated.",
+        ),
+    ] = None,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with importing():
@@ -154,7 +172,17 @@ def replay(
         from detector.memory import tune_garbage_collection
 
     tune_garbage_collection()  # otherwise a third of the time of reading is spent on searching among samples
-    replay_files(recordings, output, detector, rules or (), compared, as_one=as_one, kinds=chosen(results))
+    replay_files(
+        recordings,
+        output,
+        detector,
+        rules or (),
+        compared,
+        as_one=as_one,
+        kinds=chosen(results),
+        sets=sets or (),
+        sweeps=sweeps or (),
+    )
 
 
 @app.command()
