@@ -200,6 +200,23 @@ def topics(
 
 
 @app.command()
+def schema(
+    output: Annotated[Path | None, typer.Option(help="The file to write; default: print it.")] = None,
+) -> None:
+    """Write the JSON Schema of all kinds, for editors that complete and check YAML."""
+    with importing():
+        import json
+
+        from wayside.api.editing import editor_schema
+
+    text = json.dumps(editor_schema(), indent=1) + "\n"
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        output.write_text(text, encoding="utf-8")
+
+
+@app.command()
 def check(
     files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
     recordings: Annotated[
