@@ -199,6 +199,24 @@ def topics(
     list_topics(recordings, as_yaml=as_yaml)
 
 
+@app.command("try")
+def try_(
+    expression: Annotated[str, typer.Argument(help="CEL over msg, e.g. msg.twist.twist.linear.x * 3.6.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these.")
+    ],
+    stream: Annotated[
+        str | None, typer.Option(help="As `detector topics --yaml` names it; default: the one that has the fields.")
+    ] = None,
+    every: Annotated[str, typer.Option(help="How often to look.")] = "100ms",
+) -> None:
+    """Print the values of one expression over the messages of recordings, by client; no file is needed."""
+    with importing():
+        from detector.commands.trying import try_expression
+
+    try_expression(expression, recordings, stream, every)
+
+
 @app.command()
 def schema(
     output: Annotated[Path | None, typer.Option(help="The file to write; default: print it.")] = None,

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, inlets
 from detector.rules.selection import select
+from detector.topics.proposal import Proposal
 from detector.topics.shape import Shape
 from detector.topics.survey import Topic, shape_of
 from wayside.api import Detector, EventRule
@@ -37,7 +38,7 @@ def topic_doubts(documents: Sequence[Document], topics: Sequence[Topic]) -> Iter
                     ("spec", "streams", index, "key"),
                     f"no message of the recording belongs to stream {stream.name}; its keys are {keys}",
                 )
-            fields = _fields(stream, own)
+            fields = _seen(stream.encoding, own)
             if fields is not None:
                 seen[stream.name] = fields
         yield from _fields_missing(detector, rules, {**known, **seen})
@@ -67,13 +68,19 @@ def _topics_of(stream: Stream, topics: Sequence[Topic]) -> list[Topic]:
     return [topic for topic in topics if pattern.match(topic.key) is not None]
 
 
-def _fields(stream: Stream, topics: Sequence[Topic]) -> Fields | None:
+def fields_of(found: Sequence[Proposal]) -> dict[str, Fields]:
+    """By stream, the fields of JSON and CBOR by the samples; without those whose messages are no maps."""
+    named = {each.name: _seen(each.encoding, each.topics) for each in found}
+    return {name: fields for name, fields in named.items() if fields is not None}
+
+
+def _seen(encoding: Encoding, topics: Sequence[Topic]) -> Fields | None:
     """The fields of JSON and CBOR by the samples of all topics; None where they are not maps."""
-    if stream.encoding not in (Encoding.JSON, Encoding.CBOR) or not topics:
+    if encoding not in (Encoding.JSON, Encoding.CBOR) or not topics:
         return None
     whole = Shape()
     for topic in topics:
-        shape = shape_of(topic, stream.encoding)
+        shape = shape_of(topic, encoding)
         if shape is None:
             return None
         whole.join(shape)
