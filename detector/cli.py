@@ -147,6 +147,24 @@ def replay(
             "Parquet and CSV; or all. May be repeated."
         ),
     ] = None,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="RULE.FIELD=VALUE",
+            help="Also play the rule with another value of a field, e.g. close.when='distance < 120', and compare the "
+            "two; may be repeated.",
+        ),
+    ] = None,
+    sweeps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sweep",
+            metavar="RULE.FIELD=FIRST:LAST:STEP",
+            help="The same with several values in one pass, e.g. close.parameters.distance=80:200:20, or 80,120; "
+            "may be repeated.",
+        ),
+    ] = None,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with importing():
@@ -154,7 +172,66 @@ def replay(
         from detector.memory import tune_garbage_collection
 
     tune_garbage_collection()  # otherwise a third of the time of reading is spent on searching among samples
-    replay_files(recordings, output, detector, rules or (), compared, as_one=as_one, kinds=chosen(results))
+    replay_files(
+        recordings,
+        output,
+        detector,
+        rules or (),
+        compared,
+        as_one=as_one,
+        kinds=chosen(results),
+        sets=sets or (),
+        sweeps=sweeps or (),
+    )
+
+
+@app.command()
+def topics(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these.")
+    ],
+    as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a Detector with streams that take all of it.")] = False,
+) -> None:
+    """Say what recordings hold: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
+    with importing():
+        from detector.commands.topics import list_topics
+
+    list_topics(recordings, as_yaml=as_yaml)
+
+
+@app.command("try")
+def try_(
+    expression: Annotated[str, typer.Argument(help="CEL over msg, e.g. msg.twist.twist.linear.x * 3.6.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these.")
+    ],
+    stream: Annotated[
+        str | None, typer.Option(help="As `detector topics --yaml` names it; default: the one that has the fields.")
+    ] = None,
+    every: Annotated[str, typer.Option(help="How often to look.")] = "100ms",
+) -> None:
+    """Print the values of one expression over the messages of recordings, by client; no file is needed."""
+    with importing():
+        from detector.commands.trying import try_expression
+
+    try_expression(expression, recordings, stream, every)
+
+
+@app.command()
+def schema(
+    output: Annotated[Path | None, typer.Option(help="The file to write; default: print it.")] = None,
+) -> None:
+    """Write the JSON Schema of all kinds, for editors that complete and check YAML."""
+    with importing():
+        import json
+
+        from wayside.api.editing import editor_schema
+
+    text = json.dumps(editor_schema(), indent=1) + "\n"
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        output.write_text(text, encoding="utf-8")
 
 
 @app.command()
@@ -164,7 +241,8 @@ def check(
         list[Path] | None,
         typer.Option(
             "--recording",
-            help="Also replay this recording, and warn where rules use old samples; may be repeated.",
+            help="Also look at this recording and replay it: warn of fields and streams that are not in it, and where "
+            "rules use old samples; may be repeated.",
         ),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where there is a warning, too.")] = False,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
+from typing import NamedTuple
 
 import typer
 from rich.console import Console
@@ -18,20 +19,35 @@ from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.errors import RecordingError
-from detector.replay.gathering import intake_file_of, name_of, recordings_of
+from detector.replay.gathering import Recording, intake_file_of, name_of, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.playing import Played, play
 from detector.replay.progress import Progress
 from detector.replay.recordings import quick_span_of
 from detector.replay.replaying import Outcome, replay_intake
+from detector.replay.variants import Variant, variants_of, with_variants
 from detector.results.kinds import Kind
+from detector.results.variants import comparisons, show_variants, write_variants
 from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
 from detector.rules.files import load_rules
 from detector.rules.selection import select
+from detector.topics.doubts import topic_doubts
+from detector.topics.survey import survey
 from detector.tracing import episode_traces
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document
 from wayside.commandline import refuse
+
+_WIDTH = 160
+"""Columns of a table that goes into a pipe or a file."""
+
+
+class Options(NamedTuple):
+    """How recordings are played."""
+
+    as_one: bool
+    sets: Sequence[str]
+    sweeps: Sequence[str]
 
 
 def replay_files(
@@ -43,6 +59,8 @@ def replay_files(
     *,
     as_one: bool,
     kinds: frozenset[Kind] = frozenset(),
+    sets: Sequence[str] = (),
+    sweeps: Sequence[str] = (),
 ) -> None:
     """Replay, write the results into the folder, and print a summary.
 
@@ -56,24 +74,29 @@ def replay_files(
         compared: the names of two rules whose episodes are compared; None: nothing is compared.
         as_one: merge all recordings by time; otherwise each is replayed on its own.
         kinds: the results to look at that are written as well.
+        sets: fields of rules with other values, as RULE.FIELD=VALUE: a variant that is compared with the rule.
+        sweeps: the same with several values, each a variant: RULE.FIELD=FIRST:LAST:STEP.
 
     Raises:
+        VariantError: a variant cannot be made.
         MissingExtraError: a result needs a package that is not installed.
         DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text says why.
     """
     check_installed(kinds)
     looking = Looking() if kinds else None
     with Progress(Console(stderr=True)) as progress:
-        played, evaluated = _replayed(recordings, detector, rules, as_one, progress, looking)
+        options = Options(as_one, tuple(sets), tuple(sweeps))
+        played, evaluated, variants = _replayed(recordings, detector, rules, options, progress, looking)
         output.mkdir(parents=True, exist_ok=True)
         results = [] if looking is None else looking.results(played.outcomes, evaluated)
         if results:
             progress.note("writing the results")
             write_results(output, results, kinds)
     outcomes = list(played.outcomes.values())
+    tried = {variant.rule.name for variant in variants}
     traced = [_traced(outcome) for outcome in outcomes]
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
-        file.writelines(event.to_json() + "\n" for events, _ in traced for event in events)
+        file.writelines(event.to_json() + "\n" for events, _ in traced for event in events if event.rule not in tried)
     write_tasks_yaml(output / "tasks.yaml", [task for _, tasks in traced for task in tasks])
     if compared is not None:
         write_comparison(outcomes, compared, output)
@@ -86,11 +109,21 @@ def replay_files(
             typer.echo(line, err=True)
     for error in played.errors:
         typer.echo(f"error: {error}", err=True)
+    if variants:
+        compared_variants = comparisons(outcomes, variants)
+        write_variants(output / "variants.json", variants, compared_variants)
+        show_variants(_console(), variants, compared_variants)
     if results:
-        show_summary(Console(stderr=True), results)
-    typer.echo(f"{_counted(outcomes)}: {output}", err=True)
+        show_summary(_console(), results)
+    typer.echo(f"{_counted(outcomes, tried)}: {output}", err=True)
     if refusals or played.errors:
         raise typer.Exit(1)
+
+
+def _console() -> Console:
+    """For tables; in a pipe they are as wide as they are."""
+    console = Console(stderr=True)
+    return console if console.is_terminal else Console(stderr=True, width=_WIDTH)
 
 
 def _lines(outcome: Outcome, where: str) -> Iterator[str]:
@@ -104,8 +137,8 @@ def _lines(outcome: Outcome, where: str) -> Iterator[str]:
         yield f"the intake file lacks {outcome.lost} samples, the disk being too slow: events may differ"
 
 
-def _counted(outcomes: Sequence[Outcome]) -> str:
-    events = [event for outcome in outcomes for event in outcome.events]
+def _counted(outcomes: Sequence[Outcome], tried: Set[str]) -> str:
+    events = [event for outcome in outcomes for event in outcome.events if event.rule not in tried]
     started = sum(event.started for event in events)
     several = f"{len(outcomes)} recordings, " if len(outcomes) > 1 else ""
     samples = _number(sum(outcome.samples for outcome in outcomes), "sample")
@@ -122,8 +155,8 @@ def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> tupl
     intake = intake_file_of(recordings)
     gathered = [] if intake is not None else recordings_of(recordings)
     rules = [document.object for document in documents if isinstance(document.object, EventRule)]
-    found: list[str] = []
     errors: dict[str, RecordingError] = {}
+    found = [] if intake is not None else [*_topic_doubts(documents, gathered, errors)]
     for detector in (document.object for document in documents if isinstance(document.object, Detector)):
         selected = select(detector, rules).rules
         if intake is not None:
@@ -137,6 +170,21 @@ def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> tupl
     return list(dict.fromkeys(found)), list(errors.values())
 
 
+def _topic_doubts(
+    documents: Sequence[Document], gathered: Sequence[Recording], errors: dict[str, RecordingError]
+) -> Iterator[str]:
+    """What the messages show before anything is replayed; errors of recordings are noted."""
+    readable = []
+    for recording in gathered:
+        try:
+            readable.append(survey([recording]).topics)
+        except RecordingError as error:
+            errors[str(error)] = error
+    topics = [topic for each in readable for topic in each]
+    if topics:
+        yield from (str(doubt) for doubt in topic_doubts(documents, topics))
+
+
 def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:
     """Runs the plugins of one replay in processes of their own."""
     return closing(ProcessHost(outages, wait=True, patience=REPLAY_PATIENCE))
@@ -146,35 +194,39 @@ def _replayed(
     recordings: Sequence[Path],
     detector: Path | None,
     rules: Sequence[Path],
-    as_one: bool,
+    options: Options,
     progress: Progress,
     looking: Looking | None,
-) -> tuple[Played, Sequence[EventRule]]:
-    """What the recordings came to, and the rules as written, where files have them."""
+) -> tuple[Played, Sequence[EventRule], Sequence[Variant]]:
+    """What the recordings came to, the rules as written, where files have them, and their variants."""
     intake = intake_file_of(recordings)
     if intake is not None:
+        if options.sets or options.sweeps:
+            refuse("--set and --sweep are not for intake files: give the recording itself")
         name = name_of((intake,))
         outcome, given = _intake_replayed(
             intake, detector, rules, progress, None if looking is None else looking.watch(name)
         )
-        return Played({name: outcome}, []), given
+        return Played({name: outcome}, []), given, ()
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
     loaded = load_rules(detector, rules, lasting_problems)
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
-    gathered = recordings_of(recordings, as_one=as_one)
+    gathered = recordings_of(recordings, as_one=options.as_one)
+    variants = variants_of(loaded.rule_set.rules, options.sets, options.sweeps)
+    evaluated = [*loaded.rule_set.rules, *(variant.rule for variant in variants)]
     if progress.shown:
         progress.expect([quick_span_of(recording) for recording in gathered])
     played = play(
         gathered,
-        loaded.rule_set.detector,
-        loaded.rule_set.rules,
+        with_variants(loaded.rule_set.detector, variants),
+        evaluated,
         lambda: _plugins(Outages(lambda: ())),
         lambda batches: progress.watch_batches(batches if looking is None else looking.batches(batches)),
         lambda name: None if looking is None else looking.watch(name).tracer,
     )
-    return played, loaded.rule_set.rules
+    return played, evaluated, variants
 
 
 def _intake_replayed(

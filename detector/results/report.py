@@ -28,7 +28,7 @@ from detector.results.thinning import thinned
 from wayside.manifests import to_yaml
 from wayside.times import format_time
 
-MOST = 200_000
+MOST = 140_000
 """About so many points of series are in a page."""
 _WIDEST = 1500
 """So many parts of the time are told apart at most: more pixels than a plot has."""
@@ -220,9 +220,7 @@ def _subject(
         "clients": subject.clients,
         "episodes": [
             {
-                "id": each.episode,
                 "start": table.seconds(each.start_time),
-                "onset": table.seconds(each.onset_time),
                 "end": None if each.end_time is None else table.seconds(each.end_time),
                 "reason": each.reason,
                 "values": _values(each) if each.episode in told else {},

@@ -248,8 +248,9 @@ class _RuleCompiler:
             for text in unknown_fields(expression.paths, variable, members):
                 self.problem(path, text)
         if stream is not None and stream.name in self.fields:
+            of_type = "" if stream.type is None else f", type {stream.type}"
             for text in unknown_fields(expression.paths, "msg", self.fields[stream.name]):
-                self.problem(path, f"{text} (stream {stream.name}, type {stream.type})")
+                self.problem(path, f"{text} (stream {stream.name}{of_type})")
         return expression
 
     def _expression(

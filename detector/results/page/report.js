@@ -97,7 +97,8 @@
     const coarse = matchMedia("(pointer: coarse)").matches;
     const made = Bokeh.Plotting.figure({
       sizing_mode: "stretch_width", toolbar_location: coarse ? "below" : "right", background_fill_color: colour("back"),
-      border_fill_color: colour("back"), outline_line_color: colour("line"), output_backend: "canvas", ...options,
+      border_fill_color: colour("back"), outline_line_color: colour("line"), output_backend: "canvas",
+      min_border_left: 60, ...options,
     });
     for (const axis of [made.xaxis, made.yaxis].flat())
       Object.assign(axis, { axis_label_text_color: colour("faint"), major_label_text_color: colour("faint"),
@@ -158,7 +159,7 @@
       made.add_layout(new Bokeh.Span({ dimension: "width", location: value, line_color: paint, line_dash: [6, 4], line_width: 1.5 }));
       made.add_layout(new Bokeh.Label({ x: 4, x_units: "screen", y: value, text: `${field} ${operator} ${short(value)}`,
         text_color: paint, text_font_size: "11px", text_baseline: field === "when" ? "bottom" : "top",
-        background_fill_color: colour("back"), background_fill_alpha: 0.7 }));
+        background_fill_color: colour("back"), background_fill_alpha: 0.85 }));
     }
     const known = y.filter((value) => !Number.isNaN(value)).concat(thresholds.map((each) => each[3]));
     if (known.length && thresholds.length) {
@@ -348,6 +349,8 @@
   async function main() {
     data = await unpack(at("data").textContent);
     window.wayside = data;
+    const order = (one, other) => one.localeCompare(other, "en", { numeric: true });
+    data.subjects.sort((one, other) => order(one.rule, other.rule) || order(one.subject, other.subject));
     at("title").textContent = `Replay of ${data.recording}`;
     const episodes = data.rules.reduce((sum, each) => sum + each.episodes, 0);
     at("summary").textContent = `${data.begin.slice(0, 19).replace("T", " ")} UTC, ${span(data.length)}, ` +

@@ -1,0 +1,183 @@
+"""Variants of rules: the same rule with other fields, played in the same pass as the rule as written."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import yaml
+from pydantic import ValidationError
+
+from wayside.api import Detector, EventRule
+from wayside.api.wording import messages
+from wayside.inputerror import InputError
+
+_MOST = 100
+"""So many variants at most."""
+_RANGE = re.compile(r"(-?[0-9.eE+-]+):(-?[0-9.eE+-]+):([0-9.eE+-]+)")
+
+
+class VariantError(InputError, ValueError):
+    """A change that cannot be made; the text names the option, the field and the remedy."""
+
+
+class Change(NamedTuple):
+    """One field of one rule, and its value."""
+
+    rule: str
+    path: tuple[str, ...]
+    """Below spec; items of lists by their names or numbers."""
+    value: Any
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        text = self.value if isinstance(self.value, str) else json.dumps(self.value)
+        return f"{'.'.join(self.path)}={text}"
+
+
+class Variant(NamedTuple):
+    """A rule with other fields. It has no actions, and a name of its own."""
+
+    of: str
+    """The rule as written."""
+    label: str
+    rule: EventRule
+    parameters: frozenset[str]
+    """Those of the rule that the variant sets for all clients."""
+
+
+def variants_of(rules: Sequence[EventRule], sets: Sequence[str], sweeps: Sequence[str]) -> list[Variant]:
+    """The variants that the options name: of each rule one with all that is set, and one for each value of each sweep.
+
+    Raises:
+        VariantError: an option cannot be read, names no rule or no field of it, or makes a rule that is wrong.
+    """
+    known = {rule.name: rule for rule in rules}
+    fixed: dict[str, list[Change]] = {}
+    for option in sets:
+        rule, path, text = _parts("--set", option, known)
+        fixed.setdefault(rule, []).append(Change(rule, path, _value(text)))
+    chosen = [*fixed.items()]
+    for option in sweeps:
+        rule, path, text = _parts("--sweep", option, known)
+        chosen += [(rule, [*fixed.get(rule, ()), Change(rule, path, value)]) for value in _values(option, text)]
+    if len(chosen) > _MOST:
+        raise VariantError(f"--sweep: {len(chosen)} variants are more than {_MOST}: take larger steps")
+    taken = set(known)
+    return [_variant(known[rule], changes, taken) for rule, changes in chosen]
+
+
+def with_variants(detector: Detector, variants: Sequence[Variant]) -> Detector:
+    """The Detector, with the parameters that it sets for clients also set for variants, but those that they change."""
+    if not any(client.parameters for client in detector.spec.clients):
+        return detector
+    clients = []
+    for client in detector.spec.clients:
+        parameters = dict(client.parameters)
+        for variant in variants:
+            own = {
+                name: value
+                for name, value in client.parameters.get(variant.of, {}).items()
+                if name not in variant.parameters
+            }
+            if own:
+                parameters[variant.rule.name] = own
+        clients.append(client.model_copy(update={"parameters": parameters}))
+    return detector.model_copy(update={"spec": detector.spec.model_copy(update={"clients": clients})})
+
+
+def _parts(option: str, text: str, rules: Mapping[str, EventRule]) -> tuple[str, tuple[str, ...], str]:
+    before, equals, value = text.partition("=")
+    rule, *path = before.strip().split(".")
+    if not equals or not path:
+        raise VariantError(f"{option} {text}: write RULE.FIELD=VALUE, e.g. close.when='distance < 120'")
+    if rule not in rules:
+        close = difflib.get_close_matches(rule, rules, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there is {', '.join(sorted(rules)) or 'none'}"
+        raise VariantError(f"{option} {text}: there is no rule {rule}; {hint}")
+    if path[0] == "parameters" and path[1:2] and path[1] not in rules[rule].spec.parameters:
+        there = ", ".join(sorted(rules[rule].spec.parameters)) or "none"
+        raise VariantError(f"{option} {text}: rule {rule} has no parameter {path[1]}; it has {there}")
+    return rule, tuple(path), value.strip()
+
+
+def _value(text: str) -> Any:
+    """As YAML has it: a number, a boolean, a list; all else is text."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+def _values(option: str, text: str) -> Iterator[Any]:
+    """`80:200:20`, both ends included, or values with commas between."""
+    span = _RANGE.fullmatch(text)
+    if span is None:
+        yield from (_value(each.strip()) for each in text.split(","))
+        return
+    try:
+        first, last, step = (float(part) for part in span.groups())
+    except ValueError:
+        raise VariantError(f"--sweep {option}: {text} is no range of numbers: write first:last:step") from None
+    if step <= 0 or last < first:
+        raise VariantError(f"--sweep {option}: write first:last:step, with a step above 0 and the last not below first")
+    for number in range(int((last - first) / step + 1e-9) + 1):
+        value = round(first + number * step, 9)
+        yield int(value) if value == int(value) else value
+
+
+def _variant(rule: EventRule, changes: Sequence[Change], taken: set[str]) -> Variant:
+    document = copy.deepcopy(rule.model_dump(mode="json", by_alias=True, exclude_unset=True))
+    number = 1
+    while (name := f"{rule.name[:58]}-{number}") in taken:
+        number += 1
+    taken.add(name)
+    document["metadata"]["name"] = name
+    document["spec"].pop("actions", None)
+    for change in changes:
+        _set(document["spec"], change)
+    label = ", ".join(change.label for change in changes)
+    try:
+        made = EventRule.model_validate(document)
+    except ValidationError as error:
+        (path, text), *_ = messages(error, document)
+        raise VariantError(f"{rule.name} with {label}: {'.'.join(map(str, path))}: {text}") from None
+    parameters = frozenset(each.path[1] for each in changes if each.path[0] == "parameters" and len(each.path) > 1)
+    return Variant(rule.name, label, made, parameters)
+
+
+def _set(spec: dict[str, Any], change: Change) -> None:
+    here: Any = spec
+    for step in change.path[:-1]:
+        here = _below(here, step, change)
+    last = change.path[-1]
+    if isinstance(here, list):
+        here[_index(here, last, change)] = change.value
+    elif isinstance(here, dict):
+        here[last] = change.value
+    else:
+        raise VariantError(f"{change.rule}: there is no field {'.'.join(change.path)}")
+
+
+def _below(here: Any, step: str, change: Change) -> Any:
+    if isinstance(here, list):
+        return here[_index(here, step, change)]
+    if isinstance(here, dict):
+        return here.setdefault(step, {})
+    raise VariantError(f"{change.rule}: there is no field {'.'.join(change.path)}")
+
+
+def _index(items: Sequence[Any], step: str, change: Change) -> int:
+    """The item of that name or number."""
+    for at, item in enumerate(items):
+        if isinstance(item, Mapping) and item.get("name") == step:
+            return at
+    if step.isdigit() and int(step) < len(items):
+        return int(step)
+    names = ", ".join(str(item.get("name")) for item in items if isinstance(item, Mapping))
+    raise VariantError(f"{change.rule}: {'.'.join(change.path)}: there is no {step}; there is {names or 'none'}")

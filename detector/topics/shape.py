@@ -1,0 +1,90 @@
+"""What plain values look like: the fields of maps, the items of lists, and what kinds of values they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from wayside.rules import Fields
+
+_FIELDS = 500
+"""A map with more different names is a table, not a message: no more of them are noted."""
+_DEPTH = 12
+
+
+class Shape:
+    """Values of one place in messages."""
+
+    def __init__(self) -> None:
+        self.kinds: set[str] = set()
+        """`number`, `boolean`, `text`, `bytes`, `list`, `map`, `null`."""
+        self.fields: dict[str, Shape] = {}
+        self.items: Shape | None = None
+
+    def add(self, value: Any, depth: int = 0) -> None:
+        """Look at one more value."""
+        kind = _kind(value)
+        self.kinds.add(kind)
+        if depth >= _DEPTH:
+            return
+        if kind == "map":
+            for name, child in value.items():
+                known = self.fields.get(name)
+                if known is None:
+                    if len(self.fields) >= _FIELDS:
+                        continue
+                    known = self.fields[name] = Shape()
+                known.add(child, depth + 1)
+        elif kind == "list" and value:
+            self.items = self.items or Shape()
+            for child in (value[0], value[-1]):
+                self.items.add(child, depth + 1)
+
+    def join(self, other: Shape) -> None:
+        """Take in what another has seen."""
+        self.kinds |= other.kinds
+        for name, child in other.fields.items():
+            self.fields.setdefault(name, Shape()).join(child)
+        if other.items is not None:
+            self.items = self.items or Shape()
+            self.items.join(other.items)
+
+    @property
+    def known_fields(self) -> Fields | None:
+        """As for checking paths; None where the values are not maps alone, or there are too many names."""
+        if "map" not in self.kinds or not self.kinds <= {"map", "null"} or len(self.fields) >= _FIELDS:
+            return None
+        return {name: child.known_fields for name, child in self.fields.items()}
+
+    def paths(self, above: str = "msg") -> Iterator[tuple[str, str]]:
+        """Each place with its kinds, as expressions write it."""
+        for name, child in self.fields.items():
+            yield from child.paths(f"{above}.{name}" if name.isidentifier() else f'{above}["{name}"]')
+        if self.items is not None and self.items.fields:
+            yield from self.items.paths(f"{above}[0]")
+        elif not self.fields:
+            of = f" of {' or '.join(sorted(self.items.kinds))}" if self.items is not None else ""
+            yield above, " or ".join(sorted(self.kinds)) + of
+
+
+def paths_of(fields: Fields | None, above: str = "msg", depth: int = 0) -> Iterator[tuple[str, str]]:
+    """The places of a message whose type is known."""
+    if not fields or depth >= _DEPTH:
+        yield above, ""
+        return
+    for name, child in fields.items():
+        yield from paths_of(child, f"{above}.{name}", depth + 1)
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "boolean"
+    if isinstance(value, int | float):
+        return "number"
+    if isinstance(value, str):
+        return "text"
+    if isinstance(value, bytes | bytearray):
+        return "bytes"
+    return "map" if isinstance(value, Mapping) else "list"

@@ -1,0 +1,143 @@
+"""Reads recordings once, and says of each key how much came, how regularly, and what the messages look like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+
+from detector.engine.samples.sample import DecodeError
+from detector.replay.batches import Batch, Channel
+from detector.replay.gathering import Recording
+from detector.replay.message import Cut
+from detector.replay.recordings import open_recordings
+from detector.streams.codecs.cbor import CborDecoder
+from detector.topics.shape import Shape
+from wayside.api.stream import Encoding
+
+_SAMPLES = 512
+"""So many messages of a key are looked at, at most; evenly, whatever their number."""
+_BYTES = 64 << 20
+"""So many bytes of samples of a key are kept at most."""
+
+
+@dataclass(slots=True)
+class Topic:
+    """The messages of one key. Times are nanoseconds since the epoch."""
+
+    key: str
+    recorded_as: str
+    """The encoding as the recording has it."""
+    type: str | None
+    decode: Callable[[bytes], object] | None
+    count: int = 0
+    gap: int = 0
+    """The longest time between two messages of one recording."""
+    gap_time: int = 0
+    """When it begins."""
+    samples: list[bytes] = field(default_factory=list)
+    _last: int | None = None
+    """The message before, of the same recording."""
+    _lasted: int = 0
+    _intervals: int = 0
+    _stride: int = 1
+    _bytes: int = 0
+
+    def begin(self) -> None:
+        """Another recording follows."""
+        self._last = None
+
+    def add(self, time: int, payload: bytes) -> None:
+        """One more message."""
+        if self.count % self._stride == 0 and self._bytes < _BYTES:
+            self.samples.append(payload)
+            self._bytes += len(payload)
+            if len(self.samples) >= _SAMPLES:
+                del self.samples[1::2]
+                self._stride *= 2
+                self._bytes = sum(map(len, self.samples))
+        self.count += 1
+        if self._last is not None:
+            self._lasted += time - self._last
+            self._intervals += 1
+            if time - self._last > self.gap:
+                self.gap, self.gap_time = time - self._last, self._last
+        self._last = time
+
+    @property
+    def rate(self) -> float | None:
+        """Messages a second; None where there are less than two."""
+        return self._intervals * 1e9 / self._lasted if self._lasted else None
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What was found in some recordings."""
+
+    topics: Sequence[Topic]
+    """In order of their keys."""
+    cuts: Sequence[Cut]
+
+
+def survey(recordings: Iterable[Recording]) -> Survey:
+    """Look at recordings, each a sequence of files. Raises RecordingError."""
+    topics: dict[tuple[str, str, str | None], Topic] = {}
+    cuts: list[Cut] = []
+    for recording in recordings:
+        for topic in topics.values():
+            topic.begin()
+        by_channel: dict[Channel, Topic] = {}
+        for batch in open_recordings(recording, on_cut=cuts.append):
+            _add(batch, topics, by_channel)
+    return Survey([topics[at] for at in sorted(topics, key=str)], cuts)
+
+
+def _add(batch: Batch, topics: dict[tuple[str, str, str | None], Topic], by_channel: dict[Channel, Topic]) -> None:
+    for time, channel, payload in zip(batch.times, batch.channels, batch.payloads, strict=True):
+        topic = by_channel.get(channel)
+        if topic is None:
+            at = channel.key, channel.encoding, channel.type
+            topic = by_channel[channel] = topics.setdefault(at, Topic(*at, channel.decode))
+        topic.add(time, payload)
+
+
+def encoding_of(topic: Topic) -> Encoding:
+    """How a stream reads the topic: as it is recorded, else by looking at its samples."""
+    if topic.decode is not None:
+        return Encoding.JSON
+    if topic.recorded_as in {each.value for each in Encoding} - {Encoding.RAW.value}:
+        return Encoding(topic.recorded_as)
+    return next((each for each in (Encoding.JSON, Encoding.CBOR) if shape_of(topic, each) is not None), Encoding.RAW)
+
+
+def shape_of(topic: Topic, encoding: Encoding | None = None) -> Shape | None:
+    """What its samples look like; None where one is not of that encoding, or it is none of plain values."""
+    encoding = encoding or encoding_of(topic)
+    if encoding not in (Encoding.JSON, Encoding.CBOR):
+        return None
+    shape = Shape()
+    for value in _values(topic, encoding):
+        if value is _UNREADABLE:
+            return None
+        shape.add(value)
+    if encoding is Encoding.CBOR and topic.recorded_as != encoding.value and "map" not in shape.kinds:
+        return None  # a byte or two of anything may be a number in CBOR
+    return shape if shape.kinds else None
+
+
+_UNREADABLE = object()
+
+
+def _values(topic: Topic, encoding: Encoding) -> Iterator[object]:
+    cbor = CborDecoder()
+    for payload in topic.samples:
+        try:
+            if topic.decode is not None:
+                yield topic.decode(payload)
+            elif encoding is Encoding.JSON:
+                yield msgspec.json.decode(payload)
+            else:
+                yield cbor.decode(payload)
+        except (ValueError, DecodeError, RecursionError):
+            yield _UNREADABLE
