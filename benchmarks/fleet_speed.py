@@ -45,7 +45,7 @@ def main() -> int:
 
 
 def rule(limit: speeds.Limits, many: int) -> EventRule:
-    """More than so many clients are above the limit, until fewer are."""
+    """More than `many` clients are above the limit, until fewer are."""
     document = speeds.rule_document(limit, {"every": "100ms"})
     document["spec"] |= {
         "scope": {"fleet": {"members": "true"}},

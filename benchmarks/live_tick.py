@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def measure(rules: Sequence[EventRule], clients: int, ticks: int, fill: float) -> Spent:
-    """Fill the windows, then measure so many ticks; `fill` is seconds."""
+    """Fill the windows, then measure `ticks` ticks; `fill` is seconds."""
     before = round(fill * 1e9 / speeds.TICK)
     arrivals = list(speeds.arrivals(clients, HZ, (before + ticks + 1) * speeds.TICK / 1e9))
     parts = list(by_tick(arrivals, speeds.TICK))[: before + ticks]

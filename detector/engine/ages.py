@@ -13,7 +13,7 @@ OLD = 3
 """Usual periods: a sample that is older shows that its sender fell silent."""
 
 _MANY, _SHARE = 10, 0.1
-"""So many uses of old samples, and this share of all, are said; a client that leaves gives a few in any case."""
+"""Uses of old samples are reported from this number and share on; a client that leaves always gives a few."""
 
 
 class Lane(Protocol):

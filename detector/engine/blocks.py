@@ -29,7 +29,7 @@ from detector.engine.timing.schedule import Only
 from wayside.rules import CompiledRule, episode_stream
 
 _POINTS = 200_000
-"""At most so many points are evaluated together, for all ticks and clients: the columns of all rules are in memory."""
+"""Maximum number of points, for all ticks and clients, in a block: the columns of all rules are in memory."""
 
 _AGAIN = 255
 """In place of the observation before: the subject has to be looked at."""
@@ -239,7 +239,7 @@ class Blocks:
     def set_rules(
         self, runs: Mapping[str, RuleRun], paused: Collection[str], thinning: Callable[[RuleRun], int]
     ) -> None:
-        """These rules are evaluated from now on; `thinning`: of so many evaluations of a rule, one takes place."""
+        """These rules are evaluated from now on; `thinning`: one in this number of a rule's evaluations takes place."""
         orders = {name: order for order, name in enumerate(runs)}
         depths: dict[str, int] = {}
         together: dict[tuple[int, type[Group | FleetGroup], int, int], list[RuleRun]] = {}
@@ -303,7 +303,7 @@ class Blocks:
                     run.counters.skipped += 1
 
     def wait(self, time: int, groups: Iterable[RuleGroup | PairGroup]) -> bool:
-        """Evaluate the groups at this tick later; whether there are so many points that it should be soon."""
+        """Evaluate the groups at this tick later. Returns whether enough points wait to evaluate them now."""
         clients = len(self._context.clients)
         full = False
         for group in groups:

@@ -14,7 +14,7 @@ _EARLY = 3600 * 1_000_000_000
 """Nanoseconds: a recording whose receive times are smaller counts from 0, and a stamp of 0 is a time."""
 
 _MAXIMUM_REASONS = 16
-"""So many different reasons are kept for each rule: some name values, of which there is no end."""
+"""Maximum number of different reasons for each rule: some name values, which are unbounded."""
 
 OTHERS = "for other reasons"
 """What counts the reasons beyond these."""
@@ -72,7 +72,7 @@ class RuleCounters:
             self.absences[message if known else OTHERS] += times
 
     def timed(self, tick: int, spent: int, ticks: int = 1) -> None:
-        """The rule was evaluated at so many ticks up to this one; nanoseconds, both."""
+        """Count an evaluation at a number of ticks up to this one; `tick` and `spent` are nanoseconds."""
         self.ticks += ticks
         self.last_tick = tick
         self.time_ns += spent

@@ -145,7 +145,7 @@ class Engine:
             yield self._run((step,))
 
     def gap(self, time: int) -> list[Event]:
-        """The wall clock stood still or jumped: go on from `time`; windows begin anew, open episodes hold."""
+        """The wall clock stood still or jumped: go on from `time`; windows reset, open episodes hold."""
         return self._run(self._timeline.gap(time))
 
     def set_rules(self, rules: Sequence[CompiledRule]) -> list[Event]:
@@ -232,7 +232,7 @@ class Engine:
         self._wake_anew(self.now)
 
     def set_level(self, level: int) -> None:
-        """Leave out so many evaluations from now on (see load.py); 0: none."""
+        """Thin evaluations by this level from now on (see load.py); 0: none."""
         self.schedule.set_level(level)
         self._plan()
 
@@ -564,5 +564,5 @@ def _longest(detector: Detector) -> int:
 
 
 def _latched(detector: Detector) -> frozenset[str]:
-    """The streams whose samples hold until they are said anew."""
+    """The streams whose samples stay valid until they are replaced."""
     return frozenset(stream.name for stream in detector.spec.streams if stream.latched)

@@ -80,7 +80,7 @@ class RuleRun:
         self._states: dict[Subject, SubjectState] = {}
         self._open: dict[Subject, Episode] = {}
         self._muted: set[Subject] = set()
-        """Subjects in an episode beyond the budget: it runs its course, and nobody hears of it."""
+        """Subjects in an episode beyond the budget: it goes on, without events."""
         self._budget = Budget()
         self._answers: list[Answer] | None = None
         self.looked_at: list[Subject] = []
@@ -184,7 +184,7 @@ class RuleRun:
         """Take up an episode that was open before a restart, with the demands of its actions.
 
         Returns the event that told of its start then. Where an action is not what it was, its demand holds until it is
-        rendered anew, at the next evaluation.
+        rendered again, at the next evaluation.
         """
         self.disturbed = True
         deploys = {deploy.action: deploy.fixed for deploy in self.rule.deploys}
@@ -208,7 +208,7 @@ class RuleRun:
     def change_actions(self, rule: CompiledRule) -> None:
         """Go on with a rule that differs in nothing that decides which episodes there are.
 
-        The demands of actions that are gone go at once, those of changed ones hold until they are rendered anew.
+        The demands of actions that are gone go at once, those of changed ones hold until they are rendered again.
         """
         changed = {deploy.action for deploy in {*rule.deploys} ^ {*self.rule.deploys}}
         gone = changed - {deploy.action for deploy in rule.deploys}
@@ -303,7 +303,7 @@ class RuleRun:
         return episode is not None and (self._follows or not episode.is_complete(self.rule))
 
     def happened(self, now: int, what: Started | Ended, candidate: Candidate) -> Event | None:
-        """An episode of the subject started or ended; None where nobody hears of it."""
+        """An episode of the subject started or ended; None: it has no event."""
         subject = candidate.subject
         if isinstance(what, Ended):
             if subject in self._muted:

@@ -170,7 +170,7 @@ class Knowledge:
         return lost
 
     def gap(self, time: int, backwards: bool) -> None:
-        """Time went on from here without us, or (backwards) begins anew: windows do not reach back further."""
+        """Time went on from here without us, or (backwards) restarts: windows do not reach back further."""
         if backwards:
             self.buffer.step_back(time)
             self.tables.forget()

@@ -33,7 +33,7 @@ class Lane:
     )  # fmt: skip
 
     latched = False
-    """Whether what was said last holds until it is said anew; such lanes are the last that the cap over all empties."""
+    """Whether the last sample stays valid until replaced; the cap over all lanes empties such lanes last."""
 
     def __init__(
         self,

@@ -20,13 +20,13 @@ from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Sample, Sta
 from wayside.api import Detector
 
 MAXIMUM_CLIENTS = 100_000
-"""So many clients are known at a time; samples of further ones are dropped and counted."""
+"""Maximum number of known clients; samples of further ones are dropped and counted."""
 
 MAXIMUM_KEYS = 200_000
-"""So many keys of a stream are remembered; beyond, they are read anew, which is slower and otherwise the same."""
+"""Maximum number of cached keys of a stream; further ones are read each time, which is only slower."""
 
 MAXIMUM_LOST = 1_000
-"""Of so many lost clients the newest samples are kept, for the case that they return; those lost first go first."""
+"""Maximum number of lost clients whose newest samples are kept, in case they return; the oldest go first."""
 
 _STREAM = attrgetter("stream")
 

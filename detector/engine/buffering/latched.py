@@ -1,4 +1,4 @@
-"""Lanes of latched streams: what was said last holds, however long ago, until it is said anew.
+"""Lanes of latched streams: the last sample stays valid, however old, until it is replaced.
 
 What a sample speaks of is its key; of transforms (a /tf_static that several publishers share) the key and the frames.
 The newest sample about each is kept beyond the duration; caps push it out last of all.
@@ -67,7 +67,7 @@ class LatchedLane(Lane):
         return super().drop_oldest()
 
     def expire(self, now: int) -> int:
-        """Forget what is older than the duration and was said anew since; returns the bytes freed."""
+        """Forget what is older than the duration and was replaced since; returns the bytes freed."""
         horizon = now - self.duration
         if not self.samples or self.samples[0].time > horizon:
             return 0
@@ -75,7 +75,7 @@ class LatchedLane(Lane):
         return self._keep([s for s in self.samples if s.time > horizon or newest[self._about(s)] is s])
 
     def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
-        """See Lane; what is older than the duration is left out where the same was said anew since."""
+        """See Lane; leaves out what is older than the duration and was replaced since."""
         horizon = (until if now is None else now) - self.duration
         said: set[Hashable] = set()
         for sample in reversed(self.samples):

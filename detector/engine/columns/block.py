@@ -25,7 +25,7 @@ from wayside.expressions.columns.values import Column, value_at
 from wayside.rules import CompiledElement, CompiledRule
 
 _SUBJECTS = 100_000
-"""So many subjects of a rule are remembered."""
+"""Maximum number of cached subjects of a rule."""
 
 
 class Context(NamedTuple):

@@ -27,7 +27,7 @@ _OF_CLIENTS = frozenset({"client", "labels", "parameters"})
 """Variables that differ from client to client."""
 
 _REMEMBERED = 100_000
-"""Of so many clients the last result of CEL is remembered."""
+"""Maximum number of clients whose last result of CEL is cached."""
 
 
 class Condition(NamedTuple):
@@ -146,7 +146,7 @@ class Conditions:
     def _ask_point(
         self, block: Block, row: int, condition: Condition, point: int, true: Truths, false: Truths, times: int = 1
     ) -> None:
-        """Evaluate a condition by CEL at a point, and take the result for so many points from there on."""
+        """Evaluate a condition by CEL at a point, and take the result for `times` points from there on."""
         track, client = self._tracks[row], block.clients[point // len(block.ticks)]
         cache = self._cache.setdefault((row, condition.field), {})
         key = self._inputs(block, condition, point)

@@ -2,7 +2,7 @@
 
 All segments lie in one flat array. The key of a row is its client and its time in one integer, and the keys ascend over
 the whole array: so one binary search finds the windows of all clients at all ticks. A segment has room for more rows
-behind it; where that is used up, the table is packed anew with the rows that are still needed.
+behind it; when that is full, the table is packed again with the rows that are still needed.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Table:
         return len(self.end)
 
     def grow(self, clients: int) -> None:
-        """Have a place for at least so many clients."""
+        """Have a place for at least this number of clients."""
         more = clients - len(self.end)
         if more > 0:
             size = len(self.keys)
@@ -180,7 +180,7 @@ class Table:
             mark[client] = begin
 
     def _pack(self, counts: Integers, base: int) -> None:
-        """Move the rows that are still needed to new arrays, with room for so many new ones and more."""
+        """Move the rows that are still needed to new arrays, with room for `counts` new ones and more."""
         self._base = base
         live = self.end - self.first
         need = live + counts

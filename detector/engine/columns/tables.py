@@ -25,10 +25,10 @@ from wayside.rules import CompiledSignal
 _TIME = attrgetter("received")
 
 _MAXIMUM_TEXTS = 1_000_000
-"""Beyond so many different texts, tables are built anew: texts are never forgotten one by one."""
+"""Maximum number of different texts; beyond, tables are rebuilt: texts are never forgotten one by one."""
 
 _SPARE_COLUMNS = 16
-"""So many columns of rules that are gone do no harm."""
+"""Number of columns of removed rules that do no harm."""
 
 
 class Tables:
@@ -51,7 +51,7 @@ class Tables:
         self.users: dict[tuple[str, Used], list[tuple[RuleCounters, CompiledSignal]]] = {}
         """Who uses which columns of a stream."""
         self.version = 0
-        """Changes when tables are built anew: places and numbers from before mean nothing then."""
+        """Changes when tables are rebuilt: earlier places and numbers are invalid then."""
 
     def configure(
         self, detector: Detector, decoders: Mapping[str, Decoder], messages: Messages, counters: Counters
@@ -79,7 +79,7 @@ class Tables:
             self._tables[stream].marks.append(mark)
 
     def forget(self) -> None:
-        """Build all tables anew from the buffer, when they are needed next."""
+        """Rebuild all tables from the buffer when they are next needed."""
         self._stale = True
 
     def add(self, stream: str) -> Reader:
@@ -97,7 +97,7 @@ class Tables:
         return self._tables[stream]
 
     def mark(self, stream: str, owner: Hashable) -> int:
-        """The owner's mark in the stream's table: the same one each time, until tables are built anew."""
+        """The owner's mark in the stream's table: the same one each time, until tables are rebuilt."""
         self._asked.add((stream, owner))
         if (stream, owner) not in self._marks:
             self._marks[stream, owner] = self._tables[stream].mark()

@@ -21,7 +21,7 @@ from wayside.rules import CompiledAction, CompiledRule, CompiledWindow
 
 _WATCHED = 100
 _WATCHED_FOR = 10 * 10**9
-"""So many complete excerpts are watched for late samples, and so many nanoseconds."""
+"""Maximum number of complete excerpts that are watched for late samples, and for how many nanoseconds."""
 
 REPLACED = "the action was changed or removed"
 

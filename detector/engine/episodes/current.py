@@ -41,7 +41,7 @@ class Episode:
     demands: dict[str, Demand] = field(default_factory=dict)
     """By action; an action whose parameters cannot be rendered yet has none."""
     outdated: set[str] = field(default_factory=set)
-    """Actions that changed since: their demands hold until they can be rendered anew."""
+    """Actions that changed since: their demands hold until they can be rendered again."""
 
     def started(self, rule: CompiledRule, identity: Identity) -> Event:
         """The event of its start, with what is rendered for the rule's actions as they are now."""
@@ -90,7 +90,7 @@ class Episode:
         return changes
 
     def follow(self, rule: CompiledRule, variables: Mapping[str, Any], counters: RuleCounters) -> int:
-        """Evaluate anew the parameters of the actions that say so. Returns how many demands changed."""
+        """Evaluate the parameters of actions with `follow` again. Returns how many demands changed."""
         changes = 0
         for deploy in rule.deploys:
             demand = self.demands.get(deploy.action)

@@ -104,7 +104,7 @@ class Queries(Protocol):
 
 
 class BufferQueries:
-    """The queries, answered from the engine's buffer; made anew for each tick."""
+    """The queries, answered from the engine's buffer; there is a new one for each tick."""
 
     def __init__(
         self,

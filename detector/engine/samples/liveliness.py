@@ -12,7 +12,7 @@ LIVELINESS = "~liveliness"
 """The stream name of what happens to tokens; no Detector's stream can be called so."""
 
 MAXIMUM_TOKENS = 200_000
-"""So many tokens are known at a time; further ones are ignored and counted."""
+"""Maximum number of known tokens; further ones are ignored and counted."""
 
 
 class Token(Enum):

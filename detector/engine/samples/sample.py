@@ -52,7 +52,7 @@ class Stamped(msgspec.Struct, frozen=True, gc=False, order=True):
 
 
 Sample = Arrival | Stamped
-"""One message in the buffer. With clock Wall it is what the intake queued: nothing is made anew for every message."""
+"""One message in the buffer. With clock Wall it is what the intake queued: no message is copied."""
 
 
 class DecodeError(ValueError):

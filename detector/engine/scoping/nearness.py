@@ -23,7 +23,7 @@ Distance = Callable[[str, str], float]
 """Between two clients, in metres, as expressions see it."""
 
 FEW = 1024
-"""Up to so many pairs to compare, doing so is faster than building trees."""
+"""Maximum number of pairs for which comparing all is faster than building trees."""
 
 _ROUNDING = 1 + 1e-9
 _SLACK = 1e-6
@@ -31,7 +31,7 @@ _SLACK = 1e-6
 is `distance`. Points on the Earth are 6,400 km from the origin, so they are exact to a nanometre only."""
 
 ROOM = 4
-"""Up to so many times the wanted number of pairs is made, to be sorted exactly."""
+"""Up to this multiple of the wanted number of pairs is made, to be sorted exactly."""
 
 _HALVINGS = 40
 

@@ -51,7 +51,7 @@ class PluginHost(Protocol):
         """The rule was evaluated for these subjects: the state of all others goes."""
 
     def reset(self) -> None:
-        """Time jumped: all state goes, since windows begin anew."""
+        """Time jumped: all state goes, since windows reset."""
 
 
 class NoPlugins:
@@ -82,7 +82,7 @@ class PluginSignals:
         """By rule and subject its clients, of what may have state."""
 
     def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
-        """These rules are evaluated from now on; those that are not among `kept` begin anew."""
+        """These rules are evaluated from now on; those that are not among `kept` start without state."""
         self._subjects = {rule: subjects for rule, subjects in self._subjects.items() if rule in kept}
         self._host.configure(rules, kept)
 
@@ -95,7 +95,7 @@ class PluginSignals:
                 self._host.keep(rule, left)
 
     def gap(self) -> None:
-        """Time jumped: windows begin anew, and so do plugins."""
+        """Time jumped: windows reset, and so do plugins."""
         self._subjects.clear()
         self._host.reset()
 

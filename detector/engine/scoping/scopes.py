@@ -162,7 +162,7 @@ class Views:
         return frozenset((*role, signal.name) for signal in self._rule.signals if not possible(signal.stream, client))
 
     def left_out(self, pairs: int) -> None:
-        """So many pairs within reach were left out."""
+        """Count pairs within reach that were left out."""
         self._counters.crowded_pairs += pairs
 
 

@@ -11,7 +11,7 @@ from wayside.rules import CompiledRule, FleetSubject, PairSubject
 _PLAIN = frozenset({float, bool, str})
 
 _MEMBERS = 100
-"""So many members of the fleet go into an event; `count` says how many there are."""
+"""Maximum number of members of the fleet in an event; `count` is the number of all."""
 
 
 def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:

@@ -47,7 +47,7 @@ class Signals:
         self._floor = floor
 
     def gap(self, time: int) -> None:
-        """Windows begin anew: what lies before `time` no longer counts in them."""
+        """Reset windows: what lies before `time` no longer counts in them."""
         self._floor = time
         self._extracted.clear()
         self._picked = {key: last for key, last in self._picked.items() if last <= time}
@@ -148,7 +148,7 @@ class Signals:
     ) -> list[tuple[Sample, Value | Unknown]]:
         """The samples in the window with their values, newest first, without those that `where` leaves out.
 
-        `at_most` so many of them are looked for, from the newest or from the oldest on.
+        It looks for `at_most` of them, from the newest or from the oldest on.
         """
         key = (rule, signal.place, client)
         known = self._extracted.get(key, {})

@@ -197,7 +197,7 @@ class DataTimeline:
             self._wait(arrival, place)
 
     def _begin(self, stamp: int, backwards: bool) -> Gap:
-        """Time begins, or begins anew, with this stamp."""
+        """Time starts, or restarts, with this stamp."""
         early, self._early = self._early, []
         for latched_stamp, arrival in early:
             self._wait(arrival, min(latched_stamp, stamp))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 STEPS = (1, 2, 4, 8)
-"""Of so many evaluations one takes place, step by step."""
+"""By level: one in this number of evaluations takes place."""
 
 
 def highest_level(priorities: Collection[int]) -> int:

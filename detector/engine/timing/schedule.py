@@ -76,7 +76,7 @@ class Schedule:
         self._thinning = thinning(self.level, self._priorities)
 
     def thinning(self, rule: CompiledRule) -> int:
-        """Of so many evaluations of the rule, one takes place."""
+        """One in this number of the rule's evaluations takes place."""
         return 1 if rule.on_demand else self._thinning.get(rule.priority, 1)
 
     def is_thinned(self, rule: CompiledRule, now: int) -> bool:
@@ -97,7 +97,7 @@ class Schedule:
             thinned = count % self.thinning(rule) != 0
         wakes = self._wakes.get(rule.name, {})
         due = frozenset(subject for subject, time in wakes.items() if time <= now)
-        for subject in due:  # who is looked at says anew when to wake; who is gone does not
+        for subject in due:  # an evaluation sets the next wake again; a subject that is gone needs none
             del wakes[subject]
         return Only(frozenset() if thinned else clients, due), thinned
 
