@@ -95,6 +95,7 @@ class Tracer:
         self._time(block.ticks[0], block.ticks[-1])
         plan = self._plans.get(id(tracks))
         if plan is None:
+            self._flush_all()  # rules that were evaluated otherwise until now
             plan = self._plans[id(tracks)] = self._plan(tracks)
         if looked is None and not _has_texts(block):  # codes of texts may not last
             plan.waiting.append(Waiting(block, codes, numbers))
@@ -103,6 +104,10 @@ class Tracer:
             return
         self._flush(plan)
         self._note(plan, Seen([block]), codes, numbers, looked)
+
+    def _flush_all(self) -> None:
+        for plan in self._plans.values():
+            self._flush(plan)
 
     def _flush(self, plan: _Plan) -> None:
         """Note the blocks that wait."""
@@ -139,8 +144,7 @@ class Tracer:
 
     def trace(self) -> Trace:
         """All that was seen."""
-        for plan in self._plans.values():
-            self._flush(plan)
+        self._flush_all()
         found: dict[tuple[str, str], SubjectTrace] = {}
         self._of_clients(found)
         for (name, _), log in self._pairs.items():

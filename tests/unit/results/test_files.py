@@ -16,11 +16,13 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from detector.commands.replay import replay_files
+from detector.engine.timing.timeline import ORDER
+from detector.replay.intake_writer import IntakeWriter
 from detector.results import writing
 from detector.results.episodes import TIMES
 from detector.results.foxglove_file import path_of
 from detector.results.kinds import Kind, chosen
-from tests.unit.results.drives import SECOND, START, write
+from tests.unit.results.drives import SECOND, START, arrivals, documents, write
 from wayside.times import format_time, parse_time
 
 ALL = chosen([Kind.ALL])
@@ -251,3 +253,42 @@ def test_a_missing_package_is_named_before_the_replay(tmp_path: Path, monkeypatc
     with pytest.raises(writing.MissingExtraError, match=r"mcap needs foxglove: pip install 'wayside\[results\]'"):
         replay_files([recording], tmp_path / "out", detector, [rules], None, as_one=False, kinds=frozenset({Kind.MCAP}))
     assert not (tmp_path / "out").exists()
+
+
+def test_an_intake_file_whose_rules_change_on_the_way_has_results_too(tmp_path: Path) -> None:
+    detector, rules = documents(tmp_path)
+    samples = arrivals()
+    half = len(samples) // 2
+    writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams)
+    start = {"kind": "start", "version": ORDER, "holder": "desk", "detector": detector.to_json()}
+    first = [rule.to_json() for rule in rules]
+    first[0]["spec"]["signals"] = first[0]["spec"]["signals"][:1]  # blocks with texts are noted at once, others wait
+    writer.control(START - 1, {**start, "rules": first})
+    writer.arrivals(samples[:half])
+    changed = [rule.to_json() for rule in rules]
+    gear = {"name": "gear", "stream": "odom", "value": "msg.gear"}
+    pace = {"name": "pace", "stream": "odom", "value": "msg.speed"}
+    changed[0]["spec"] |= {"signals": [pace, gear], "when": "pace > 20"}
+    changed[0]["spec"]["until"] = "pace < 10"
+    changed[2]["spec"] |= {"when": "distance < 60", "signals": []}
+    middle = samples[half - 1].received
+    writer.control(middle, {"kind": "rules", "until": middle, "rules": changed})
+    writer.arrivals(samples[half:])
+    end = samples[-1].received
+    writer.control(end, {"kind": "end", "until": end, "finished": True})
+    writer.close()
+    replay_files([tmp_path / "intake.mcap"], tmp_path / "out", None, [], None, as_one=False, kinds=ALL)
+    rows = table_of(tmp_path / "out/episodes.parquet")
+    assert {row["reason"] for row in rows} >= {"RuleChanged", "Until"}
+    later = [row for row in rows if row["rule"] == "too-fast" and row["start_time"] > middle]
+    assert later
+    for row in later:
+        assert row["pace.start"] > 20
+        assert row["pace.max"] >= row["pace.start"]
+    data = report_data((tmp_path / "out/report.html").read_text())
+    assert data["streams"][0]["samples"] == len(samples)
+    assert sum(rule["episodes"] for rule in data["rules"]) == len(rows)
+    for subject in data["subjects"]:
+        times = [data["series"][place]["t"] for place in subject["signals"].values()]
+        times += [steps["t"] for steps in subject["conditions"].values()]
+        assert all(difference >= 0 for each in times for difference in each)
