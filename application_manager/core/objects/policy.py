@@ -10,6 +10,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
+from application_manager.core.objects.podspecs import NamedAccount, PodSpec, pods_and_accounts
+
 KindKey = tuple[str, str]
 """apiVersion and kind."""
 
@@ -43,15 +45,6 @@ _NEVER_GROUPS = frozenset(
         "wayside.dev",
     }
 )
-
-_POD_SPECS: Mapping[str, tuple[str, ...]] = {
-    "Pod": ("spec",),
-    "Deployment": ("spec", "template", "spec"),
-    "StatefulSet": ("spec", "template", "spec"),
-    "DaemonSet": ("spec", "template", "spec"),
-    "Job": ("spec", "template", "spec"),
-    "CronJob": ("spec", "jobTemplate", "spec", "template", "spec"),
-}
 
 _TOKEN_SECRET = "kubernetes.io/service-account-token"  # noqa: S105  a type of Secret, not one
 
@@ -101,26 +94,30 @@ class Policy:
         """Field and problem of each thing in the manifest's pods that is not allowed."""
         if manifest.get("kind") == "Secret" and manifest.get("type") == _TOKEN_SECRET:
             yield "type", f"{_TOKEN_SECRET} would hold a service account's token: remove it"
-        path = _POD_SPECS.get(str(manifest.get("kind")))
-        spec = _pod_spec(manifest)
-        if path is None or spec is None:
-            return
-        where = ".".join(path)
-        account = spec.get("serviceAccountName", spec.get("serviceAccount", "default"))
+        for found in pods_and_accounts(manifest):
+            if isinstance(found, NamedAccount):
+                yield from self._account_problems(found.where, found.account)
+                continue
+            spec, where = found.spec, found.where
+            account = spec.get("serviceAccountName", spec.get("serviceAccount", "default"))
+            refused = list(self._account_problems(f"{where}.serviceAccountName", account))
+            yield from refused
+            if not refused and account == "default":
+                yield from _token_problems(spec, where)
+
+    def _account_problems(self, where: str, account: Any) -> Iterator[tuple[str, str]]:
         if account not in self.service_accounts:
             listed = ", ".join(sorted(self.service_accounts))
             yield (
-                f"{where}.serviceAccountName",
+                where,
                 f"{account!r} is not of the service accounts that the administrator lists: use one of {listed}",
             )
-        elif account == "default":
-            yield from _token_problems(spec, where)
 
     def completed(self, manifest: dict[str, Any]) -> dict[str, Any]:
         """The manifest, in place, with the token of the account `default` kept out of its pods."""
-        spec = _pod_spec(manifest)
-        if spec is not None and spec.get("serviceAccountName", "default") == "default":
-            spec.setdefault("automountServiceAccountToken", False)
+        for found in pods_and_accounts(manifest):
+            if isinstance(found, PodSpec) and found.spec.get("serviceAccountName", "default") == "default":
+                found.spec.setdefault("automountServiceAccountToken", False)
         return manifest
 
 
@@ -129,13 +126,6 @@ def _parse_kind(text: str) -> KindKey:
     if not slash or not api_version or not kind[:1].isupper():
         raise ValueError(f"{text!r} is no kind: write apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service")
     return api_version, kind
-
-
-def _pod_spec(manifest: dict[str, Any]) -> dict[str, Any] | None:
-    here: Any = manifest
-    for part in _POD_SPECS.get(str(manifest.get("kind")), ("",)):
-        here = here.get(part) if isinstance(here, dict) else None
-    return here if isinstance(here, dict) else None
 
 
 def _token_problems(spec: dict[str, Any], where: str) -> Iterator[tuple[str, str]]:

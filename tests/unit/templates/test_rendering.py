@@ -147,6 +147,43 @@ def test_what_a_template_may_not_do_is_said_with_its_place(path: str, value: Any
         assert part in message
 
 
+ANYWHERE = [
+    ("apps/v1", "ReplicaSet", "spec.template.spec"),
+    ("argoproj.io/v1alpha1", "Rollout", "spec.template.spec"),
+    ("serving.knative.dev/v1", "Service", "spec.template.spec"),
+    ("example.dev/v1", "Fleet", "spec.members[0].pod"),
+]
+
+
+def making_pods(api_version: str, kind: str, where: str, pod: dict[str, Any]) -> dict[str, Any]:
+    inside = {"members": [{"pod": pod}]} if "members" in where else {"template": {"spec": pod}}
+    return {"apiVersion": api_version, "kind": kind, "metadata": {"name": "app"}, "spec": inside}
+
+
+@pytest.mark.parametrize(("api_version", "kind", "where"), ANYWHERE)
+def test_a_pod_is_judged_by_its_shape_whatever_kind_it_is_in(api_version: str, kind: str, where: str) -> None:
+    policy = Policy(kinds=frozenset({(api_version, kind)}))
+    containers = [{"name": "main", "image": "app:1"}]
+    manifest = making_pods(api_version, kind, where, {"containers": containers, "serviceAccountName": "admin"})
+    assert list(policy.pod_problems(manifest)) == [
+        (f"{where}.serviceAccountName", "'admin' is not of the service accounts that the administrator lists: "
+         "use one of default")
+    ]  # fmt: skip
+    mounting = making_pods(api_version, kind, where, {"containers": containers, "automountServiceAccountToken": True})
+    assert [field for field, _ in policy.pod_problems(mounting)] == [f"{where}.automountServiceAccountToken"]
+    plain = policy.completed(making_pods(api_version, kind, where, {"containers": containers}))
+    assert list(policy.pod_problems(plain)) == []
+    assert "'automountServiceAccountToken': False" in str(plain)
+
+
+def test_an_account_that_a_kind_names_outside_of_a_pod_has_to_be_listed_too() -> None:
+    policy, workflow = Policy(), {"apiVersion": "argoproj.io/v1alpha1", "kind": "Workflow", "metadata": {"name": "w"}}
+    assert [field for field, _ in policy.pod_problems(workflow | {"spec": {"serviceAccountName": "admin"}})] == [
+        "spec.serviceAccountName"
+    ]
+    assert list(policy.pod_problems(CONFIG | {"data": {"serviceAccountName": "admin", "containers": "none"}})) == []
+
+
 def test_what_does_not_compile_and_what_there_is_not_are_told_together() -> None:
     manifest = changed(DEPLOYMENT, "spec.replicas", "${parameters.n}")
     manifest = changed(manifest, "spec.template.spec.containers.0.args", ["${1 +}", "${instance.nam}"])

@@ -1,0 +1,32 @@
+"""A pod runs with the accounts that the administrator lists, whatever kind it is in."""
+
+from __future__ import annotations
+
+from application_manager.core.claims.claims import instance_name
+from tests.cluster.api import Api
+from tests.cluster.managed_world import condition, deployment, start_manager, task, template
+from tests.cluster.processes import Processes
+
+
+def test_an_account_that_is_not_listed_is_refused_in_a_kind_that_the_manager_does_not_know(
+    api: Api, processes: Processes, namespace: str
+) -> None:
+    """ReplicaSets are not of the default kinds; what an administrator adds is looked at all the same."""
+    start_manager(processes, namespace, "--allowed-kinds", "apps/v1/ReplicaSet")
+    made = deployment() | {"kind": "ReplicaSet"}
+    api.create(template("fine", manifests=[made]))
+    api.create(task("north", of="fine"))
+    running = api.wait_for("ReplicaSet", instance_name("fine", "north"), lambda _: True, what="one without is made")
+    assert running["spec"]["template"]["spec"]["automountServiceAccountToken"] is False
+
+    made["spec"]["template"]["spec"]["serviceAccountName"] = "admin"
+    api.create(template("bad", manifests=[made]))
+    refused = api.wait_for(
+        "ApplicationTemplate",
+        "bad",
+        lambda raw: condition(raw, "Accepted").get("status") == "False",
+        what="the account is refused",
+    )
+    message = condition(refused, "Accepted")["message"]
+    for part in ("spec.manifests[0].spec.template.spec.serviceAccountName", "'admin'", "use one of default"):
+        assert part in message
