@@ -230,9 +230,13 @@ class Blocks:
         self._depths: list[list[RuleGroup | PairGroup]] = []
         """First the groups whose rules look at no episodes of others, then those that look at episodes of these, …"""
         self._groups: list[RuleGroup | PairGroup] = []
+        self._ahead: list[Happened] = []
+        """What happened at ticks that others still wait for."""
         self._on_sample: dict[str, RuleGroup] = {}
         self.with_samples: Mapping[str, Sequence[RuleRun]] = {}
         """By stream, the rules that are evaluated with its samples."""
+        self.hurries = False
+        """Whether there are groups for `run_ahead`."""
         self.names: frozenset[str] = frozenset()
         """The rules that are evaluated here."""
 
@@ -272,6 +276,7 @@ class Blocks:
             period = every * thinning(run)
             self._depths[depth].append(PairGroup(run, orders[run.rule.name], self._context, every, period))
         self._groups = [group for groups in self._depths for group in groups]
+        self.hurries = any(not group.may_wait for groups in self._depths[:1] for group in groups)
         self._on_sample = {
             stream: RuleGroup(chosen, orders, self._context, 0, 0) for stream, chosen in by_stream.items()
         }
@@ -306,24 +311,37 @@ class Blocks:
         """Evaluate the groups at this tick later. Returns whether enough points wait to evaluate them now."""
         clients = len(self._context.clients)
         full = False
+        ahead = self._depths[0] if self._depths else ()
         for group in groups:
             group.waiting.append(time)
-            full = full or len(group.waiting) * max(clients, 1) * group.width > _POINTS * 10 or not group.may_wait
+            full = full or len(group.waiting) * max(clients, 1) * group.width > _POINTS * 10
+            full = full or not (group.may_wait or group in ahead)
         return full
 
     @property
     def waiting(self) -> bool:
         """Whether there are ticks that are not evaluated yet."""
-        return any(group.waiting for group in self._groups)
+        return bool(self._ahead) or any(group.waiting for group in self._groups)
 
     @property
     def since(self) -> int:
         """The first tick that is not evaluated yet; there is one."""
-        return min(group.waiting[0] for group in self._groups if group.waiting)
+        first = [group.waiting[0] for group in self._groups if group.waiting]
+        return min([*first, *(each.time for each in self._ahead[:1])])
+
+    def run_ahead(self, stopwatch: Callable[[], int]) -> None:
+        """Evaluate the groups that take one tick at a time, while the others wait. `run` returns their events."""
+        clients = [*self._context.clients]
+        for group in self._depths[0]:
+            if group.waiting and not group.may_wait:
+                ticks, group.waiting = group.waiting, []
+                self._ahead += self._noted(
+                    _timed(group, ticks, stopwatch, group.evaluate(ticks, clients, self._floor()))
+                )
 
     def run(self, stopwatch: Callable[[], int]) -> list[Happened]:
         """Evaluate all ticks that wait; what happened, in order."""
-        happened: list[Happened] = []
+        happened, self._ahead = self._ahead, []
         clients = [*self._context.clients]
         for groups in self._depths:
             found: list[Happened] = []

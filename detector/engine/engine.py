@@ -94,6 +94,8 @@ class Engine:
         """Rules that have not looked yet who was lost."""
         self._last_wait = start
         """The last tick that waits to be evaluated."""
+        self._unsorted: int | None = None
+        """From where on the journal is not in order yet; None: it is."""
         self.journal: list[Change] | None = None
         """What became of demands, in order; None while nobody wants to know."""
         self.observer: Observer | None = None
@@ -373,7 +375,8 @@ class Engine:
 
     def _in_columns(self) -> list[Happened]:
         """Evaluate what waits, and put in order what happened."""
-        noted = 0 if self.journal is None else len(self.journal)
+        noted = self._unsorted if self._unsorted is not None else 0 if self.journal is None else len(self.journal)
+        self._unsorted = None
         happened = self._blocks.run(self.stopwatch)
         if self.journal is not None:
             self.journal[noted:] = sorted(
@@ -402,6 +405,12 @@ class Engine:
         self._last_wait = time
         if self._blocks.wait(time, groups) or self.consequences.wanted:
             events += self._evaluate_waiting()
+        elif self._blocks.hurries:
+            if self._unsorted is None and self.journal is not None:
+                self._unsorted = len(self.journal)
+            self._known.settle()
+            self._blocks.run_ahead(self.stopwatch)
+            self._known.looked(self.now)
         return events
 
     def _is_alone(self, tick: Tick, groups: Sequence[RuleGroup | PairGroup]) -> bool:

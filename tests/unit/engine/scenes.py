@@ -1,4 +1,4 @@
-"""Random scenes for rules about clients and the fleet: rules, what comes in, and what is done to the engine meanwhile.
+"""Random scenes: rules of every scope, what comes in, and what is done to the engine meanwhile.
 
 A scene follows from its seed. It is driven in cuts: each is one call of `Engine.advance`.
 """
@@ -151,6 +151,18 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
         signal, form = random.choice(_OVER)
         signals.append({"name": "over", "rule": f"r{random.randrange(number)}", **signal})
         spec["when"] = random.choice(["{1}", "{1} && ({0})", "({0}) || {1}"]).format(spec["when"], form)
+    if kind == "pairs":
+        position = {"stream": "p", "x": "msg.q.w", "y": "msg.q.z", "maxAge": "1s"}
+        spec["scope"] = {"pairs": {"position": position, "within": 3}}
+        condition = spec["when"]
+        for name, _ in names:
+            condition = condition.replace(name, f"a.{name}")
+        for variable in ("labels.", "client ", "streams"):
+            condition = condition.replace(variable, f"b.{variable}")
+        spec["when"] = random.choice(["distance < 1.5", "closingSpeed > 0.1", f"distance < 2 && ({condition})"])
+        if random.random() < 0.5:
+            spec["until"] = "distance > 2"
+        return a_rule(f"r{number}", **spec)
     if kind == "fleet":
         spec["when"] = _fleet_condition(random, names, each)
         spec["scope"] = {"fleet": {"members": _members(random, names)}}
@@ -236,7 +248,7 @@ def a_scene(seed: int) -> Scene:
                  {"name": "c1", "labels": {"kind": "car"}, "parameters": {f"r{random.randrange(5)}": {"f": 2.5}}}],
     )  # fmt: skip
     mixed = random.random() < 0.5
-    kinds = ["client"] * 2 + (random.choices(["client", "over", "fleet"], k=3) if mixed else ["client"] * 3)
+    kinds = ["client"] * 2 + (random.choices(["client", "over", "fleet", "pairs"], k=3) if mixed else ["client"] * 3)
     rules = [a_random_rule(random, number, kind) for number, kind in enumerate(kinds)]
     arrivals = _arrivals(random, data)
     operations, done = [Operation("rules", rules)], 0
@@ -318,8 +330,9 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
                     begin = end
         events += [event.to_json() for event in found]
         demands.append(sorted((name, str(each.parameters)) for name, each in engine.demands().items()))
+    # A sample that cannot be read counts once for each time at which somebody reads it.
     counted = {name: _counted(each) for name, each in sorted(engine.counters.rules.items())}
-    return Outcome(events, demands, {**counted, "undecodable": dict(engine.counters.undecodable)})
+    return Outcome(events, demands, {**counted, "undecodable": sorted(engine.counters.undecodable)})
 
 
 def _nobody(_: Sight) -> None:
