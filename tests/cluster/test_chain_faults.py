@@ -175,6 +175,6 @@ def test_the_intake_of_a_killed_detector_can_be_replayed_up_to_the_cut(
 def newest(intake: Path) -> int:
     """The newest receive time in an intake file that is being written, in nanoseconds since the epoch; 0: none yet."""
     try:
-        return max((each[0] for each in read_intake(intake) if isinstance(each, Arrival)), default=0)
+        return max((each.received for each in read_intake(intake) if isinstance(each, Arrival)), default=0)
     except RecordingError:
         return 0  # its beginning is not yet written
