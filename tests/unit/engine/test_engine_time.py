@@ -97,7 +97,7 @@ def in_one_go(detector: Any, arrivals: list[Arrival], until: float) -> list[str]
     return lines(an_engine(detector, *RULES).advance(arrivals, at(until)))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(drives(), st.lists(st.integers(1, 110), max_size=12), st.booleans())
 def test_however_the_arrivals_are_split_the_events_are_the_same_to_the_byte(
     drive: list[tuple[float, str, str, dict[str, float]]], cuts: list[int], data: bool
@@ -114,7 +114,7 @@ def test_however_the_arrivals_are_split_the_events_are_the_same_to_the_byte(
     assert lines(events) == in_one_go(detector, arrivals, 12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(drives(), st.integers(1, 5))
 def test_samples_stamped_while_the_intake_is_emptied_enter_after_the_ticks_before_them(
     drive: list[tuple[float, str, str, dict[str, float]]], size: int
@@ -131,7 +131,7 @@ def test_samples_stamped_while_the_intake_is_emptied_enter_after_the_ticks_befor
     assert lines(events) == in_one_go(WALL, arrivals, 12)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(drives(), st.data())
 def test_with_clock_data_the_order_of_arrival_makes_no_difference_within_the_lateness(
     drive: list[tuple[float, str, str, dict[str, float]]], data: st.DataObject
