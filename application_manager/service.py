@@ -161,7 +161,7 @@ class Manager:
         await self._listing.first()
 
     def _lacks(self, watching: asyncio.Event) -> str | None:
-        if not watching.is_set():
+        if not watching.is_set() or not self._pulse.begun("applicationtasks"):
             return "not everything is listed and watched yet"
         return None if self._work.world.healthy.reached else "the API server does not answer"
 

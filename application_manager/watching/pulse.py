@@ -68,6 +68,10 @@ class Pulse(Collector):
             self.limit,
         )
 
+    def begun(self, resource: str) -> bool:
+        """Whether a watch of the resource has begun."""
+        return any(each == resource for each, _ in self._beats.copy())
+
     def dead(self) -> str | None:
         """The watch that has had no sign of life for too long while the API server answered, in words."""
         now = self._healthy()
