@@ -19,7 +19,7 @@ from detector.assembly import detector_problems
 from detector.memory import tune_garbage_collection
 from detector.restoring import what_was_open
 from detector.rules.files import load_rules
-from detector.rules.following import follow_files
+from detector.rules.following import follow_files, hangups
 from detector.running import Running
 from detector.state import state_file
 from detector.tracing import EpisodeTraces, episode_traces
@@ -89,6 +89,7 @@ async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces 
 async def _run_from_files(
     files: Files, options: Options, stopping: asyncio.Event, traces: EpisodeTraces | None
 ) -> None:
+    changed = hangups()
     loaded = load_rules(files.detector, files.rules, detector_problems)
     for warning in loaded.warnings:
         _log.warning("%s", warning)
@@ -106,7 +107,7 @@ async def _run_from_files(
                 loaded.rule_set, holder, reconciler, files.output, record, restored, port, state, traces
             ) as running:
                 following = group.create_task(
-                    running.follow(follow_files(files.detector, files.rules, detector_problems))
+                    running.follow(follow_files(files.detector, files.rules, detector_problems, changed))
                 )
                 await running.until(stopping)
                 following.cancel()

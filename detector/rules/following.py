@@ -15,11 +15,17 @@ from wayside.api.documents import DocumentError
 _log = logging.getLogger(__name__)
 
 
-async def follow_files(detector: Path, rules: Sequence[Path], check: Check) -> AsyncIterator[RuleSet]:
-    """What the files say, at each SIGHUP. Files that are wrong are said, and change nothing."""
+def hangups() -> asyncio.Event:
+    """An event that every SIGHUP sets from now on. Call it before the files are first read, so that none is lost."""
     changed = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    loop.add_signal_handler(signal.SIGHUP, changed.set)
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, changed.set)
+    return changed
+
+
+async def follow_files(
+    detector: Path, rules: Sequence[Path], check: Check, changed: asyncio.Event
+) -> AsyncIterator[RuleSet]:
+    """The content of the files each time `changed` is set. Wrong files are logged and change nothing."""
     try:
         while True:
             await changed.wait()
@@ -34,4 +40,4 @@ async def follow_files(detector: Path, rules: Sequence[Path], check: Check) -> A
             _log.info("the files are read again: %d rules", len(loaded.rule_set.rules))
             yield loaded.rule_set
     finally:
-        loop.remove_signal_handler(signal.SIGHUP)
+        asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
