@@ -38,8 +38,8 @@ from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork
 from application_manager.work.templates import TemplateWork
 from application_manager.work.workqueue import Key, WorkQueue
+from application_manager.workers.answers import AnswerCache
 from application_manager.workers.claiming import Claiming
-from application_manager.workers.desk import Desk
 from application_manager.workers.pool import Pool
 from wayside.tracing import Tracing
 
@@ -116,8 +116,8 @@ class Assembly:
         )
         self.queues = (*queues, self._configurations)
         self.pool = Pool(measures, options.cpu_time)
-        self._desk = Desk(self.pool)
-        self._claiming = Claiming(self._desk, self._claimed)
+        self._answers = AnswerCache(self.pool)
+        self._claiming = Claiming(self._answers, self._claimed)
         self.world.claims.claim_of = self._claiming
         self.router = Router(
             self.world,
@@ -144,7 +144,11 @@ class Assembly:
         cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
         self.charts = ChartDesk(options.helm, cache, self._instances.add_at)
         self._renderings = Renderings(
-            self.world, self._desk, self.charts.outcome, lambda name, _: self._instances.add(name), self._templates.add
+            self.world,
+            self._answers,
+            self.charts.outcome,
+            lambda name, _: self._instances.add(name),
+            self._templates.add,
         )
         self._instance_work = InstanceWork(
             world=self.world,
@@ -194,7 +198,7 @@ class Assembly:
 
     async def close(self) -> None:
         """End what works in the background."""
-        await self._desk.close()
+        await self._answers.close()
         await self.pool.close()
         await self.charts.close()
 

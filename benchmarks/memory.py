@@ -1,8 +1,8 @@
 """How many bytes a buffered sample costs beside its payload, with one rule that reads a field of each.
 
 An engine takes in small samples of many clients that it keeps all. Measured is the growth of the process's resident
-memory for each sample, without the payload and without 8 bytes for the field that is read: what is left is compared
-with the bound.
+memory for each sample, minus the payload and 8 bytes for the field that the rule reads. The rest is compared with the
+bound.
 
     python -m benchmarks.memory [--clients 100] [--samples 1000000] [--bound 200]
 
@@ -28,7 +28,7 @@ FIELD = 8
 """Bytes: the number that the rule reads."""
 
 WARM = 0.1
-"""The share of the samples that comes first and does not count: what is there once is there after it."""
+"""The share of samples that comes first and does not count: one-time allocations happen there."""
 
 
 def main() -> int:

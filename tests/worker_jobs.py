@@ -18,7 +18,7 @@ TEXT = "".join(random.Random(1).choices("ab", k=4000))  # without a pattern, so 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The bomb, on so many items."""
+    """The bomb, on `items` items."""
 
     items: int
 

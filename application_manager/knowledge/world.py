@@ -75,7 +75,7 @@ class World:
         deadlines: by instance, its uid and the release time last decided; ahead of its status as well, since a status
             may be written long after what it says was decided.
         limit: how many instances a namespace may have; None: any number.
-        exceeded: by template, the instances whose rendering takes more than it may, and what is said of it.
+        exceeded: by template, the instances whose rendering exceeds its limit, and the message.
     """
 
     policy: Policy

@@ -27,7 +27,7 @@ WATCH_TIMEOUT = 90.0
 NEVER = 10 * 365 * 86400.0
 """Seconds: for kopf's own timeout."""
 
-_LIMITS = 2  # and so many times the timeout until the manager ends, while the API server answers
+_LIMITS = 2  # multiple of the timeout after which the manager ends, while the API server answers
 
 Watch = tuple[str, str]
 """Resource and namespace; empty: all."""

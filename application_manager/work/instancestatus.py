@@ -190,7 +190,7 @@ class InstanceStatusWork:
                 missing.append(f"{kind} {name} {problem}")
         if not objects:
             return Aspect("Ready", False, "NotApplied", "nothing is applied yet")
-        if not applied.holds:  # what was applied before may run, and is not what is wanted
+        if not applied.holds:  # the previous version may run, but it is not the wanted one
             return Aspect("Ready", False, applied.reason, f"not applied: {applied.message}")
         if instance.spec.suspended:
             return Aspect("Ready", False, "Suspended", "the instance is suspended")

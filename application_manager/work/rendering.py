@@ -18,7 +18,7 @@ from application_manager.core.demand import drafting
 from application_manager.core.objects.charts import ChartFailure, ChartOutcome, ChartRequest, Charts
 from application_manager.core.objects.rendering import Rendering
 from application_manager.knowledge.world import World
-from application_manager.workers.desk import Desk, Exceeded
+from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.jobs import Problem, RenderJob
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
@@ -31,7 +31,7 @@ class Renderings:
     def __init__(
         self,
         world: World,
-        desk: Desk,
+        answers: AnswerCache,
         charts: Charts,
         again: Callable[[Name, float], None],
         template_changed: Callable[[Name], None],
@@ -40,13 +40,13 @@ class Renderings:
 
         Args:
             world: the policy, and what exceeded.
-            desk: has the renderings worked out.
+            answers: has the renderings worked out.
             charts: knows what became of a chart.
             again: asks for an instance at a time, in seconds since 1970.
             template_changed: asks for a template whose renderings exceed the limit, or do so no more.
         """
         self._world = world
-        self._desk = desk
+        self._answers = answers
         self._charts = charts
         self._again = again
         self._template_changed = template_changed
@@ -79,7 +79,7 @@ class Renderings:
     def forget(self, name: Name) -> None:
         """Drop what is known of an instance that is gone."""
         for kind in ("rendering", "chart"):
-            self._desk.forget((kind, *name))
+            self._answers.forget((kind, *name))
         for template in [each for each, instances in self._world.exceeded.items() if name in instances]:
             self._note(name, template, Problem("", ""))
 
@@ -89,7 +89,7 @@ class Renderings:
         name = (wanted.namespace, wanted.name)
         metadata = template.metadata
         bare = wanted.model_copy(update={"status": None})
-        return self._desk.answer(
+        return self._answers.answer(
             key=(kind, *name),
             question=(metadata.uid, metadata.generation, wanted.spec, chart),
             namespace=wanted.namespace,

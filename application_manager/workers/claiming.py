@@ -15,7 +15,7 @@ from typing import Any
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, Refused
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished, refused
-from application_manager.workers.desk import Desk, Exceeded
+from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.jobs import ClaimJob
 from wayside.api import ApplicationTask, ApplicationTemplate
 
@@ -28,9 +28,9 @@ _PLAIN = re.compile(r"\$\{\s*parameters(?:\.[A-Za-z_]\w*)+\s*\}")
 class Claiming:
     """Works out claims."""
 
-    def __init__(self, desk: Desk, done: Callable[[Name], None]) -> None:
+    def __init__(self, answers: AnswerCache, done: Callable[[Name], None]) -> None:
         """`done` is called with a task once its claim is there."""
-        self._desk = desk
+        self._answers = answers
         self._done = done
 
     def __call__(
@@ -44,7 +44,7 @@ class Claiming:
             return over
         name = (task.namespace, task.name)
         metadata, spec = template.metadata, task.spec
-        found = self._desk.answer(
+        found = self._answers.answer(
             key=("claim", *name),
             question=(metadata.uid, metadata.generation, task.metadata.uid, spec.operation, spec.parameters),
             namespace=task.namespace,
@@ -63,7 +63,7 @@ class Claiming:
 
     def forget(self, name: Name) -> None:
         """Drop what is known of a task that is gone."""
-        self._desk.forget(("claim", *name))
+        self._answers.forget(("claim", *name))
 
 
 def _is_plain(template: ApplicationTemplate) -> bool:

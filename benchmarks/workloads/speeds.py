@@ -35,7 +35,7 @@ class Limits(NamedTuple):
 
 
 def limits(count: int) -> list[Limits]:
-    """Of so many rules; each differs from the others, and every client crosses each of them about every 9 s."""
+    """The limits of `count` rules. All differ, and every client crosses each about every 9 s."""
     found = []
     for number in range(count):
         window, step = number % LONGEST + 1, number // LONGEST % 10

@@ -310,7 +310,7 @@ class Engine:
         return self._known.queries(self.now)
 
     def _plan(self) -> None:
-        """Rules, or what is left out, changed: which rules are evaluated in columns, and which together."""
+        """Decide which rules are evaluated in columns, and which together, after rules or thinning changed."""
         if self._known.tables.full:
             self._known.new_tables()
         self._make_blocks()

@@ -17,7 +17,7 @@ EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x"
 _BLOCK = 1 << 17
 """About how many bytes of lines make a batch."""
 _TAIL = 1 << 16
-"""The last line is looked for in so many bytes."""
+"""Number of bytes at the end of a file in which the last line is searched."""
 
 
 class _Line(msgspec.Struct, forbid_unknown_fields=True, gc=False):

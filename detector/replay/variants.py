@@ -17,7 +17,7 @@ from wayside.api.wording import messages
 from wayside.inputerror import InputError
 
 _MOST = 100
-"""So many variants at most."""
+"""Maximum number of variants."""
 _RANGE = re.compile(r"(-?[0-9.eE+-]+):(-?[0-9.eE+-]+):([0-9.eE+-]+)")
 
 

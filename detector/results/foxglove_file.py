@@ -25,7 +25,7 @@ from detector.results.thinning import thinned
 from wayside.times import format_time
 
 MOST = 200_000
-"""About so many messages about values: longer series keep their minimum and maximum of equal parts of the time."""
+"""Approximate limit of messages about values: longer series keep minimum and maximum of equal parts of the time."""
 
 _TYPES = {Kind.NUMBER: "number", Kind.BOOLEAN: "boolean", Kind.TEXT: "string"}
 _SIGNS = {"+": "plus", "-": "minus", "*": "times", "/": "by"}

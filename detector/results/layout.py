@@ -10,7 +10,7 @@ from detector.results.scene import FRAME
 from detector.results.series import Kind, SubjectTrace
 
 _SUBJECTS = 3
-"""Of so many subjects of each rule values are plotted: those with most episodes."""
+"""Maximum number of subjects of a rule with plotted values: those with most episodes."""
 
 
 def layout_of(result: Result) -> str:

@@ -29,15 +29,15 @@ from wayside.manifests import to_yaml
 from wayside.times import format_time
 
 MOST = 140_000
-"""About so many points of series are in a page."""
+"""Approximate limit of points of series in a page."""
 _WIDEST = 1500
-"""So many parts of the time are told apart at most: more pixels than a plot has."""
+"""Maximum number of parts of the time in a series: more than a plot has pixels."""
 _WAY = 600
-"""So many places of a client are on the map at most."""
+"""Maximum number of places of a client on the map."""
 _VALUES = 2000
-"""Of so many episodes of a page the values are listed; the others have their times."""
+"""Maximum number of episodes of a page with values; the others have times only."""
 _DEEDS = 2000
-"""So many rows of what actions would have done are listed at most; the number of all is given."""
+"""Maximum number of listed rows of what actions would have done; the page gives the number of all."""
 
 
 def write_report(path: Path, result: Result) -> None:

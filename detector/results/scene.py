@@ -34,7 +34,7 @@ FRAME = "map"
 _STEP = 200_000_000
 """Nanoseconds: the scene is written no more often, but at each start and end of an episode."""
 _MOST = 2000
-"""So many updates at most, besides."""
+"""Maximum number of further updates."""
 _KEPT = 1_000_000_000
 """Nanoseconds: a client is shown for so long after its last place."""
 _EARTH = 6_371_000.0

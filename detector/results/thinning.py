@@ -8,7 +8,7 @@ from detector.results.series import Integers, Series
 
 
 def thinned(series: Series, begin: int, end: int, buckets: int, exact: Integers) -> Series:
-    """The series with the minimum and the maximum of each of so many equal parts of the time, and with exact points.
+    """The series with the minimum and the maximum of each of `buckets` equal parts of the time, and with exact points.
 
     What stays besides: the first and the last point, where it becomes known or unknown, and what holds at the times
     `exact` and before each of them.

@@ -37,7 +37,7 @@ from wayside.expressions.columns.values import Tag
 from wayside.rules import PairSubject
 
 _POINTS = 20_000
-"""So many points, clients and ticks, are noted together."""
+"""Number of points (client and tick) that are noted together."""
 
 
 class _Plan(NamedTuple):

@@ -14,7 +14,7 @@ from wayside.api.stream import Encoding
 _STALE_S = 5.0
 """The default of staleAfter."""
 _MISSED = 3
-"""A stream is stale when so many samples in a row are missing."""
+"""A stream is stale when this number of samples in a row is missing."""
 _ALONE = "vehicle"
 """The client of keys that name none."""
 

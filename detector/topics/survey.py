@@ -17,9 +17,9 @@ from detector.topics.shape import Shape
 from wayside.api.stream import Encoding
 
 _SAMPLES = 512
-"""So many messages of a key are looked at, at most; evenly, whatever their number."""
+"""Maximum number of messages of a key that are looked at, spread evenly."""
 _BYTES = 64 << 20
-"""So many bytes of samples of a key are kept at most."""
+"""Maximum number of bytes of samples kept for a key."""
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from tests.cluster.processes import Processes
 
 MANY = 150
 AHEAD = MANY // 2
-"""Of the many, so many may be written before the one that comes last; of those that take no turns it would be all."""
+"""Maximum number of the many that may be written before the last one; without turns it would be all."""
 
 
 def test_a_flood_in_one_namespace_delays_neither_what_another_applies_nor_its_statuses(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from application_manager.measures import Measures
-from application_manager.workers.desk import Desk, Exceeded
+from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.pool import ExceededError, JobError, Pool
 from tests.worker_jobs import Defective, Evaluation, Greedy, KilledOnce, Where
 
@@ -123,15 +123,15 @@ def test_at_the_end_the_processes_go_whatever_they_do() -> None:
 
 def test_an_answer_is_kept_for_its_question_and_one_that_exceeds_is_not_worked_out_again() -> None:
     async def work(pool: Pool) -> None:
-        desk = Desk(pool)
+        answers = AnswerCache(pool)
         done = asyncio.Event()
 
         async def answer(question: object, job: Evaluation | Where) -> object:
             done.clear()
-            found = desk.answer("key", question, "a", lambda: job, done.set)
+            found = answers.answer("key", question, "a", lambda: job, done.set)
             if found is None:
                 await done.wait()
-                found = desk.answer("key", question, "a", Defective, done.set)
+                found = answers.answer("key", question, "a", Defective, done.set)
             return found
 
         first = await answer(1, Where())
@@ -140,25 +140,25 @@ def test_an_answer_is_kept_for_its_question_and_one_that_exceeds_is_not_worked_o
         assert isinstance(exceeded, Exceeded)
         assert await answer(2, Where()) == exceeded
         assert await answer(3, Evaluation(1)) == 0
-        await desk.close()
+        await answers.close()
 
     with_pool(work)
 
 
 def test_answers_are_dropped_beyond_their_bytes_those_longest_unused_first() -> None:
     async def work(pool: Pool) -> None:
-        desk, done = Desk(pool, kept=40), asyncio.Event()
+        answers, done = AnswerCache(pool, kept=40), asyncio.Event()
 
         async def answer(key: str) -> object:
             done.clear()
-            if desk.answer(key, 1, "a", Where, done.set) is None:
+            if answers.answer(key, 1, "a", Where, done.set) is None:
                 await done.wait()
-            return desk.answer(key, 1, "a", Where, done.set)
+            return answers.answer(key, 1, "a", Where, done.set)
 
         assert await answer("first") is not None
         for index in range(20):
             assert await answer(f"later {index}") is not None
-        assert desk.answer("first", 1, "a", Where, done.set) is None
-        await desk.close()
+        assert answers.answer("first", 1, "a", Where, done.set) is None
+        await answers.close()
 
     with_pool(work)

@@ -48,7 +48,7 @@ class Ranges:
         """The first row of the table that is among these."""
 
     def picked(self, keep: NDArray[np.bool_]) -> None:
-        """Leave out all rows but these: the ranges become those of what is left."""
+        """Keep only these rows, and adapt the ranges."""
         before = np.concatenate(([0], np.cumsum(keep)))
         self.low, self.high = before[self.low], before[self.high]
         self.values, self.times = self.values[keep], self.times[keep]

@@ -90,7 +90,7 @@ class Source:
         self.lines.append(f"{self.indent}{names}, = {unpack}(p, {here})")
 
     def advance(self, size: int) -> None:
-        """Go on by so many bytes."""
+        """Advance by a number of bytes."""
         self.constant += size
         self.remainder = (self.remainder + size) % self.modulus
 

@@ -1,4 +1,4 @@
-"""CDR: generates the source that walks through messages of a type, and reads what is wanted of them.
+"""CDR: generates the source that walks through messages of a type and reads the wanted fields.
 
 rosbags reads a field wherever its own rules of alignment lead it; the same rules hold here.
 """
@@ -42,7 +42,7 @@ _FORMATS: Final = {
 _OCTETS: Final = frozenset(("uint8", "char", "byte"))
 
 _UNROLLED = 32
-"""Arrays of so many messages are read one by one, larger ones in a loop."""
+"""Arrays of up to this number of messages are read one by one, larger ones in a loop."""
 _MOST_FIELDS = 20_000
 """What a generated function may look at: messages that hold each other many times over would make it endless."""
 

@@ -9,8 +9,8 @@ from application_manager.core.claims.claims import Claim, Refused
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict
 from application_manager.knowledge.claimbook import ClaimBook
+from application_manager.workers.answers import Exceeded
 from application_manager.workers.claiming import Claiming
-from application_manager.workers.desk import Exceeded
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 NAME = ("site", "a")
@@ -35,7 +35,7 @@ def task(region: str = "north", *, ended: bool = False) -> ApplicationTask:
 
 
 class Answers:
-    """In place of a desk: has the answer that is put in."""
+    """In place of the cache of answers: has the answer that is put in."""
 
     def __init__(self) -> None:
         self.found: object | None = None

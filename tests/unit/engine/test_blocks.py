@@ -148,7 +148,7 @@ def test_what_is_left_out_for_a_while_leaves_nothing_behind() -> None:
 
 
 def tasks_of(rule: Any, arrivals: list[Any], cut: int) -> dict[str, Any]:
-    """The tasks that a replay writes that takes so many arrivals at once."""
+    """The tasks of a replay that takes this number of arrivals at once."""
     outcome = Outcome()
     replay = Replay(a_detector(), [rule], holder="h", start=START, outcome=outcome)
     for begin in range(0, len(arrivals), cut):

@@ -17,7 +17,7 @@ TASKS = SimpleNamespace(plural="applicationtasks", get_url=lambda **_: "")
 
 
 def streaming(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    """Let kopf's API bring so many events, and then nothing any more."""
+    """Let kopf's API return `events` events, and then nothing."""
 
     async def stream(**_: Any) -> AsyncIterator[Any]:
         for version in range(count):

@@ -1,8 +1,8 @@
-"""Answers of the worker processes: asked for at once, worked out in the background, kept while their question stays.
+"""A cache of the worker processes' answers, filled in the background.
 
-Who asks for an answer that is not there gets None, and is called once it is; nobody waits, so no queue's worker is held
-by an expression that takes long. Each key has one answer, that to its latest question, so there are as many as there
-are objects; those not used for longest are dropped beyond a number of bytes, and worked out again.
+A caller whose answer is missing gets None, and a callback once it is there. Nobody waits, so a slow expression holds no
+worker of a queue. Each key has one entry, for its latest question. Beyond a number of bytes, the cache drops the least
+recently used entries, and computes them again when they are next requested.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _Kept:
         return len(self.answer) if isinstance(self.answer, bytes) else 200
 
 
-class Desk:
+class AnswerCache:
     """Takes questions. Only the event loop's thread uses it."""
 
     def __init__(self, pool: Pool, kept: int = KEPT) -> None:
