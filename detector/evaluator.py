@@ -121,7 +121,7 @@ class Evaluator:
         self._demands: dict[str, Demand] = {}
         self.losses = Losses(engine, intake)
         self.status = StatusKeeper(engine, self.losses, now)
-        engine.stopwatch = time.perf_counter_ns
+        engine.instruments.stopwatch = time.perf_counter_ns
         engine.consequences.wanted = True
         intake.on_urgent = self._hurry
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
@@ -283,10 +283,10 @@ class Evaluator:
         if self._recorder is not None and arrivals:
             self._recorder.arrivals(arrivals)
         self.status.arrived(arrivals)
-        begin = self._engine.stopwatch()
+        begin = self._engine.instruments.stopwatch()
         events = self._engine.advance(arrivals, now)
         self._record_outages()
-        self._adapt(self._engine.stopwatch() - begin)
+        self._adapt(self._engine.instruments.stopwatch() - begin)
         return events
 
     def _record_outages(self) -> None:

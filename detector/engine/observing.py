@@ -1,18 +1,20 @@
-"""Who looks on while rules are evaluated in columns. It decides nothing, and nothing is computed for it."""
+"""What looks on at an engine. It decides nothing, and nothing is computed for it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from detector.engine.columns.block import Block, Track
 from detector.engine.columns.pairs import Sight
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Codes
+from detector.engine.evaluation import Change
 
 
 class Observer(Protocol):
-    """Gets each block as it was evaluated. What it keeps of it, it copies."""
+    """Receives each block as it was evaluated in columns. It copies what it keeps."""
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
         """Rules about clients: the observations have shape (tracks, clients, ticks), `looked` (tracks, clients).
@@ -22,3 +24,14 @@ class Observer(Protocol):
 
     def pairs(self, track: Track, sight: Sight) -> None:
         """A rule about pairs at one tick."""
+
+
+@dataclass
+class Instruments:
+    """What looks on; all are off at first."""
+
+    stopwatch: Callable[[], int] = int
+    """Returns nanoseconds of any clock that runs; the counters use it."""
+    journal: list[Change] | None = None
+    """What became of demands, in order."""
+    observer: Observer | None = None

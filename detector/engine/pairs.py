@@ -11,18 +11,13 @@ from numpy.typing import NDArray
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.pairs import PairColumns, Sight
 from detector.engine.columns.table import Integers, Truths
-from detector.engine.episodes.episodes import TRUE
+from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation import RuleRun
 from detector.engine.happened import Happened
 from detector.engine.observing import Observer
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
-
-_AGAIN = 255
-"""In place of the observation before: the pair has to be looked at."""
-
-_NEVER = np.iinfo(np.int64).max
 
 _SHIFT = 32
 
@@ -146,7 +141,7 @@ class PairGroup:
             assert state is not None  # noqa: S101  it has one
             in_progress = state.is_open or state.onset is not None
             wake = 0 if in_progress else state.rests_until
-            found.append((a << _SHIFT | b, _AGAIN, wake, in_progress, _ENDS if state.is_open else _STARTS))
+            found.append((a << _SHIFT | b, UNSEEN, wake, in_progress, _ENDS if state.is_open else _STARTS))
         self._watched = _joined(_NOBODY, found)
 
     def _subject(self, key: int) -> Subject:
@@ -187,7 +182,7 @@ class PairGroup:
         in_progress = state.is_open or state.onset is not None
         wake = ran.wake if in_progress else state.rests_until
         matters = _ENDS if state.is_open else _STARTS
-        kept.append((key, code, _NEVER if wake is None else wake, in_progress, matters))
+        kept.append((key, code, NO_WAKE if wake is None else wake, in_progress, matters))
 
 
 def _joined(watched: Watched, more: Sequence[Entry]) -> Watched:

@@ -95,8 +95,8 @@ class Replay:
             detector, self._entries, holder=holder, start=start, plugins=plugins, order=order
         )
         self._engine.counters.watch_ages = True
-        self._engine.journal = []
-        self._engine.observer = self._onlooker = onlooker
+        self._engine.instruments.journal = []
+        self._engine.instruments.observer = self._onlooker = onlooker
         self._demands: dict[str, Demand] = {}
         self._demands_version: tuple[int, int] | None = None
         self.set_rules(rules)
@@ -177,7 +177,7 @@ class Replay:
 
     def _note_changes(self) -> None:
         """What became of demands since the last time: one that began and ended in between is a task as well."""
-        journal = self._engine.journal or []
+        journal = self._engine.instruments.journal or []
         changed = {change.demand.name: change for change in journal}
         for name, (_, demand, end) in changed.items():
             self.outcome.tasks[name] = to_task(demand, end)

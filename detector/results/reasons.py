@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from detector.engine.buffering.buffer import NEVER
 from detector.engine.columns.block import Block, Track
-from detector.engine.columns.table import NEVER
 from wayside.expressions import Expression
 from wayside.rules import CompiledRule, PairSubject
 

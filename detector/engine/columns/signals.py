@@ -7,10 +7,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from detector.engine.buffering.buffer import NEVER
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.episodes import of_episodes
 from detector.engine.columns.reading import Reading, Used
-from detector.engine.columns.table import NEVER, Integers, Truths, rows_between
+from detector.engine.columns.table import Integers, Truths, rows_between
 from detector.engine.columns.watching import Ages
 from detector.engine.columns.windows import Ranges, aggregated, misfits
 from wayside.api.eventrule import OF_A_SAMPLE, Aggregate
@@ -57,17 +58,16 @@ class Signals:
             own = {signal.name: signal for signal in track.element.signals}
             for signal in track.rule.signals:
                 track.signals[signal.name] = self._place(row, own.get(signal.name, signal))
+        self._by_stream: dict[str, list[tuple[int, Key]]] = {}
+        """The signals and their places, by the stream that they read."""
+        for key, at in self._keys.items():
+            self._by_stream.setdefault(key.stream, []).append((at, key))
 
     def watch_all_streams(self) -> None:
         """Know of every stream whether it is fresh: some rule reads it."""
         self._all_streams = True
         for stream in self._context.stale_after:
             self._context.tables.add(stream)
-
-    @property
-    def streams(self) -> frozenset[str]:
-        """The streams that the rules read."""
-        return frozenset(key.stream for key in self._keys)
 
     def _place(self, row: int, signal: CompiledSignal) -> int:
         if signal.rule is not None:
@@ -95,16 +95,13 @@ class Signals:
         tables = self._context.tables
         if self._version != tables.version:
             self._version = tables.version
-            self._marks = {stream: tables.table(stream).mark() for stream in self.streams}
+            self._marks = {stream: tables.table(stream).mark() for stream in self._by_stream}
             if not self._shared:
                 rule = self._tracks[0].rule.name
                 self._new = {at: tables.mark(key.stream, (rule, key)) for key, at in self._keys.items()}
-        by_stream: dict[str, list[tuple[int, Key]]] = {stream: [] for stream in self.streams}
-        for key, at in self._keys.items():
-            by_stream[key.stream].append((at, key))
         found: dict[int, Column] = {}
-        for stream in self._context.stale_after if self._all_streams else by_stream:
-            keys = by_stream.get(stream, [])
+        for stream in self._context.stale_after if self._all_streams else self._by_stream:
+            keys = self._by_stream.get(stream, ())
             high, lows = self._ranges(block, stream, {key.over for _, key in keys}, floor)
             if keys:
                 self._fill(stream, block, high, [(key, lows[key.over]) for _, key in keys])

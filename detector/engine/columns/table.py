@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from detector.engine.buffering.buffer import NEVER
 from detector.engine.samples.sample import Sample
 
 Integers = NDArray[np.int64]
 Truths = NDArray[np.bool_]
-
-NEVER = -(2**63)
-"""Before all times: nothing has come yet."""
 
 MAXIMUM_CLIENTS = 2**17 - 1
 """Numbers of clients are below this: 17 bits of a key."""

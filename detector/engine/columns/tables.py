@@ -11,10 +11,10 @@ from operator import attrgetter
 
 import numpy as np
 
-from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.buffering.buffer import NEVER, Buffer, Lane
 from detector.engine.buffering.messages import Messages
 from detector.engine.columns.reading import Failure, Reader, Used
-from detector.engine.columns.table import LONGEST, MAXIMUM_CLIENTS, NEVER, Integers, Table
+from detector.engine.columns.table import LONGEST, MAXIMUM_CLIENTS, Integers, Table
 from detector.engine.counters import Counters, RuleCounters
 from detector.engine.samples.sample import Decoder, Sample
 from wayside.api import Detector

@@ -66,6 +66,11 @@ FALSE, UNSURE, TRUE = 0, 1, 2
 """Whether an episode may start: the lower two bits of an observation that is one byte."""
 UNTIL_UNSURE, UNTIL, OUTSIDE = 4, 8, 12
 """What may end one: the two bits above. 0: nothing."""
+UNSEEN = 255
+"""In place of an observation: there was none yet, so any is a change."""
+
+NO_WAKE = 2**63 - 1
+"""In place of a time to wake: nothing happens before the observation changes. Nanoseconds, beyond all times."""
 
 
 class Ran(NamedTuple):

@@ -10,7 +10,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from detector.engine.columns.table import LONGEST, NEVER, Table, rows_between
+from detector.engine.buffering.buffer import NEVER
+from detector.engine.columns.table import LONGEST, Table, rows_between
 from detector.engine.samples.sample import Arrival
 from tests.driving import SECOND, START
 

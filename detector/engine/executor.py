@@ -1,0 +1,323 @@
+"""The steps of a timeline are carried out here: samples go into the buffer, rules are evaluated at ticks.
+
+Ticks wait to be evaluated together as long as nothing happens between them that an evaluation could see or change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from detector.engine.blocks import Blocks
+from detector.engine.columns.table import LONGEST
+from detector.engine.consequences.consequences import Consequences
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.subjects import Subject
+from detector.engine.evaluation import RuleRun
+from detector.engine.groups import RuleGroup
+from detector.engine.happened import Happened
+from detector.engine.knowledge import Knowledge
+from detector.engine.observing import Instruments
+from detector.engine.pairs import PairGroup
+from detector.engine.samples.sample import Arrival
+from detector.engine.scoping.plugins import PluginSignals
+from detector.engine.signals.starts import Starts
+from detector.engine.timing.schedule import Only, Schedule
+from detector.engine.timing.steps import Gap, Insert, Step, Tick
+from detector.engine.timing.ticks import HOUSEKEEPING, Ticks
+from wayside.rules import CompiledRule
+
+
+class Executor:
+    """Inserts samples and evaluates rules, block by block or tick by tick."""
+
+    def __init__(
+        self,
+        known: Knowledge,
+        ticks: Ticks,
+        schedule: Schedule,
+        starts: Starts,
+        plugins: PluginSignals,
+        consequences: Consequences,
+        instruments: Instruments,
+        now: Callable[[], int],
+    ) -> None:
+        """`now`: up to there all ticks have run; nanoseconds on the engine's time axis."""
+        self._known = known
+        self._clients = known.clients
+        self._ticks = ticks
+        self._schedule = schedule
+        self._starts = starts
+        self._plugins = plugins
+        self._consequences = consequences
+        self._instruments = instruments
+        self._now = now
+        self._runs: Mapping[str, RuleRun] = {}
+        self._blocks = Blocks(known.context, lambda: known.floor)
+        self._order: dict[str, int] = {}
+        """The rules' places in the order of evaluation."""
+        self._others: list[CompiledRule] = []
+        """Rules that are not evaluated in blocks."""
+        self._alone: set[str] = set()
+        """Rules of which somebody looks at each evaluation by itself."""
+        self._losing: set[str] = set()
+        """Rules that have not ended the episodes of lost clients yet."""
+        self._last_wait = now()
+        """The last tick that waits to be evaluated."""
+        self._unsorted: int | None = None
+        """From where on the journal is not in order yet; None: it is."""
+
+    @property
+    def in_columns(self) -> frozenset[str]:
+        """The rules that are evaluated in columns."""
+        return self._blocks.names
+
+    def set_rules(self, runs: Mapping[str, RuleRun]) -> None:
+        """Evaluate these rules from now on, in this order."""
+        self._runs = runs
+        self._losing &= runs.keys()
+        self.wake_all(self._now())
+        self.plan()
+
+    def follow_detector(self) -> None:
+        """The Detector changed; until `set_rules`, rules are evaluated one by one."""
+        self._blocks = Blocks(self._known.context, lambda: self._known.floor)
+        self._others = [run.rule for run in self._runs.values() if run.rule.enabled]
+
+    def plan(self) -> None:
+        """Decide which rules are evaluated in columns, and which together, after rules or thinning changed."""
+        if self._known.tables.full:
+            self._known.new_tables()
+        self._make_blocks()
+        if self._known.tables.wasteful:
+            self._known.new_tables()
+            self._make_blocks()
+        self._order = {name: order for order, name in enumerate(self._runs)}
+        names = self._blocks.names
+        rules = (run.rule for run in self._runs.values() if run.rule.enabled)
+        self._others = [rule for rule in rules if rule.name not in names or rule.every_ns is None]
+        self._alone = {name for name, run in self._runs.items() if run.alone}
+        for run in self._runs.values():
+            run.journal = self._instruments.journal
+        self._known.settle()
+
+    def _make_blocks(self) -> None:
+        self._blocks = Blocks(self._known.context, lambda: self._known.floor, self._instruments.observer)
+        thinning = self._schedule.thinning
+        self._blocks.set_rules(self._runs, self._schedule.paused, lambda run: thinning(run.rule))
+
+    def run(self, steps: Iterable[Step]) -> list[Event]:
+        """Carry out these steps; what happened, in order."""
+        if {name for name, run in self._runs.items() if run.alone} != self._alone:
+            self.plan()
+        events: list[Event] = []
+        for step in steps:
+            match step:
+                case Insert(arrivals, times):
+                    if self._blocks.waiting and not self._may_wait(arrivals, times):
+                        events += self._evaluate_waiting()
+                    self._known.inflow.insert(arrivals, times)
+                case Tick():
+                    events += self._tick(step)
+                case Gap(time, backwards):
+                    events += self._evaluate_waiting()
+                    self.gap(time, backwards)
+        events += self._evaluate_waiting()
+        if self._known.tables.full:
+            self.plan()
+        self._known.looked(self._now())
+        return events
+
+    def _may_wait(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> bool:
+        """Whether what comes changes nothing that the ticks that wait see."""
+        first, last = (arrivals[0].received, arrivals[-1].received) if times is None else (min(times), max(times))
+        in_order = times is None or first > self._last_wait
+        return in_order and last - self._blocks.since <= LONGEST and self._known.fits(arrivals)
+
+    def _evaluate_waiting(self) -> list[Event]:
+        """Evaluate the ticks that wait."""
+        if not self._blocks.waiting:
+            return []
+        self._known.settle()
+        happened = self._in_columns()
+        self._known.forget_rows(self._last_wait)
+        self._known.looked(self._now())
+        self._starts.settle(self._last_wait)
+        events = [each.event for each in happened]
+        if self._consequences.wanted:
+            for event in events:
+                self._consequences.note(self._runs[event.rule].rule, event)
+        return events
+
+    def _in_columns(self) -> list[Happened]:
+        """Evaluate what waits, and put in order what happened."""
+        journal = self._instruments.journal
+        noted = self._unsorted if self._unsorted is not None else len(journal or ())
+        self._unsorted = None
+        happened = self._blocks.run(self._instruments.stopwatch)
+        if journal is not None:
+            journal[noted:] = sorted(journal[noted:], key=lambda change: (change.time, self._order[change.demand.rule]))
+        return happened
+
+    def _tick(self, tick: Tick) -> list[Event]:
+        time, regular = tick.time, self._ticks.is_regular(tick.time)
+        events: list[Event] = []
+        if self._known.tables.full:
+            events += self._evaluate_waiting()
+            self.plan()
+        if regular:  # else it is there for a single sample or subject, and must cost no look at all the others
+            if self._known.clients.may_lose(time):
+                events += self._evaluate_waiting()  # who is lost now was known at the ticks before
+                self._keep_house(time)
+            elif time % HOUSEKEEPING == 0:
+                self._keep_house(time)
+        self._blocks.skip(time)
+        groups = self._blocks.due(time)
+        if self._is_alone(tick, groups):
+            events += self._evaluate_waiting()
+            self._known.settle()
+            return events + self._tick_alone(tick, regular, groups)
+        self._last_wait = time
+        if self._blocks.wait(time, groups) or self._consequences.wanted:
+            events += self._evaluate_waiting()
+        elif self._blocks.hurries:
+            if self._unsorted is None and self._instruments.journal is not None:
+                self._unsorted = len(self._instruments.journal)
+            self._known.settle()
+            self._blocks.run_ahead(self._instruments.stopwatch)
+            self._known.looked(self._now())
+        return events
+
+    def _is_alone(self, tick: Tick, groups: Sequence[RuleGroup | PairGroup]) -> bool:
+        """Whether the tick cannot wait: for rules that are not in columns, or have to look who was lost."""
+        if self._losing and any(run.rule.name in self._losing for group in groups for run in group.runs):
+            return True
+        return any(
+            tick.time % rule.every_ns == 0 if rule.every_ns is not None else rule.on_sample or self._losing
+            for rule in self._others
+        )
+
+    def _tick_alone(self, tick: Tick, regular: bool, groups: Sequence[RuleGroup | PairGroup]) -> list[Event]:
+        """Evaluate a tick by itself, rule by rule in their order."""
+        time, sampled = tick.time, self._known.sampled(tick.sampled)
+        due = {run.rule.name for group in groups for run in group.runs}
+        happened: dict[str, list[Event]] = {name: self._lost(name, time) for name in due}
+        self._blocks.wait(time, groups)
+        for each in self._in_columns():
+            happened[each.event.rule].append(each.event)
+        happened |= self._with_samples(time, regular, sampled)
+        events: list[Event] = []
+        for name, run in self._runs.items():
+            if run.rule.enabled and name not in self._schedule.paused:
+                own = happened.get(name)
+                if own is None and name not in self._blocks.names:
+                    self._losing.discard(name)
+                    own = self._seen(self._turn(run, time, sampled, regular))
+                for event in sorted(own or (), key=lambda event: event.subject):
+                    self._consequences.note(run.rule, event)
+                    events.append(event)
+        self._starts.settle(time)
+        self._known.forget_rows(time)
+        self._known.looked(self._now())
+        return events
+
+    def _lost(self, name: str, time: int) -> list[Event]:
+        """The ends of a rule's episodes whose clients are lost."""
+        if name not in self._losing:
+            return []
+        self._losing.discard(name)
+        return self._seen(self._runs[name].lose(time, self._clients))
+
+    def _with_samples(
+        self, time: int, regular: bool, sampled: Mapping[str, frozenset[str]]
+    ) -> Mapping[str, list[Event]]:
+        """What happens to the rules in columns that are evaluated with samples, by rule."""
+        happened: dict[str, list[Event]] = {}
+        for stream, runs in self._blocks.with_samples.items():
+            chosen: dict[str, Only] = {}
+            for run in runs:
+                name = run.rule.name
+                happened[name] = self._lost(name, time) if regular else []
+                only, thinned = self._schedule.whom(run.rule, time, sampled)
+                run.counters.skipped += thinned
+                if only.clients or only.subjects:
+                    chosen[name] = only
+            if chosen:
+                for each in self._blocks.run_with_samples(stream, time, chosen, self._instruments.stopwatch):
+                    happened[each.event.rule].append(each.event)
+                for name, only in chosen.items():
+                    self._wake(self._runs[name], time, self._looked_at(self._runs[name], only))
+        return happened
+
+    def _looked_at(self, run: RuleRun, only: Only) -> list[Subject]:
+        """The subjects of a rule about clients that were evaluated."""
+        subjects = (
+            Subject((client,), element.name) for element in run.rule.elements for client in only.present(self._clients)
+        )
+        return [subject for subject in subjects if only.takes(subject)]
+
+    def _seen(self, events: list[Event]) -> list[Event]:
+        """The events, once rules that look at episodes of others can see them."""
+        for event in events:
+            self._starts.note(event)
+        return events
+
+    def noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
+        """The events, once other rules and the rule's actions know of them."""
+        happened = self._seen([*events])
+        for event in happened:
+            self._consequences.note(run.rule, event)
+        return happened
+
+    def _turn(self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool) -> list[Event]:
+        """What happens to a rule at a tick; `regular`: it is one of some rule's periods, or of housekeeping."""
+        rule = run.rule
+        if rule.every_ns is not None:
+            if time % rule.every_ns:
+                return []
+            if self._schedule.is_thinned(rule, time):
+                run.counters.skipped += 1
+                return []
+            return self._evaluated(run, time)
+        events = run.lose(time, self._clients) if regular else []
+        if rule.on_sample is None:
+            return events
+        only, thinned = self._schedule.whom(rule, time, sampled)
+        run.counters.skipped += thinned
+        if only.clients or only.subjects:
+            events += self._evaluated(run, time, only)
+            self._wake(run, time, run.looked_at)
+        return sorted(events, key=lambda event: event.subject)
+
+    def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
+        begin = self._instruments.stopwatch()
+        events = run.tick(time, self._known.views(run, time), self._clients, self._plugins, only)
+        run.counters.timed(time, self._instruments.stopwatch() - begin)
+        return events
+
+    def _keep_house(self, time: int) -> None:
+        """Forget old samples and lost clients."""
+        lost = self._known.age(time)
+        if lost:
+            self._losing.update(self._runs)
+            self._starts.lose(lost)
+            self._plugins.lose(lost)
+
+    def _wake(self, run: RuleRun, time: int, subjects: Iterable[Subject]) -> None:
+        for subject, at in run.wakes(time, subjects):
+            self._schedule.wake(run.rule.name, subject, at)
+
+    def wake_all(self, time: int) -> None:
+        """Rules or time changed."""
+        for run in self._runs.values():
+            if run.rule.on_sample is not None:
+                self._wake(run, time, run.subjects)
+
+    def gap(self, time: int, backwards: bool) -> None:
+        """Time goes on from here without the ticks between; `backwards`: it may be earlier. Nanoseconds."""
+        if backwards:
+            self._starts.step_back(time)
+        self._known.gap(time, backwards)
+        self._plugins.gap()
+        for run in self._runs.values():
+            run.gap(time)
+        self.wake_all(time)

@@ -1,0 +1,204 @@
+"""Rules about clients or the fleet that are due at the same ticks: from their observations to their episodes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.fleets import FleetBlock, FleetGroup
+from detector.engine.columns.group import Group
+from detector.engine.columns.table import Integers, Truths
+from detector.engine.columns.verdicts import Codes
+from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
+from detector.engine.episodes.subjects import Subject
+from detector.engine.evaluation import RuleRun
+from detector.engine.happened import Happened
+from detector.engine.observing import Observer
+from detector.engine.scoping.scopes import Candidate
+from detector.engine.timing.schedule import Only
+
+
+class Changes(NamedTuple):
+    """When a subject has to be looked at, by the block's ticks, and its observations then."""
+
+    row: int
+    """The subject's track."""
+    at: int
+    """Its place among the block's clients."""
+    ticks: list[int]
+    codes: list[int]
+
+
+class RuleGroup:
+    """The rules that are due at the same ticks, and what was last seen of their subjects."""
+
+    def __init__(
+        self,
+        runs: Sequence[RuleRun],
+        orders: Mapping[str, int],
+        context: Context,
+        every: int,
+        period: int,
+        columns: type[Group | FleetGroup] = Group,
+    ) -> None:
+        """`every` is the rules' period, `period` that at which they are evaluated: longer where some are left out."""
+        self.every = every
+        self.period = period
+        self.runs = runs
+        self.waiting: list[int] = []
+        """Ticks that are not evaluated yet."""
+        elements = [(run, element) for run in runs for element in run.rule.elements]
+        self.columns = columns(
+            [Track(run.rule, each, run.counters, run.read, row) for row, (run, each) in enumerate(elements)], context
+        )
+        self.observer: Observer | None = None
+        self.may_wait = True
+        """Whether several ticks are evaluated together."""
+        self.width = len(self.columns.tracks)
+        """How many columns there are for each client."""
+        self._of = [run for run in runs for _ in run.rule.elements]
+        """The rule of each track."""
+        self._budgeted = [run for run in runs if run.rule.maximum_per_hour is not None]
+        self._deploying = [(row, run) for row, run in enumerate(self._of) if run.has_deploys]
+        self._orders = [orders[run.rule.name] for run in self._of]
+        self._context = context
+        self._version = -1
+        self._last: Codes = np.zeros((0, 0), np.uint8)
+        self._wakes: Integers = np.zeros((0, 0), np.int64)
+        self._watched: Truths = np.zeros((0, 0), bool)
+        """Which subjects have a state of their own. These have a row for each track, a column for each client."""
+
+    def evaluate(
+        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
+    ) -> Iterator[Happened]:
+        """What happens at these ticks. `only`: by rule, the subjects that it looks at; others are looked at in vain."""
+        if not clients and self.columns.needs_clients:
+            return
+        looked = None if only is None else self._looked(clients, only)
+        block, codes = self.columns.evaluate(ticks, clients, floor, looked)
+        if self.observer is not None and isinstance(block, Block):
+            self.observer.clients(self.columns.tracks, block, codes, looked)
+        self._follow()
+        numbers: list[int] = block.numbers.tolist()
+        states: list[tuple[int, int, bool, int]] = []
+        for change in self._changed(block, codes, looked):
+            yield from self._step(block, change, numbers[change.at], states)
+        if states:
+            rows, at, watched, wakes = zip(*states, strict=True)
+            self._watched[rows, at] = watched
+            self._wakes[rows, at] = wakes
+        last = ticks[-1]
+        for run in self._budgeted:
+            run.tidy_starts(last)
+
+    def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths:
+        """Which track looks at which client."""
+        looked = np.zeros((len(self._of), len(clients)), bool)
+        for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True)):
+            chosen = only.get(run.rule.name)
+            if chosen is not None:
+                looked[row] = [chosen.takes(track.subject(client)) for client in clients]
+        return looked
+
+    def _follow(self) -> None:
+        """Know all clients, and the states that changed otherwise."""
+        tables = self._context.tables
+        if self._version != tables.version:
+            self._version = tables.version
+            nobody = (len(self._of), 0)
+            self._last, self._wakes = np.zeros(nobody, np.uint8), np.zeros(nobody, np.int64)
+            self._watched = np.zeros(nobody, bool)
+            for run in self.runs:
+                run.disturbed = True
+        # Before there is room for all clients: of a subject that was restored, no sample may have come yet.
+        watched = {
+            row: [self.columns.number(each) for each in run.subjects if each.element == track.element.name]
+            for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True))
+            if run.disturbed
+        }
+        clients, room = self.columns.room, self._last.shape[1]
+        if clients > room:
+            more = (len(self._of), max(clients, 2 * room) - room)
+            self._last = np.concatenate((self._last, np.full(more, UNSEEN, np.uint8)), axis=1)
+            self._wakes = np.concatenate((self._wakes, np.full(more, NO_WAKE)), axis=1)
+            self._watched = np.concatenate((self._watched, np.zeros(more, bool)), axis=1)
+        for row, numbers in watched.items():
+            self._last[row] = UNSEEN
+            self._watched[row] = False
+            self._watched[row, numbers] = True
+        for run in self.runs:
+            run.disturbed = False
+
+    def _changed(self, block: Block | FleetBlock, codes: Codes, looked: Truths | None) -> Iterator[Changes]:
+        """Of each subject, where it matters, the ticks at which the observation changes or something is due."""
+        numbers, last = block.numbers, int(block.times[-1])
+        changed = np.empty(codes.shape, bool)
+        np.not_equal(codes[:, :, 0], self._last[:, numbers], out=changed[:, :, 0])
+        np.not_equal(codes[:, :, 1:], codes[:, :, :-1], out=changed[:, :, 1:])
+        watched = self._watched[:, numbers]
+        changed[:, :, 0] |= self._wakes[:, numbers] <= last
+        for row, run in self._deploying:
+            if run.open_episodes:
+                track = self.columns.tracks[row]
+                for at in np.flatnonzero(watched[row]).tolist():
+                    if run.needs_every_tick(track.subject(block.clients[at])):
+                        changed[row, at] = True
+        matters = watched | (codes & 3 == TRUE).any(axis=2)
+        if looked is not None:
+            matters &= looked
+            kept = np.where(looked, codes[:, :, -1], self._last[:, numbers])
+            self._last[:, numbers] = kept
+        else:
+            self._last[:, numbers] = codes[:, :, -1]
+        changed &= matters[:, :, None]
+        if block.present is not None:
+            changed &= block.present
+        flat = np.flatnonzero(changed)
+        if not len(flat):
+            return
+        which, when = np.divmod(flat, len(block.ticks))
+        bounds = [0, *(np.flatnonzero(np.diff(which)) + 1).tolist(), len(flat)]
+        ticks: list[int] = when.tolist()
+        seen: list[int] = codes.ravel()[flat].tolist()
+        tracks, subjects = (each.tolist() for each in np.divmod(which[bounds[:-1]], len(block.clients)))
+        for row, at, (begin, end) in zip(tracks, subjects, itertools.pairwise(bounds), strict=True):
+            yield Changes(row, at, ticks[begin:end], seen[begin:end])
+
+    def _step(
+        self, block: Block | FleetBlock, changes: Changes, number: int, states: list[tuple[int, int, bool, int]]
+    ) -> list[Happened]:
+        """Bring one subject's state forward over all ticks of the block; adds whether it has one, and when to look."""
+        row, at = changes.row, changes.at
+        run, track = self._of[row], self.columns.tracks[row]
+        subject = track.subject(block.clients[at])
+        state = run.state(subject) or run.new_state(subject)
+        happened: list[Happened] = []
+        ticks, timing, count = block.ticks, run.timing, len(block.ticks)
+        wake: int | None = None
+        for code, begin, end in zip(changes.codes, changes.ticks, (*changes.ticks[1:], count), strict=True):
+            first = begin
+            while first < end:
+                one_by_one = run.has_deploys and state.is_open and run.needs_every_tick(subject)
+                ran = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
+                wake, happened_at = ran.wake, ran.at
+                if ran.what is not None:
+                    candidate = self._candidate(block, track, subject, at * count + happened_at)
+                    event = run.happened(ticks[happened_at], ran.what, candidate)
+                    if event is not None:
+                        happened.append(Happened(ticks[happened_at], self._orders[row], event))
+                    happened_at += 1
+                elif one_by_one:
+                    run.stays(ticks[first], self._candidate(block, track, subject, at * count + first))
+                first = happened_at
+        idle = state.idle_at(ticks[-1])
+        if idle:
+            run.drop_state(subject)
+        states.append((row, number, not idle, NO_WAKE if wake is None else wake))
+        return happened
+
+    def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
+        return Candidate(subject, block.variables(track, point), in_scope=True, near=True)
