@@ -10,7 +10,7 @@ from detector.engine.samples.sample import DecodeError, Decoder, NearDecoder, Sa
 from wayside.expressions import UNKNOWN, EvaluationError
 from wayside.rules import CompiledStream
 
-_MISSING = object()
+_MISSING: Any = object()
 
 _RECEIVED = "sample.received"
 """A stream's `stamp` where the receive time is the sender's: in JSON lines, `t`."""
@@ -42,10 +42,15 @@ class Messages:
         self._read_key = read_key
         self._counters = counters
         self._decoded: dict[tuple[str, Sample], Any] = {}
+        self._stamps: dict[tuple[str, Sample], int | None] = {}
+        self._stamps_before: dict[tuple[str, Sample], int | None] = {}
+        """Those of the last tick at which stamps were read: plugins look at the same samples tick by tick."""
 
     def forget(self) -> None:
         """Drop what was decoded: the tick is over."""
         self._decoded.clear()
+        if self._stamps:
+            self._stamps_before, self._stamps = self._stamps, {}
 
     def message(self, stream: str, sample: Sample) -> Any:
         """The decoded sample, or UNKNOWN where it cannot be read; that is counted."""
@@ -90,6 +95,17 @@ class Messages:
                 **({} if stamp is None else {"stamp": stamp / _SECOND, "latency": (sample.received - stamp) / _SECOND}),
             }
         return values
+
+    def stamp(self, stream: str, sample: Sample) -> int | None:
+        """The stamp of a sample in the buffer: see `time`. It is read once while each tick looks at the sample."""
+        at = (stream, sample)
+        stamp: int | None = self._stamps.get(at, _MISSING)
+        if stamp is _MISSING:
+            stamp = self._stamps_before.get(at, _MISSING)
+            if stamp is _MISSING:
+                stamp = self.time(stream, sample.key, sample.received, sample.payload)
+            self._stamps[at] = stamp
+        return stamp
 
     def time(self, stream: str, key: str, received: int, payload: bytes) -> int | None:
         """A sample's time with clock Data, in nanoseconds: its stamp, or the receive time where it carries none.

@@ -222,7 +222,7 @@ class BufferQueries:
 
     def _of_lane(self, lane: Lane, after: int | None, until: int, frame: str | None) -> Iterator[DecodedSample]:
         for sample in lane.newest_first(after, until, self._now):
-            stamp = self._messages.time(lane.stream, sample.key, sample.received, sample.payload)
+            stamp = self._messages.stamp(lane.stream, sample)
             decoded = None if stamp is None else self._decoded(lane.client, lane.stream, (stamp, 0, sample))
             if decoded is not None and (frame is None or frame_of(decoded.message) == frame):
                 yield decoded
@@ -235,7 +235,7 @@ class BufferQueries:
             samples = [] if lane is None else list(lane.newest_first(None, self._now))[::-1]
             known = []
             for index, sample in enumerate(samples):
-                stamp = self._messages.time(stream, sample.key, sample.received, sample.payload)
+                stamp = self._messages.stamp(stream, sample)
                 if stamp is not None:
                     known.append((stamp, index, sample))
             known.sort(key=lambda each: each[:2])

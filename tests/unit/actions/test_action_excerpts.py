@@ -86,7 +86,7 @@ messages = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(drawn=messages, cuts=st.lists(st.integers(1, 59), max_size=8), on_data=st.booleans())
 @example(
     drawn=[(21, "car1", "speed", 1.0, 0), (41, "car1", "speed", 0.0, 0), (49, "car1", "load", 0.0, 0)],

@@ -151,7 +151,7 @@ def plainly(events: list[Event]) -> list[Told]:
 
 
 @settings(
-    max_examples=int(os.environ.get("WAYSIDE_EQUIVALENCE", "150")),
+    max_examples=int(os.environ.get("WAYSIDE_EQUIVALENCE", "100")),
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )

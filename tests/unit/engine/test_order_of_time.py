@@ -72,7 +72,7 @@ APART = {"scope": {"pairs": {"position": POSITION, "within": 1000}}, "when": "di
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(data=st.data())
 def test_two_clients_on_a_common_time_grid_that_always_move_together_never_part(
     clock: Mapping[str, Any], data: st.DataObject, tmp_path_factory: pytest.TempPathFactory

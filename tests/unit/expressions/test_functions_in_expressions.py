@@ -158,7 +158,7 @@ anything = st.recursive(
 likely = st.lists(st.tuples(numbers, numbers).map(list) | places, max_size=5) | numbers | anything
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.sampled_from(calls()), st.lists(likely, min_size=5, max_size=5))
 def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str, int], arguments: list[Any]) -> None:
     source, count = call

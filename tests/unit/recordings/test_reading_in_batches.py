@@ -185,7 +185,7 @@ def cut_at(times: Sequence[int], name: str, places: set[int]) -> Iterator[Batch]
             begin = at
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     recordings=st.lists(
         st.tuples(st.lists(st.integers(-3, 9), max_size=25), st.sets(st.integers(0, 25)), st.booleans()), max_size=4
@@ -270,7 +270,7 @@ def arrivals_into(found: list[Arrival], router: Router, messages: Iterable[Messa
     return []
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     steps=st.lists(st.sampled_from([0, 0, 0, 1, parts.PAUSE, parts.PAUSE + 1]), max_size=60),
     cuts=st.sets(st.integers(0, 60)),
