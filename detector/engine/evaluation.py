@@ -354,7 +354,8 @@ class RuleRun:
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
         subject = candidate.subject
         identifier = episode_id(self._identity.holder, self.rule.name, subject.text, now)
-        episode = Episode(identifier, subject, onset, now, snapshot(self.rule, candidate), candidate.variables)
+        variables = candidate.variables if self.rule.has_actions else None
+        episode = Episode(identifier, subject, onset, now, snapshot(self.rule, candidate), variables)
         self._open[subject] = episode
         self.counters.started += 1
         self._render(episode)

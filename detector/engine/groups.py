@@ -20,6 +20,7 @@ from detector.engine.happened import Happened
 from detector.engine.observing import Observer
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
+from wayside.rules import ClientSubject
 
 
 class Changes(NamedTuple):
@@ -64,6 +65,8 @@ class RuleGroup:
         """The rule of each track."""
         self._budgeted = [run for run in runs if run.rule.maximum_per_hour is not None]
         self._deploying = [(row, run) for row, run in enumerate(self._of) if run.has_deploys]
+        self._plain = [isinstance(run.rule.subject, ClientSubject) and not run.rule.has_actions for run in self._of]
+        """Rules of which only signals go into events, and nothing is rendered."""
         self._orders = [orders[run.rule.name] for run in self._of]
         self._context = context
         self._version = -1
@@ -178,11 +181,12 @@ class RuleGroup:
         state = run.state(subject) or run.new_state(subject)
         happened: list[Happened] = []
         ticks, timing, count = block.ticks, run.timing, len(block.ticks)
+        deploys = run.has_deploys
         wake: int | None = None
         for code, begin, end in zip(changes.codes, changes.ticks, (*changes.ticks[1:], count), strict=True):
             first = begin
             while first < end:
-                one_by_one = run.has_deploys and state.is_open and run.needs_every_tick(subject)
+                one_by_one = deploys and state.is_open and run.needs_every_tick(subject)
                 ran = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
                 wake, happened_at = ran.wake, ran.at
                 if ran.what is not None:
@@ -201,4 +205,6 @@ class RuleGroup:
         return happened
 
     def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
+        if isinstance(block, Block) and self._plain[track.row]:
+            return Candidate(subject, block.values(track, point), in_scope=True, near=True)
         return Candidate(subject, block.variables(track, point), in_scope=True, near=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from detector.engine.buffering.buffer import Buffer
+from detector.engine.buffering.buffer import Buffer, bytes_of
 from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.inflow import Inflow
 from detector.engine.buffering.lanes import lane_makers
@@ -20,7 +20,7 @@ from detector.engine.counters import Counters
 from detector.engine.evaluation import RuleRun
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.queries.transforms import Transforms, TransformStream
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Decoder, Sample
+from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.positions import Positions
 from detector.engine.scoping.scopes import Views
 from detector.engine.signals.signals import Signals
@@ -144,9 +144,7 @@ class Knowledge:
 
     def fits(self, arrivals: Sequence[Arrival]) -> bool:
         """Whether the buffer takes in the arrivals without pushing anything out."""
-        buffer = self.buffer
-        room = buffer.maximum_bytes - buffer.bytes - SAMPLE_OVERHEAD * len(arrivals)
-        return room >= sum([len(arrival.payload) for arrival in arrivals])
+        return self.buffer.bytes + bytes_of(arrivals) <= self.buffer.maximum_bytes
 
     def new_tables(self) -> None:
         """Begin with new tables: rules that are evaluated in columns have to be set again."""

@@ -236,6 +236,11 @@ class CompiledRule:
     """So many episodes of a client may start within an hour."""
 
     @property
+    def has_actions(self) -> bool:
+        """Whether an episode has any consequence beside its events, so that its variables may be rendered."""
+        return bool(self.deploys or self.actions)
+
+    @property
     def common_signals(self) -> tuple[CompiledSignal, ...]:
         """The signals that are the same for all elements."""
         own = {signal.name for signal in self.elements[0].signals}

@@ -12,16 +12,25 @@ client and then stream.
 from __future__ import annotations
 
 import heapq
+from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from operator import attrgetter
 
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample
 
 NEVER = -(2**63)
 """Before all times: nothing has come yet."""
 
+_RECEIVED = attrgetter("received")
+
 _SLACK = 64
 """Beyond the cap over all streams, 1/64 of it is freed at once, so that the search for the oldest pays off."""
+
+
+def bytes_of(samples: Sequence[Sample]) -> int:
+    """What the samples take in the buffer."""
+    return sum([len(sample.payload) for sample in samples]) + SAMPLE_OVERHEAD * len(samples)
 
 
 class Lane:
@@ -113,9 +122,9 @@ class Lane:
 
     def expire(self, now: int) -> int:
         """Forget what is older than the duration, but never the newest; returns the bytes freed."""
-        samples, horizon, freed = self.samples, now - self.duration, 0
-        while len(samples) > 1 and samples[0].received <= horizon:
-            freed += len(samples.popleft().payload) + SAMPLE_OVERHEAD
+        samples = self.samples
+        count = bisect_right(samples, now - self.duration, 0, max(len(samples) - 1, 0), key=_RECEIVED)
+        freed = bytes_of([samples.popleft() for _ in range(count)])
         self.bytes -= freed
         return freed
 

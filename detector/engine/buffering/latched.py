@@ -11,8 +11,8 @@ from collections.abc import Callable, Hashable, Iterator
 
 from msgspec.structs import replace
 
-from detector.engine.buffering.buffer import NEVER, Lane
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, DecodeError, Decoder, Sample
+from detector.engine.buffering.buffer import NEVER, Lane, bytes_of
+from detector.engine.samples.sample import DecodeError, Decoder, Sample
 
 Topic = Callable[[str, bytes], Hashable]
 """What a sample with that key and payload speaks of: a newer one about the same takes its place."""
@@ -102,7 +102,7 @@ class LatchedLane(Lane):
         before = self.bytes
         self.samples = deque(samples)
         self._topics = {sample: self._about(sample) for sample in samples}
-        self.bytes = sum(len(sample.payload) + SAMPLE_OVERHEAD for sample in samples)
+        self.bytes = bytes_of(samples)
         return before - self.bytes
 
 

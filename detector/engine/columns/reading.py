@@ -7,7 +7,6 @@ that they cannot take, is left to CEL, row by row.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,8 +31,6 @@ from wayside.expressions.columns.program import Program
 from wayside.expressions.columns.values import Column, Tag, Texts, column_of
 from wayside.rules import CompiledElement
 from wayside.rules.parameters import Parameters
-
-_PAYLOAD = attrgetter("payload")
 
 _CONSTANTS = (bool, float, str)
 
@@ -169,7 +166,7 @@ class Reader:
         assert self._fields is not None  # noqa: S101
         if not self._paths:
             return _Leaves([], None, {}, ())
-        fields = self._fields([*map(_PAYLOAD, samples)])
+        fields = self._fields([sample.payload for sample in samples])
         for at, error in fields.errors.items():
             self._messages.unreadable(self._stream, samples[at], error)
         columns = [column_of(values, self._texts) for values in fields.columns]

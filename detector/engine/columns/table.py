@@ -105,7 +105,9 @@ class Table:
         at = (self.end - (ends - counts))[whose] + np.arange(len(whose))
         self.times[at] = ordered
         self.keys[at] = self._keys(whose, ordered)
-        self.samples[at] = np.fromiter(samples, object, len(samples))[order]
+        places = np.empty_like(at)
+        places[order] = at
+        self.samples[places] = np.fromiter(samples, object, len(samples))
         self.filled[at] = False
         self.end += counts
         late = (at > self.first[whose]) & (self.times[at] < self.times[at - 1])

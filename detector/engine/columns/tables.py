@@ -7,7 +7,6 @@ that is forgotten, leaves the tables as well.
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from operator import attrgetter
 
 import numpy as np
 
@@ -21,8 +20,6 @@ from wayside.api import Detector
 from wayside.api.stream import Stream
 from wayside.expressions.columns.values import Texts
 from wayside.rules import CompiledSignal
-
-_TIME = attrgetter("received")
 
 _MAXIMUM_TEXTS = 1_000_000
 """Maximum number of different texts; beyond, tables are rebuilt: texts are never forgotten one by one."""
@@ -188,15 +185,15 @@ class Tables:
             samples, lanes = [sample for sample, _ in kept], [lane for _, lane in kept]
             if not samples:
                 return
-        numbers = np.array([lane.number for lane in lanes])  # type: ignore[union-attr]
+        numbers = np.fromiter([lane.number for lane in lanes], np.int64, len(lanes))  # type: ignore[union-attr]
         if numbers.min() < 0:
             for lane in dict.fromkeys(lanes):
                 assert lane is not None  # noqa: S101  left out above
                 lane.number = self.number(lane.client)
-            numbers = np.array([lane.number for lane in lanes])  # type: ignore[union-attr]
+            numbers = np.fromiter([lane.number for lane in lanes], np.int64, len(lanes))  # type: ignore[union-attr]
         if len(self.names) < 2**15:
             numbers = numbers.astype(np.int16)  # sorted faster
-        times = np.fromiter(map(_TIME, samples), np.int64, len(samples))
+        times = np.fromiter([sample.received for sample in samples], np.int64, len(samples))
         streams = {lane.stream for lane in set(lanes)}  # type: ignore[union-attr]
         for stream in streams & self._tables.keys():
             if len(streams) == 1:
@@ -224,7 +221,7 @@ class Tables:
             table.grow(len(self.names))
             samples = [sample for lane in lanes for sample in lane.samples]
             numbers = np.array([lane.number for lane in lanes for _ in lane.samples], np.int64)
-            table.append(numbers, np.fromiter(map(_TIME, samples), np.int64, len(samples)), samples)
+            table.append(numbers, np.fromiter([sample.received for sample in samples], np.int64, len(samples)), samples)
             for lane in lanes:
                 table.dropped[lane.number] = NEVER if lane.samples else lane.latest
         self._evictions = self._buffer.evictions

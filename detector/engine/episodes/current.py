@@ -37,7 +37,8 @@ class Episode:
     start: int
     values: Mapping[str, Any]
     variables: Mapping[str, Any] | None
-    """What the conditions saw at the start; None in a restored episode until its next evaluation."""
+    """What the conditions saw at the start; None until the next evaluation where the episode was restored, or started
+    while the rule had no actions."""
     demands: dict[str, Demand] = field(default_factory=dict)
     """By action; an action whose parameters cannot be rendered yet has none."""
     outdated: set[str] = field(default_factory=set)
