@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks.intake_rate import MARK
 from detector import cli
 from detector.engine.blocks import Blocks
-from detector.engine.buffering.inflow import Inflow
+from detector.engine.buffering.ingest import Ingest
 from detector.engine.engine import Engine
 from detector.engine.knowledge import Knowledge
 from detector.engine.samples.intake import Intake
@@ -50,15 +50,15 @@ def clocked(stage: str, thread: str, function: Callable[..., Any]) -> Callable[.
 
 def clock_all() -> None:
     """Put clocks around all stages."""
-    putter, insert, run = Intake.putter, Inflow.insert, Blocks.run
+    putter, insert, run = Intake.putter, Ingest.insert, Blocks.run
     last = wait = 0.0
 
     def clocked_putter(intake: Intake, stream: str) -> Callable[..., None]:
         return clocked("queue", "stream", putter(intake, stream))
 
-    def clocked_insert(inflow: Inflow, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
+    def clocked_insert(ingest: Ingest, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
         nonlocal last, wait
-        insert(inflow, arrivals, times)
+        insert(ingest, arrivals, times)
         last, wait = time.monotonic(), max(wait, (time.time_ns() - arrivals[0].received) / 1e9)
 
     def clocked_run(blocks: Blocks, *args: Any) -> Any:
@@ -106,7 +106,7 @@ def clock_all() -> None:
     Engine.gap = clocked_gap  # type: ignore[method-assign]
     Intake.putter = clocked_putter  # type: ignore[method-assign]
     Intake.drain = clocked("drain", "evaluator", Intake.drain)  # type: ignore[method-assign]
-    Inflow.insert = clocked("insert", "evaluator", clocked_insert)  # type: ignore[method-assign]
+    Ingest.insert = clocked("insert", "evaluator", clocked_insert)  # type: ignore[method-assign]
     Knowledge.settle = clocked("tables", "evaluator", Knowledge.settle)  # type: ignore[method-assign]
     Blocks.run = clocked("evaluation", "evaluator", clocked_run)  # type: ignore[method-assign]
     Engine.advance = clocked("advance", "evaluator", Engine.advance)  # type: ignore[method-assign]

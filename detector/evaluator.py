@@ -257,7 +257,7 @@ class Evaluator:
         self._hand_over(events)
 
     def _ask(self, rule: str) -> list[Answer]:
-        events, answers = self._engine.ask(rule)
+        events, answers = self._engine.evaluate_now(rule)
         self._record(self._engine.now, {"kind": "ask", "rule": rule})
         self._hand_over(events)
         return answers

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from detector.assembly import RuleBook, inlets, make_engine
 from detector.engine.episodes.events import Event
-from detector.engine.evaluation import Sight
+from detector.engine.evaluation import Evaluated
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import replay_arrivals
 from wayside.api import Detector, EventRule
@@ -46,7 +46,7 @@ class Live:
         return self._engine.advance(arrivals, until)
 
 
-def _nobody(_: Sight) -> None:
+def _nobody(_: Evaluated) -> None:
     """Looks on."""
 
 

@@ -90,5 +90,5 @@ class Ages:
 
 
 def _rounded(nanoseconds: int) -> int:
-    """To three digits: enough to tell what is usual, in little room."""
+    """Rounded to three digits: precise enough for typical ages, and few distinct values."""
     return round(nanoseconds, 3 - len(str(nanoseconds)))

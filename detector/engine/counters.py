@@ -34,12 +34,12 @@ class RuleCounters:
     unknowns: int = 0
     """Values that were not there when an expression needed them."""
     absences: Counter[str] = field(default_factory=Counter)
-    """What was not there, by what the expressions said; a bounded number of them."""
+    """Reasons for unknown results, with their counts; a bounded number of them."""
     errors: int = 0
     """Expressions that failed on values that were there."""
     last_error: str = ""
     misplaced: int = 0
-    """Looks at a client whose newest sample says no place: absent, no number, infinite."""
+    """Evaluations of a client whose newest sample has no position: absent, not a number, infinite."""
     last_misplaced: str = ""
     ticks: int = 0
     """Times at which the rule was evaluated, for all its subjects."""
@@ -60,7 +60,7 @@ class RuleCounters:
     """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
 
     def note(self, reason: Reason, message: str, place: str = "", times: int = 1) -> None:
-        """Count an expression's unknown results; `place` says of an error which client and stream it is about."""
+        """Count an expression's unknown results; `place` names the client and stream in the text of an error."""
         if self.notes is not None and len(self.notes) < _MAXIMUM_NOTES:
             self.notes.append(message)
         if reason is Reason.ERROR:
@@ -78,7 +78,7 @@ class RuleCounters:
         self.time_ns += spent
 
     def misplace(self, message: str) -> None:
-        """Count a sample that should say where its client is, and does not."""
+        """Count a sample without the position of its client."""
         self.misplaced += 1
         self.last_misplaced = message
 
@@ -95,7 +95,7 @@ class Counters:
     unnamed: Counter[str] = field(default_factory=Counter)
     """Samples dropped since neither their key nor their message names a valid client, by stream."""
     last_unnamed: dict[str, str] = field(default_factory=dict)
-    """The key of the last one, and what its message said instead of a name, by stream."""
+    """The key of the last one, and the value in its message that is not a name, by stream."""
     unstamped: Counter[str] = field(default_factory=Counter)
     """With clock Data, samples without a stamp, by stream: their receive time counts."""
     zeros: Counter[str] = field(default_factory=Counter)

@@ -1,4 +1,4 @@
-"""The engine: arrivals and the time go in, events come out, and the demands of what is open can be asked for.
+"""The engine: arrivals and the time go in, events come out, and the demands of open episodes can be read.
 
 It reads no clock and does no I/O. Live operation, the replay of a recording and the tests call the same methods
 (`advance`, `gap`, `set_rules`, `restore`, `finish`), always from one thread; the same calls give the same events, ids
@@ -38,7 +38,7 @@ __all__ = ["Engine", "KeyReader"]
 
 
 class NoAnswerError(ValueError):
-    """A rule was asked that cannot answer; the text says why, and what to do."""
+    """A rule cannot be evaluated on demand; the text names the reason and the remedy."""
 
 
 class Engine:
@@ -74,7 +74,7 @@ class Engine:
         self.buffer, self.clients = self._known.buffer, self._known.clients
         self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
         self.consequences = Consequences(self.buffer)
-        """What the actions other than deploy are told."""
+        """The messages for actions other than deploy."""
         self._timeline = self._make_timeline(start)
         self.instruments = Instruments()
         """These look on; they are set before the rules are."""
@@ -128,7 +128,7 @@ class Engine:
     def finish(self) -> Iterator[list[Event]]:
         """Nothing more comes: what still has to be evaluated, step by step. With clock Wall nothing has.
 
-        The demands that are open between two steps can be asked for there.
+        The demands that are open between two steps can be read there.
         """
         for step in self._timeline.finish():
             yield self._executor.run((step,))
@@ -224,10 +224,10 @@ class Engine:
         self.schedule.set_level(level)
         self._executor.plan()
 
-    def ask(self, name: str) -> tuple[list[Event], list[Answer]]:
+    def evaluate_now(self, name: str) -> tuple[list[Event], list[Answer]]:
         """Evaluate a rule with `onDemand` now: after the last tick, with what was taken in since up to `now`.
 
-        Returns what started and ended, and what the rule says of each subject.
+        Returns what started and ended, and the result for each subject.
 
         Raises:
             NoAnswerError: there is no such rule, or it is none that is evaluated on demand, disabled or paused.
@@ -245,12 +245,12 @@ class Engine:
         return events, answers
 
     def demands(self) -> dict[str, Demand]:
-        """What the open episodes ask for, by the names of the tasks."""
+        """The demands of open episodes, by the names of their tasks."""
         return {demand.name: demand for run in self._runs.values() for demand in run.demands()}
 
     @property
     def demands_version(self) -> tuple[int, int]:
-        """Changes whenever the demands do, so that they need be asked for only then."""
+        """Changes whenever the demands do: a caller reads them again only then."""
         return self._rules_version, sum(run.version for run in self._runs.values())
 
     def next_tick(self) -> int:
@@ -269,7 +269,7 @@ class Engine:
 
     @property
     def on_wall_clock(self) -> bool:
-        """Whether the shell says how far time has come; else the samples do."""
+        """Whether the shell advances time; else the samples do."""
         return isinstance(self._timeline, WallTimeline)
 
     @property
@@ -309,7 +309,7 @@ class Engine:
             alone_after=spec.client_timeout.ns,
             maximum_bytes=spec.buffer.bytes.bytes,
             stamp_of=self._known.stamp_of,
-            client_of=self._known.inflow.client_of,
+            client_of=self._known.ingest.client_of,
             latched=_latched(self.detector),
             exact=self._exact,
         )

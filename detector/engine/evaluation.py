@@ -28,7 +28,7 @@ from wayside.rules import CompiledRule, FleetSubject
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-class Sight(NamedTuple):
+class Evaluated(NamedTuple):
     """What the evaluation of a rule saw of one subject, after it has decided. Times are nanoseconds."""
 
     now: int
@@ -41,7 +41,7 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a rule says of one subject when it is asked."""
+    """The result of a rule with `onDemand` for one subject."""
 
     subject: str
     when: bool | None
@@ -73,8 +73,8 @@ class RuleRun:
         self._identity = identity
         self._timing = _timing(rule)
         self._follows = any(deploy.follow for deploy in rule.deploys)
-        self.witness: Callable[[Sight], None] | None = None
-        """Told what each evaluation sees, while somebody wants to know. It decides nothing."""
+        self.witness: Callable[[Evaluated], None] | None = None
+        """Called with each evaluation while it is set. It decides nothing."""
         self.version = 0
         """Changes whenever the demands do."""
         self._states: dict[Subject, SubjectState] = {}
@@ -88,7 +88,7 @@ class RuleRun:
         self.disturbed = True
         """Whether states changed otherwise than by `run`, so that every subject has to be looked at again."""
         self.journal: list[Change] | None = None
-        """What became of demands, in order of time; None while nobody wants to know."""
+        """What became of demands, in order of time; None while nobody reads it."""
 
     def tick(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: Only | None = None
@@ -116,7 +116,7 @@ class RuleRun:
     def answer(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals
     ) -> tuple[list[Event], list[Answer]]:
-        """Evaluate the rule for all subjects, and tell what it says of each, in order of the subjects."""
+        """Evaluate the rule for all subjects; returns events, and the result for each, in order of the subjects."""
         self._answers = []
         events = self.tick(now, views, clients, plugins)
         answers, self._answers = self._answers, None
@@ -130,7 +130,7 @@ class RuleRun:
 
     @property
     def read(self) -> Mapping[str, str]:
-        """By condition, what errors say that it reads."""
+        """By condition, the text that errors add about what it reads."""
         return self._read
 
     @property
@@ -183,7 +183,7 @@ class RuleRun:
     def restore(self, episode: OpenEpisode, demands: Sequence[Demand]) -> Event:
         """Take up an episode that was open before a restart, with the demands of its actions.
 
-        Returns the event that told of its start then. Where an action is not what it was, its demand holds until it is
+        Returns the event of its start. Where an action has changed, its demand holds until it is
         rendered again, at the next evaluation.
         """
         self.disturbed = True
@@ -229,13 +229,13 @@ class RuleRun:
         self._muted.clear()
 
     def demands(self) -> Iterator[Demand]:
-        """What the open episodes ask for."""
+        """The demands of the open episodes."""
         if not self.rule.dry_run:
             for episode in self._open.values():
                 yield from episode.demands.values()
 
     def open_starts(self) -> Iterator[Event]:
-        """The events that said that the episodes which are open started, in order of the subjects."""
+        """The start events of the open episodes, in order of the subjects."""
         for subject in sorted(self._open, key=lambda each: each.text):
             yield self._open[subject].started(self.rule, self._identity)
 
@@ -266,7 +266,7 @@ class RuleRun:
         elif (event := self.happened(now, happened, candidate)) is not None:
             yield event
         if self.witness is not None:
-            self.witness(Sight(now, candidate, when, until, state.is_open, state.onset))
+            self.witness(Evaluated(now, candidate, when, until, state.is_open, state.onset))
         if self._answers is not None:
             self._answers.append(self._answer(candidate, when))
 
@@ -280,7 +280,7 @@ class RuleRun:
         return state
 
     def drop_state(self, subject: Subject) -> None:
-        """The subject's state says no more than a new one would."""
+        """Forget a state that equals a new one."""
         del self._states[subject]
 
     def tidy_starts(self, now: int) -> None:

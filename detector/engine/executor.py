@@ -115,7 +115,7 @@ class Executor:
                 case Insert(arrivals, times):
                     if self._blocks.waiting and not self._may_wait(arrivals, times):
                         events += self._evaluate_waiting()
-                    self._known.inflow.insert(arrivals, times)
+                    self._known.ingest.insert(arrivals, times)
                 case Tick():
                     events += self._tick(step)
                 case Gap(time, backwards):

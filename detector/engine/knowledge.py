@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from detector.engine.buffering.buffer import Buffer, bytes_of
 from detector.engine.buffering.clients import Clients
-from detector.engine.buffering.inflow import Inflow
+from detector.engine.buffering.ingest import Ingest
 from detector.engine.buffering.lanes import lane_makers
 from detector.engine.buffering.messages import KeyReader, Messages
 from detector.engine.buffering.naming import MessageClients
@@ -37,7 +37,7 @@ _DEFINED = (Encoding.CDR, Encoding.UPER)
 
 
 class Knowledge:
-    """The buffer, the clients, and the signals and positions that rules ask for."""
+    """The buffer, the clients, and the signals and positions that rules read."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Knowledge:
         """
         self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
         self.clients = Clients({}, detector.spec.client_timeout.ns)
-        self.inflow = Inflow(self.buffer, self.clients, counters)
+        self.ingest = Ingest(self.buffer, self.clients, counters)
         self._counters = counters
         self._starts = starts
         self._exact = exact
@@ -101,7 +101,7 @@ class Knowledge:
         )
         self._lane_makers = lane_makers(detector, decoders)
         names = MessageClients(decoders, compiled, self._counters)
-        self.inflow.configure(detector, read_key, self._lane_makers, names)
+        self.ingest.configure(detector, read_key, self._lane_makers, names)
         self.messages = Messages(decoders, compiled, read_key, self._counters)
         self.transforms = Transforms(_transform_streams(detector), self.buffer, self.messages, self._counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
@@ -131,10 +131,10 @@ class Knowledge:
 
     def settle(self) -> None:
         """Bring the tables up to date with the buffer."""
-        inflow = self.inflow
-        self.tables.settle(inflow.came, inflow.lanes)
-        inflow.came, inflow.lanes = [], []
-        inflow.noting = not self.tables.empty
+        ingest = self.ingest
+        self.tables.settle(ingest.came, ingest.lanes)
+        ingest.came, ingest.lanes = [], []
+        ingest.noting = not self.tables.empty
 
     def forget_rows(self, now: int) -> None:
         """Forget what the tables need no longer, once a second: all ticks up to `now` (nanoseconds) have run."""
@@ -163,7 +163,7 @@ class Knowledge:
             self.clients.still_heard(client, latest)
         lost = self.clients.lose(time)
         if lost:
-            self.inflow.lose(set(lost))
+            self.ingest.lose(set(lost))
             self.signals.forget(lambda rule, client: client in self.clients)
         return lost
 
@@ -190,7 +190,7 @@ class Knowledge:
         """By stream, the known clients of which these samples are."""
         found: dict[str, set[str]] = {}
         for arrival in arrivals:
-            client = self.inflow.client_of(arrival)
+            client = self.ingest.client_of(arrival)
             if client is not None and client in self.clients:
                 found.setdefault(arrival.stream, set()).add(client)
         return {stream: frozenset(clients) for stream, clients in found.items()}
@@ -222,7 +222,7 @@ class Knowledge:
         )
 
     def forget_rules(self, kept: Collection[str]) -> None:
-        """Signals of other rules than these are not asked for any more."""
+        """Forget the signals of all rules but these."""
         self.signals.forget(lambda rule, client: rule in kept)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from detector.engine.columns.block import Block, Track
-from detector.engine.columns.pairs import Sight
+from detector.engine.columns.pairs import PairBlock
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Codes
 from detector.engine.evaluation import Change
@@ -22,7 +22,7 @@ class Observer(Protocol):
         The block has the signals and, by field, where conditions are true and false (`verdicts`), one row a track.
         """
 
-    def pairs(self, track: Track, sight: Sight) -> None:
+    def pairs(self, track: Track, these: PairBlock) -> None:
         """A rule about pairs at one tick."""
 
 

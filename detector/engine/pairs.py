@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
-from detector.engine.columns.pairs import PairColumns, Sight
+from detector.engine.columns.pairs import PairBlock, PairColumns
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
 from detector.engine.episodes.subjects import Subject
@@ -55,7 +55,7 @@ class PairGroup:
     """One rule about pairs. It is driven like a `RuleGroup`."""
 
     width = 1
-    may_wait = False  # what cannot be read is counted at each tick at which somebody asks for it
+    may_wait = False  # samples that cannot be read are counted at each tick that reads them
 
     def __init__(self, run: RuleRun, order: int, context: Context, every: int, period: int) -> None:
         """`order` is the rule's place among the rules; for the rest see `RuleGroup`."""
@@ -95,19 +95,19 @@ class PairGroup:
         first, second = index[watched.keys >> _SHIFT], index[watched.keys & (1 << _SHIFT) - 1]
         there = (first >= 0) & (second >= 0)
         look = watched.in_progress & there
-        sight = self._columns.evaluate(block, floor, (first[look], second[look]))
+        these = self._columns.evaluate(block, floor, (first[look], second[look]))
         if self.observer is not None:
-            self.observer.pairs(self._track, sight)
+            self.observer.pairs(self._track, these)
         # Where each watched pair is among those that were looked at; -1: it was not.
-        pairs = sight.first * count + sight.second
+        pairs = these.first * count + these.second
         rows = np.searchsorted(pairs, first * count + second)
         rows[rows == len(pairs)] = 0
         seen = there & (pairs[rows] == first * count + second) if len(pairs) else np.zeros(len(rows), bool)
         rows = rows[seen]
-        changed = sight.codes & 3 == TRUE
-        differs = (sight.codes[rows] ^ watched.last[seen]) & watched.matters[seen] != 0
+        changed = these.codes & 3 == TRUE
+        differs = (these.codes[rows] ^ watched.last[seen]) & watched.matters[seen] != 0
         changed[rows] = differs | (watched.wakes[seen] <= tick)
-        changed[rows] |= self._followed(sight, rows, watched.in_progress[seen])
+        changed[rows] |= self._followed(these, rows, watched.in_progress[seen])
         stale = seen.copy()
         stale[seen] = changed[rows]
         over = ~seen & ~watched.in_progress & (watched.wakes <= tick)
@@ -115,7 +115,7 @@ class PairGroup:
             self._run.drop_state(self._subject(key))
         kept: list[Entry] = []
         for row in np.flatnonzero(changed).tolist():
-            yield from self._step(tick, sight, row, kept)
+            yield from self._step(tick, these, row, kept)
         self._watched = _joined(watched.of(~stale & ~over), kept)
 
     def _block(self, tick: int, clients: Sequence[str]) -> Block:
@@ -148,30 +148,30 @@ class PairGroup:
         names = self._context.tables.names
         return Subject((names[key >> _SHIFT], names[key & (1 << _SHIFT) - 1]), self._element.name)
 
-    def _key(self, sight: Sight, row: int) -> int:
-        numbers = sight.block.numbers
-        return int(numbers[sight.first[row]]) << _SHIFT | int(numbers[sight.second[row]])
+    def _key(self, these: PairBlock, row: int) -> int:
+        numbers = these.block.numbers
+        return int(numbers[these.first[row]]) << _SHIFT | int(numbers[these.second[row]])
 
-    def _followed(self, sight: Sight, rows: Integers, in_progress: Truths) -> Truths:
+    def _followed(self, these: PairBlock, rows: Integers, in_progress: Truths) -> Truths:
         """Which of these pairs have demands that an evaluation may change although the observation is the same."""
         run = self._run
         if not run.has_deploys or not run.open_episodes:
             return np.zeros(len(rows), bool)
         needed = [
-            progress and run.needs_every_tick(self._subject(self._key(sight, row)))
+            progress and run.needs_every_tick(self._subject(self._key(these, row)))
             for row, progress in zip(rows.tolist(), in_progress.tolist(), strict=True)
         ]
         return np.array(needed, bool)
 
-    def _step(self, tick: int, sight: Sight, row: int, kept: list[Entry]) -> Iterator[Happened]:
+    def _step(self, tick: int, these: PairBlock, row: int, kept: list[Entry]) -> Iterator[Happened]:
         """Bring one pair's state forward, and add it to those that are kept where it is still needed."""
-        run, key, code = self._run, self._key(sight, row), int(sight.codes[row])
+        run, key, code = self._run, self._key(these, row), int(these.codes[row])
         subject = self._subject(key)
         state = run.state(subject) or run.new_state(subject)
         stays = state.is_open and run.needs_every_tick(subject)
         ran = state.run((tick,), 0, 1, run.timing, code)
         if ran.what is not None or stays:
-            candidate = Candidate(subject, self._columns.variables(sight, row), in_scope=True, near=True)
+            candidate = Candidate(subject, self._columns.variables(these, row), in_scope=True, near=True)
             if ran.what is None:
                 run.stays(tick, candidate)
             elif (event := run.happened(tick, ran.what, candidate)) is not None:

@@ -119,7 +119,7 @@ class Replay:
     def ask(self, rule: str) -> None:
         """Somebody asked a rule; with other rules than were recorded, it may not be there to answer."""
         with contextlib.suppress(NoAnswerError):
-            self._note(self._engine.ask(rule)[0])
+            self._note(self._engine.evaluate_now(rule)[0])
 
     def finish(self) -> None:
         """Nothing more comes: what still has to be evaluated."""

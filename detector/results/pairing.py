@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Track
-from detector.engine.columns.pairs import Sight
+from detector.engine.columns.pairs import PairBlock
 from detector.engine.episodes.episodes import OUTSIDE
 from detector.engine.episodes.subjects import Subject
 from detector.results.reasons import of_stream
@@ -50,30 +50,30 @@ class PairLog:
         self._unsure: dict[str, Integers] = {}
         self._reasons: dict[str, dict[tuple[int, int], str]] = {field: {} for field in self._said}
 
-    def add(self, time: int, sight: Sight, numbers: Integers) -> None:
-        """Note a tick; `numbers` are those of the clients of the sight's block."""
+    def add(self, time: int, these: PairBlock, numbers: Integers) -> None:
+        """Note a tick; `numbers` are those of the clients of the these's block."""
         self._ticks.append(time)
-        keys = numbers[sight.first] << _SHIFT | numbers[sight.second]
+        keys = numbers[these.first] << _SHIFT | numbers[these.second]
         self._keys.append(keys)
-        outside = sight.codes & OUTSIDE == OUTSIDE
+        outside = these.codes & OUTSIDE == OUTSIDE
         for field, parts in self._said.items():
-            verdict = sight.verdicts[field]
+            verdict = these.verdicts[field]
             said = np.where(verdict.true, np.uint8(TRUE), np.where(verdict.false, np.uint8(FALSE), np.uint8(UNKNOWN)))
             said[outside] = AWAY
             parts.append(said)
-            self._note_unsure(field, time, sight, keys, said)
-        self._values["distance"].append(np.where(sight.placed, sight.distance, np.nan))
-        if sight.closing is not None and sight.closing_known is not None:
-            speeds = np.where(sight.closing_known, sight.closing, np.nan)
+            self._note_unsure(field, time, these, keys, said)
+        self._values["distance"].append(np.where(these.placed, these.distance, np.nan))
+        if these.closing is not None and these.closing_known is not None:
+            speeds = np.where(these.closing_known, these.closing, np.nan)
             self._values.setdefault("closingSpeed", []).append(speeds)
         for name, at in self._track.signals.items():
-            column = sight.seen.signals[at] if len(sight.first) else None
-            for role, clients in zip(_ROLES, (sight.first, sight.second), strict=True):
+            column = these.seen.signals[at] if len(these.first) else None
+            for role, clients in zip(_ROLES, (these.first, these.second), strict=True):
                 values = self._values.setdefault(f"{role}.{name}", [])
                 if column is None:
                     values.append(np.zeros(0))
                     continue
-                rows = sight.at[clients]
+                rows = these.at[clients]
                 tags = None if column.tags is None else column.tags[rows]
                 if tags is not None and ((tags == Tag.OTHER) | (tags == Tag.TEXT)).any():
                     self._odd.add(f"{role}.{name}")
@@ -110,7 +110,7 @@ class PairLog:
                 subject.conditions[field] = Steps(times, codes.astype(np.uint8), why)
             yield subject
 
-    def _note_unsure(self, field: str, time: int, sight: Sight, keys: Integers, said: Bytes) -> None:
+    def _note_unsure(self, field: str, time: int, these: PairBlock, keys: Integers, said: Bytes) -> None:
         """Note of pairs whose condition is unknown from now on why it is."""
         at = np.flatnonzero(said == UNKNOWN)
         before = self._unsure.get(field)
@@ -118,23 +118,23 @@ class PairLog:
             return
         unsure = keys[at]
         for row in at.tolist() if before is None else at[~np.isin(unsure, before)].tolist():
-            self._reasons[field][int(keys[row]), time] = self._why(field, sight, row)
+            self._reasons[field][int(keys[row]), time] = self._why(field, these, row)
         self._unsure[field] = unsure
 
-    def _why(self, field: str, sight: Sight, row: int) -> str:
+    def _why(self, field: str, these: PairBlock, row: int) -> str:
         rule = self._track.rule
         assert isinstance(rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
         expression = rule.when if field == "when" else rule.until
         read = set() if expression is None else {path[:2] for path in expression.paths}
-        for role, index in zip(_ROLES, (int(sight.first[row]), int(sight.second[row])), strict=True):
-            client = sight.block.clients[index]
-            if not sight.places.known[index]:
+        for role, index in zip(_ROLES, (int(these.first[row]), int(these.second[row])), strict=True):
+            client = these.block.clients[index]
+            if not these.places.known[index]:
                 return f"position of {client}: no sample of stream {rule.subject.position.stream}, or an old one"
-            point = int(sight.at[index])
-            values = sight.seen.values(self._track, point)
+            point = int(these.at[index])
+            values = these.seen.values(self._track, point)
             for signal in rule.signals:
                 if (role, signal.name) in read and signal.name not in values:
-                    return f"{role}.{signal.name} of {client}: {of_stream(sight.seen, signal.stream, point)}"
+                    return f"{role}.{signal.name} of {client}: {of_stream(these.seen, signal.stream, point)}"
         return "a value that it reads is not there"
 
 
@@ -148,16 +148,16 @@ class WayLog:
         self._clients: list[Integers] = []
         self._axes: list[Doubles] = []
 
-    def add(self, rule: str, geographic: bool, time: int, sight: Sight, numbers: Integers) -> None:
+    def add(self, rule: str, geographic: bool, time: int, these: PairBlock, numbers: Integers) -> None:
         """Note a tick."""
         if self._rule is None:
             self._rule, self.geographic = rule, geographic
         if rule != self._rule:
             return
-        known = sight.places.known
+        known = these.places.known
         self._times.append(time)
         self._clients.append(numbers[known])
-        self._axes.append(sight.places.axes[:2, known])
+        self._axes.append(these.places.axes[:2, known])
 
     def ways(self, names: Sequence[str]) -> dict[str, Way]:
         """By client, its places; without those at which it stands still."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Track
-from detector.engine.columns.pairs import Sight
+from detector.engine.columns.pairs import PairBlock
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Codes
 from detector.engine.engine import Engine
@@ -130,15 +130,15 @@ class Tracer:
             plan.seen.clear()
             plan.seen.update(numbers.tolist())
 
-    def pairs(self, track: Track, sight: Sight) -> None:
+    def pairs(self, track: Track, these: PairBlock) -> None:
         """Note what a rule about pairs sees at a tick."""
-        time = sight.block.ticks[0]
+        time = these.block.ticks[0]
         self._time(time, time)
-        numbers = self._numbers_of(sight.block.clients)
+        numbers = self._numbers_of(these.block.clients)
         log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
-        log.add(time, sight, numbers)
+        log.add(time, these, numbers)
         assert isinstance(track.rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
-        self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, sight, numbers)
+        self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
 
     # What came of it
 

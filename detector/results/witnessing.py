@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from detector.engine.evaluation import Sight
+from detector.engine.evaluation import Evaluated
 from detector.engine.scoping.snapshots import snapshot
 from detector.results.reasons import of_variables
 from detector.results.series import AWAY, FALSE, TRUE, UNKNOWN, Kind, Series, Steps, SubjectTrace
@@ -66,9 +66,9 @@ class Witnessed:
         """The first and the last evaluation; there was one."""
         return self._begin or 0, self._end
 
-    def saw(self, sight: Sight) -> None:
+    def saw(self, evaluated: Evaluated) -> None:
         """Note what changed."""
-        candidate, now = sight.candidate, sight.now
+        candidate, now = evaluated.candidate, evaluated.now
         self._begin = now if self._begin is None else self._begin
         self._end = now
         subject = self._subjects.get(candidate.subject.text)
@@ -78,9 +78,9 @@ class Witnessed:
         seen = dict(_plain(snapshot(self._rule, candidate)))
         for name in seen.keys() | subject.values.keys():
             subject.values.setdefault(name, _Values()).add(now, seen.get(name))
-        conditions = {"when": (self._rule.when, sight.when)}
+        conditions = {"when": (self._rule.when, evaluated.when)}
         if self._rule.until is not None:
-            conditions["until"] = (self._rule.until, sight.until)
+            conditions["until"] = (self._rule.until, evaluated.until)
         for name, (expression, said) in conditions.items():
             code = AWAY if candidate.in_scope is False else UNKNOWN if said is NOT_KNOWN else TRUE if said else FALSE
             if subject.said.setdefault(name, _Values()).add(now, float(code)) and code == UNKNOWN:

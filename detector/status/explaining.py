@@ -13,7 +13,7 @@ from typing import Any
 from detector.engine.buffering.buffer import NEVER
 from detector.engine.engine import Engine
 from detector.engine.episodes.plain import plain
-from detector.engine.evaluation import Sight
+from detector.engine.evaluation import Evaluated
 from detector.engine.scoping.snapshots import snapshot
 from detector.status.model import Explanation, SubjectStatus
 from wayside.expressions import UNKNOWN
@@ -62,21 +62,21 @@ class Watching:
             return [SubjectStatus(self._subject, looked_at=False, why=self._why_not(self._subject))]
         return told[:MAXIMUM_SUBJECTS]
 
-    def _see(self, sight: Sight) -> None:
-        text, variables = sight.candidate.subject.text, sight.candidate.variables
+    def _see(self, evaluated: Evaluated) -> None:
+        text, variables = evaluated.candidate.subject.text, evaluated.candidate.variables
         if self._subject not in (None, text):
             return
-        order = 0 if sight.is_open else 1 if sight.when is True else 2
+        order = 0 if evaluated.is_open else 1 if evaluated.when is True else 2
         status = SubjectStatus(
             subject=text,
             looked_at=True,
-            in_scope=_plain(sight.candidate.in_scope),
-            near=_plain(sight.candidate.near),
-            when=_plain(sight.when),
-            until=_plain(sight.until),
-            open=sight.is_open,
-            pending=None if sight.onset is None else (sight.now - sight.onset) / 1e9,
-            values=plain(snapshot(self._run.rule, sight.candidate)),
+            in_scope=_plain(evaluated.candidate.in_scope),
+            near=_plain(evaluated.candidate.near),
+            when=_plain(evaluated.when),
+            until=_plain(evaluated.until),
+            open=evaluated.is_open,
+            pending=None if evaluated.onset is None else (evaluated.now - evaluated.onset) / 1e9,
+            values=plain(snapshot(self._run.rule, evaluated.candidate)),
             unknown=dict(self._unknowns(variables)),
         )
         self._seen.append((order, status))

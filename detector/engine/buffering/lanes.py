@@ -1,4 +1,4 @@
-"""Makes the lanes of each stream, as the Detector says how much of it is kept."""
+"""Makes the lanes of each stream, within the limits that the Detector sets."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class LatchedLane(Lane):
         super().__init__(client, stream, duration, maximum_bytes, maximum_count)
         self._topic = topic
         self._topics: dict[Sample, Hashable] = {}
-        """What samples speak of, as far as it was asked; equal samples speak of the same."""
+        """The topics of samples, computed on first use; equal samples have equal topics."""
 
     def _decide(self) -> None:
         """Every sample comes through `insert`."""
@@ -77,17 +77,17 @@ class LatchedLane(Lane):
     def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
         """See Lane; leaves out what is older than the duration and was replaced since."""
         horizon = (until if now is None else now) - self.duration
-        said: set[Hashable] = set()
+        replaced: set[Hashable] = set()
         for sample in reversed(self.samples):
             if after is not None and sample.time <= after:
                 return
             about = self._about(sample)
-            if sample.time <= until and (sample.time > horizon or about not in said):
+            if sample.time <= until and (sample.time > horizon or about not in replaced):
                 yield sample
-            said.add(about)
+            replaced.add(about)
 
     def step_back(self, to: int) -> None:
-        """Time goes on from `to`: what was said still holds, and was not said after that."""
+        """Time continues from `to`: samples stay valid, none of them newer than that."""
         self._keep([_not_after(sample, to) for sample in self.samples])
         self.latest = self.samples[-1].time if self.samples else NEVER
 

@@ -1,4 +1,4 @@
-"""What expressions over one sample see of it: payloads are decoded when they are asked for, and stamps are read."""
+"""What expressions over one sample see of it: payloads are decoded on first use, and stamps are read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class KeyReader(Protocol):
 
 
 class Messages:
-    """Decodes payloads when an expression asks for them, each at most once a tick."""
+    """Decodes payloads when an expression needs them, each at most once a tick."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Whose a message is, where the message itself says so: a stream's `client` is a template over it.
+"""The client of a message that names it: a stream's `client` is a template over the message.
 
 Such messages are decoded as they enter the buffer, on the thread that evaluates, never on the one that receives.
 """
@@ -30,7 +30,7 @@ class MessageClients:
         self._counters = counters
 
     def __contains__(self, stream: str) -> bool:
-        """Whether the messages of the stream say whose they are."""
+        """Whether the messages of the stream name their client."""
         return stream in self._templates
 
     def client(self, stream: str, key: str, captures: Mapping[str, str], payload: bytes) -> str | None:

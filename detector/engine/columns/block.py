@@ -49,7 +49,7 @@ class Track:
     def __init__(
         self, rule: CompiledRule, element: CompiledElement, counters: RuleCounters, place: Mapping[str, str], row: int
     ) -> None:
-        """`place` has, by condition, what errors say that it reads; `row` is the track's place in its group."""
+        """`place`: by condition, the text that errors add about its inputs. `row`: the track's place in its group."""
         self.rule = rule
         self.element = element
         self.counters = counters

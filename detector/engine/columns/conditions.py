@@ -46,7 +46,7 @@ class Condition(NamedTuple):
 
 
 class Conditions:
-    """What the rules of a group say at the points of a block."""
+    """Evaluates the conditions of a group of rules at the points of a block."""
 
     def __init__(
         self, context: Context, tracks: Sequence[Track], chosen: Callable[[CompiledRule], Mapping[str, Expression]]
@@ -82,7 +82,7 @@ class Conditions:
         return np.array([[field in each] for each in self._of])
 
     def verdicts(self, block: Block) -> dict[str, Verdict]:
-        """What the conditions say, by field, shape (tracks, points); unknown in tracks without it. Counts unknowns."""
+        """The verdicts, by field, shape (tracks, points); unknown in tracks without the field. Counts unknowns."""
         points = len(block.clients) * len(block.ticks)
         shape = (len(self._tracks), points)
         found: dict[str, Verdict] = {}
@@ -164,7 +164,7 @@ class Conditions:
             self._note(block, row, condition, point, note, times)
 
     def _inputs(self, block: Block, condition: Condition, point: int) -> Hashable | None:
-        """What tells whether a condition may have changed; None: it may always have."""
+        """A key that differs whenever the inputs of a condition do; None: evaluate it each time."""
         inputs: list[Hashable] = []
         for at in condition.signals:
             column = block.signals[at]

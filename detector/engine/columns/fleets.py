@@ -219,7 +219,7 @@ class FleetGroup:
         self, fleet: FleetBlock, row: int, condition: Condition, inner: Results | None, outer: Results
     ) -> Truths:
         """The ticks that the columns cannot decide."""
-        assert condition.node is not None  # noqa: S101  asked for what is in columns
+        assert condition.node is not None  # noqa: S101  only conditions in columns come here
         found = np.zeros(len(fleet.ticks), bool)
         if (foreign := outer.foreign(condition.node)) is not None:
             found |= foreign

@@ -53,7 +53,7 @@ class Formulas:
         return bool(self._conditions)
 
     def evaluate(self, rows: Rows) -> Mapping[str, Verdict]:
-        """What each condition says of each row. What is unknown is noted."""
+        """The verdict of each condition on each row. Counts unknown results."""
         count = rows.size
         if not count or not self._conditions:
             return {field: Verdict(np.zeros(count, bool), np.zeros(count, bool)) for field in self._conditions}

@@ -44,8 +44,8 @@ def _takes(stream: str, tables: Tables) -> bool:
 
 
 @dataclass
-class Sight:
-    """What a rule sees at one tick: the pairs that matter, in order of their names, and what it says of them."""
+class PairBlock:
+    """The pairs that a rule evaluates at one tick, in order of their names, with their observations."""
 
     block: Block
     """The clients, in order of their names, at the tick."""
@@ -90,7 +90,7 @@ class PairColumns:
         conditions = {"where": rule.subject.where, "when": rule.when, "until": rule.until}
         self._conditions = Formulas(conditions, self._leaf, texts)
 
-    def evaluate(self, block: Block, floor: int | None, more: tuple[Integers, Integers]) -> Sight:
+    def evaluate(self, block: Block, floor: int | None, more: tuple[Integers, Integers]) -> PairBlock:
         """Look at the pairs within reach and at `more`, at the block's only tick; its clients are in order.
 
         `more` are indices of clients. No look goes back to `floor` or beyond. Counts what is unknown or fails.
@@ -118,31 +118,31 @@ class PairColumns:
             seen = Block(self._context, block.ticks, names, block.numbers[looked])
             self._signals.look(seen, floor)
         distance = np.concatenate((near.distance, self._distances(places, added // count, added % count)))[order]
-        sight = Sight(block, places, seen, at, first, second, distance, places.known[first] & places.known[second])
+        these = PairBlock(block, places, seen, at, first, second, distance, places.known[first] & places.known[second])
         if self._subject.closing_speed:
-            self._measure_closing(sight, newest, floor)
+            self._measure_closing(these, newest, floor)
         self._track.counters.evaluations += len(first)
-        sight.codes = self._observed(sight, is_near, roles)
-        return sight
+        these.codes = self._observed(these, is_near, roles)
+        return these
 
-    def variables(self, sight: Sight, row: int) -> dict[str, Any]:
+    def variables(self, these: PairBlock, row: int) -> dict[str, Any]:
         """What expressions see of a pair, as in `scopes`."""
         found: dict[str, Any] = {
-            "a": self._member(sight, int(sight.first[row])),
-            "b": self._member(sight, int(sight.second[row])),
+            "a": self._member(these, int(these.first[row])),
+            "b": self._member(these, int(these.second[row])),
             "parameters": self._track.rule.parameters.own,
             **self._track.element.variables,
         }
-        if sight.placed[row]:
-            found["distance"] = float(sight.distance[row])
-        if sight.closing is not None and sight.closing_known is not None and sight.closing_known[row]:
-            found["closingSpeed"] = float(sight.closing[row])
+        if these.placed[row]:
+            found["distance"] = float(these.distance[row])
+        if these.closing is not None and these.closing_known is not None and these.closing_known[row]:
+            found["closingSpeed"] = float(these.closing[row])
         return found
 
-    def _member(self, sight: Sight, index: int) -> dict[str, Any]:
-        view = sight.seen.view(self._track, int(sight.at[index]))
-        if sight.places.known[index]:
-            view["position"] = described(self._subject.position, sight.places.place(index))
+    def _member(self, these: PairBlock, index: int) -> dict[str, Any]:
+        view = these.seen.view(self._track, int(these.at[index]))
+        if these.places.known[index]:
+            view["position"] = described(self._subject.position, these.places.place(index))
         return view
 
     def _distances(self, places: Places, one: Integers, other: Integers) -> Doubles:
@@ -158,11 +158,11 @@ class PairColumns:
         )
         return nearby(crowd, self._subject)
 
-    def _measure_closing(self, sight: Sight, newest: Integers, floor: int | None) -> None:
+    def _measure_closing(self, these: PairBlock, newest: Integers, floor: int | None) -> None:
         """By how much distances shrank in the last second for which both have sent places: see `Views`."""
-        at = np.flatnonzero(sight.placed)
-        one, other = sight.first[at], sight.second[at]
-        now, abouts = int(sight.block.times[0]), self._where_abouts
+        at = np.flatnonzero(these.placed)
+        one, other = these.first[at], these.second[at]
+        now, abouts = int(these.block.times[0]), self._where_abouts
         if self._context.positions.limit(self._subject.position) is None:
             end = np.full(len(at), now)
         else:
@@ -170,15 +170,18 @@ class PairColumns:
         before = end != now
         times = np.concatenate((end[before], end[before], end - CLOSING_NS, end - CLOSING_NS))
         whose = np.concatenate((one[before], other[before], one, other))
-        places = abouts.then(sight.block, newest, whose, times, floor)
+        places = abouts.then(these.block, newest, whose, times, floor)
         parts = np.cumsum([before.sum(), before.sum(), len(at)])
         a_end, b_end, a_begin, b_begin = (places.of(each) for each in np.split(np.arange(len(times)), parts))
-        after, known = sight.distance[at].copy(), a_begin.known & b_begin.known
+        after, known = these.distance[at].copy(), a_begin.known & b_begin.known
         after[before] = abouts.distances(a_end, b_end)
         known[before] &= a_end.known & b_end.known
-        sight.closing, sight.closing_known = np.zeros(len(sight.placed)), np.zeros(len(sight.placed), bool)
-        sight.closing[at] = (abouts.distances(a_begin, b_begin) - after) / (CLOSING_NS / 1e9)
-        sight.closing_known[at] = known
+        these.closing, these.closing_known = (
+            np.zeros(len(these.placed)),
+            np.zeros(len(these.placed), bool),
+        )
+        these.closing[at] = (abouts.distances(a_begin, b_begin) - after) / (CLOSING_NS / 1e9)
+        these.closing_known[at] = known
 
     # Conditions
 
@@ -201,11 +204,11 @@ class PairColumns:
         everybody = Verdict(np.ones(rows.size, bool), np.zeros(rows.size, bool))
         return self._roles[role].evaluate(rows).get("where", everybody)
 
-    def _observed(self, sight: Sight, near: Truths, roles: Mapping[str, Verdict]) -> Codes:
+    def _observed(self, these: PairBlock, near: Truths, roles: Mapping[str, Verdict]) -> Codes:
         conditions = {"where": self._subject.where, "when": self._track.rule.when, "until": self._track.rule.until}
 
         def note(field: str, row: int, reason: Reason, message: str, times: int) -> None:
-            a, b = self._names(sight, row)
+            a, b = self._names(these, row)
             if reason is Reason.ABSENT and self._context.possible.limited:
                 never = {("a", name) for name in self._never(a)} | {("b", name) for name in self._never(b)}
                 condition = conditions[field]
@@ -216,27 +219,27 @@ class PairColumns:
             self._track.counters.note(reason, message, place, times)
 
         rows = Rows(
-            len(sight.first),
-            lambda leaf: self._pair_column(sight, leaf),
-            lambda row: self.variables(sight, row),
+            len(these.first),
+            lambda leaf: self._pair_column(these, leaf),
+            lambda row: self.variables(these, row),
             note,
             not self._context.possible.limited,
         )
-        found = sight.verdicts = self._conditions.evaluate(rows)
+        found = these.verdicts = self._conditions.evaluate(rows)
         when = found["when"]
         until = found.get("until", Verdict(when.false, when.true))
         inside, outside = np.ones(rows.size, bool), np.zeros(rows.size, bool)
         scope = [found["where"]] if "where" in found else []
-        for role, at in zip(_ROLES, (sight.first, sight.second), strict=True):
+        for role, at in zip(_ROLES, (these.first, these.second), strict=True):
             if role in roles:
                 scope.append(Verdict(roles[role].true[at], roles[role].false[at]))
         for each in scope:
             inside &= each.true
             outside |= each.false
-        return observed(when, until, Verdict(inside, outside), Verdict(near, sight.placed & ~near))
+        return observed(when, until, Verdict(inside, outside), Verdict(near, these.placed & ~near))
 
-    def _names(self, sight: Sight, row: int) -> tuple[str, str]:
-        return sight.block.clients[int(sight.first[row])], sight.block.clients[int(sight.second[row])]
+    def _names(self, these: PairBlock, row: int) -> tuple[str, str]:
+        return these.block.clients[int(these.first[row])], these.block.clients[int(these.second[row])]
 
     def _never(self, client: str) -> set[str]:
         """The signals that the client can never have."""
@@ -261,20 +264,20 @@ class PairColumns:
         found = self._leaves.of_client(self._track, below)
         return found if found is None or isinstance(found, Constant) else (name, found)
 
-    def _pair_column(self, sight: Sight, leaf: Any) -> Column:
+    def _pair_column(self, these: PairBlock, leaf: Any) -> Column:
         if leaf == ("distance",):
-            return _where(sight.distance, sight.placed)
+            return _where(these.distance, these.placed)
         if leaf == ("closingSpeed",):
-            assert sight.closing is not None  # noqa: S101  an expression asks for it
-            assert sight.closing_known is not None  # noqa: S101
-            return _where(sight.closing, sight.closing_known)
-        at = sight.first if leaf[0] == "a" else sight.second
+            assert these.closing is not None  # noqa: S101  an expression needs it
+            assert these.closing_known is not None  # noqa: S101
+            return _where(these.closing, these.closing_known)
+        at = these.first if leaf[0] == "a" else these.second
         if leaf[1] == "position":
-            places = sight.places.of(at)
+            places = these.places.of(at)
             axes = [*self._subject.position.axes]
             values = places.axes[axes.index(leaf[2])] if leaf[2] in axes else np.zeros(len(at))
             return Column(values, np.where(places.known, np.uint8(Tag.NUMBER), np.uint8(Tag.UNREACHABLE)))
-        whole, rows = self._leaves.column(sight.seen, leaf[1]), sight.at[at]
+        whole, rows = self._leaves.column(these.seen, leaf[1]), these.at[at]
         return Column(
             whole.values[rows],
             None if whole.tags is None else whole.tags[rows],

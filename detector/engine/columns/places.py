@@ -101,7 +101,7 @@ class Whereabouts:
         return Places(axes, known).of(inverse)
 
     def distances(self, one: Places, other: Places) -> Doubles:
-        """Metres between the places of the same index, as `positions.distance` says; where both are known."""
+        """Metres between the places of the same index, as `positions.distance` computes it; where both are known."""
         both = np.flatnonzero(one.known & other.known)
         found = np.zeros(len(one.known))
         if self._position.geographic:
@@ -132,7 +132,7 @@ class Whereabouts:
         self._counters.unknowns += sum(possible(self._position.stream, block.clients[at]) for at in missing)
 
     def _read(self, table: Table, block: Block, at: Integers, rows: Integers) -> tuple[Doubles, Truths]:
-        """The places that rows of some clients say, and which of them are known."""
+        """The places in rows of some clients, and which of them are known."""
         tables, stream = self._context.tables, self._position.stream
         wanted = np.unique(rows[~table.filled[rows]])
         if len(wanted):

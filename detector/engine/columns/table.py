@@ -27,12 +27,12 @@ LONGEST = 2**44
 
 _SHIFT = 46
 _REACH = 2**46
-"""Nanoseconds that keys can tell apart."""
+"""Range of times that keys can represent, in nanoseconds."""
 _LEAST_ROOM = 16
 
 
 class StoredColumn:
-    """What one expression says of each row: a `Column` (see wayside.expressions.columns) that grows with its table."""
+    """The values of one expression, by row: a `Column` (see wayside.expressions.columns) that grows with its table."""
 
     __slots__ = ("odd", "others", "tags", "values")
 

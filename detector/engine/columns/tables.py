@@ -43,7 +43,7 @@ class Tables:
         self._evictions = buffer.evictions
         self._stale = True
         self._asked: set[tuple[str, Hashable]] = set()
-        """The names of the marks that were asked for since the rules were set."""
+        """The names of the marks that were requested since the rules were set."""
         self._marks: dict[tuple[str, Hashable], int] = {}
         self.users: dict[tuple[str, Used], list[tuple[RuleCounters, CompiledSignal]]] = {}
         """Who uses which columns of a stream."""
@@ -53,7 +53,7 @@ class Tables:
     def configure(
         self, detector: Detector, decoders: Mapping[str, Decoder], messages: Messages, counters: Counters
     ) -> None:
-        """Follow the Detector. Tables are made when they are asked for."""
+        """Follow the Detector. Tables are created on first use."""
         self._detector, self._decoders, self._messages, self._counters = detector, decoders, messages, counters
         self._tables, self.readers = {}, {}
         self._durations = {stream.name: detector.spec.buffer_duration_ns(stream) for stream in detector.spec.streams}
@@ -64,7 +64,7 @@ class Tables:
         self.configure(other._detector, other._decoders, other._messages, other._counters)
 
     def forget_users(self) -> None:
-        """Nobody uses any column or mark from before, but marks of owners that asked for theirs since the last time."""
+        """Release all columns and marks, except the marks whose owners requested them since the last call."""
         self.users.clear()
         kept = {name: self._tables[name[0]].marks[at] for name, at in self._marks.items() if name in self._asked}
         self._marks.clear()

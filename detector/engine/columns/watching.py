@@ -73,12 +73,12 @@ class Ages:
             periods = _counted((latest - previous)[known])
             for at in np.flatnonzero(new.any(axis=1)).tolist():
                 newest[points.clients[at]] = int(seen[at].max())
-        told: set[int] = set()
+        counted: set[int] = set()
         for each in rules:
             use = each.uses.setdefault(stream, Use())
             use.ages.update(ages)
-            if id(each) not in told:
-                told.add(id(each))
+            if id(each) not in counted:
+                counted.add(id(each))
                 use.periods.update(periods)
 
 

@@ -1,1 +1,1 @@
-"""What actions are told: episodes that start and end, and the samples around them."""
+"""What actions receive: the start and end of episodes, and the samples around them."""

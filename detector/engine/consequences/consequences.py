@@ -1,4 +1,4 @@
-"""What the actions of rules are told, in order: an episode begins, its samples, it ends, nothing more comes of it.
+"""What the actions of rules receive, in order: an episode begins, its samples, it ends, nothing more follows.
 
 The engine notes what happens; the shell takes it and passes it on, to actions that may be as slow as they like.
 """
@@ -85,7 +85,7 @@ class Consequences:
         self._running: dict[Run, Excerpt | None] = {}
         """With the excerpt, where the action has a window."""
         self._requested: dict[Run, Event] = {}
-        """Of the runs, those that somebody asked for, with what they began with."""
+        """The runs that were requested from outside, with the message that began each."""
         self._noted: list[Consequence] = []
         self._complete_ones: deque[Excerpt] = deque()
         """Excerpts that are complete and still watched, for what comes too late for them."""
@@ -119,9 +119,9 @@ class Consequences:
     def request(
         self, run: Run, event: Event, window: CompiledWindow, clients: frozenset[str] | None, begin: int, until: int
     ) -> None:
-        """Somebody asked for these samples: a run that belongs to no episode of a rule. Times are nanoseconds.
+        """Begin a run that was requested from outside and belongs to no episode of a rule. Times are nanoseconds.
 
-        `event` says what it is about; `clients` None: all. It is over at `until` at the latest.
+        `event` describes it; `clients` None: all. It ends at `until` at the latest.
         """
         self._noted.append(Begun(run, event, Rendered(), resumed=False))
         excerpt = self._excerpts.begin(window, clients, begin)
@@ -148,7 +148,7 @@ class Consequences:
             self.begin(new, rule, event, resumed=True)
 
     def take(self, now: int) -> list[Consequence]:
-        """What is to be told, up to the time `now` that the engine has reached; nanoseconds."""
+        """The messages for the actions, up to the time `now` that the engine has reached; nanoseconds."""
         if self._running:
             self._excerpts.distribute()
             for run, excerpt in list(self._running.items()):

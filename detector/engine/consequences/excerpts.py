@@ -41,11 +41,11 @@ class Excerpt:
     clients: frozenset[str] | None
     """None: all."""
     begin: int
-    """Samples after this time belong to it; of latched streams, also what was said last before."""
+    """Samples after this time belong to it; of latched streams, also the last sample before."""
     until: int | None = None
     """Samples up to this time belong to it; None while the episode is open."""
     waiting: list[tuple[Lane, Sample]] = field(default_factory=list)
-    """What time has not reached yet, or nobody has asked for."""
+    """Samples that time has not reached yet, or that nobody has taken."""
     lanes: list[Lane] = field(default_factory=list)
     """Where its samples come from."""
 

@@ -1,4 +1,4 @@
-"""How many episodes a client may start within an hour, where the rule says so."""
+"""The maximum number of episodes per client and hour, where a rule has one."""
 
 from __future__ import annotations
 

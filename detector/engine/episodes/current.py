@@ -1,4 +1,4 @@
-"""One open episode of a rule: what its events say, and the demands that its deploy actions hold."""
+"""One open episode of a rule: the contents of its events, and the demands that its deploy actions hold."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Episode:
         )
 
     def is_complete(self, rule: CompiledRule) -> bool:
-        """Whether all demands are as the rule says."""
+        """Whether all demands are up to date with the rule."""
         return not self.outdated and len(self.demands) >= len(rule.deploys)
 
     def change(self, changed: Collection[str], gone: Collection[str]) -> None:
@@ -72,7 +72,7 @@ class Episode:
         self.outdated = (self.outdated | set(changed)) - set(gone)
 
     def render(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> int:
-        """Render what is not as the rule says; what cannot be rendered is tried at the next tick.
+        """Render demands that are missing or outdated; those that fail are tried again at the next tick.
 
         Returns how many demands changed.
         """

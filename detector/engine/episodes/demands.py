@@ -1,4 +1,4 @@
-"""Demands: what the deploy actions of open episodes ask for, and their form as ApplicationTasks.
+"""Demands: the applications that deploy actions of open episodes request, and their form as ApplicationTasks.
 
 A demand is held while its episode is open. It has a name that follows from what it is, so that a detector which
 restarts finds its own tasks again, and never makes two of one.
@@ -30,7 +30,7 @@ _LABEL_LIMIT = 63
 
 @dataclass(frozen=True)
 class Demand:
-    """What one deploy action of one open episode asks for."""
+    """The application that one deploy action of one open episode requests."""
 
     rule: str
     action: str
@@ -60,7 +60,7 @@ class Demand:
 
     @property
     def fixed(self) -> tuple[str, Operation, int]:
-        """What the action says of it that cannot change while it lives: template, operation and priority."""
+        """The fields that cannot change while the demand exists: template, operation and priority."""
         return self.template, self.operation, self.priority
 
     @cached_property

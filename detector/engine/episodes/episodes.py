@@ -41,7 +41,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What the rule says of the subject at one tick."""
+    """The verdicts of the rule on the subject at one tick."""
 
     in_scope: Truth
     near: Truth
@@ -93,7 +93,7 @@ class SubjectState:
     rests_until: int = 0
 
     def idle_at(self, now: int) -> bool:
-        """Whether the state says no more than a fresh one would."""
+        """Whether the state equals a new one."""
         return not self.is_open and self.onset is None and self.rests_until <= now
 
     def wake(self, now: int, timing: Timing) -> int | None:

@@ -50,7 +50,7 @@ def from_document(document: Mapping[str, Any]) -> OpenEpisode:
     """The episode of what `to_document` made.
 
     Raises:
-        ValueError: the document is not one of an episode; the text says which field is wrong.
+        ValueError: the document does not describe an episode; the text names the wrong field.
     """
     texts = ("rule", "subject", "episode", "onsetTime", "startTime", "ruleDigest")
     for field in texts:

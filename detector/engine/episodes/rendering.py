@@ -1,4 +1,4 @@
-"""What actions are told of an episode beside its values: their templates, rendered over the rule's variables."""
+"""The templates of actions, rendered with the variables of a rule when an episode starts."""
 
 from __future__ import annotations
 

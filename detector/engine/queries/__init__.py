@@ -1,1 +1,1 @@
-"""What plugins may ask of the buffer: samples, poses, tuples and transforms, up to the tick and no later."""
+"""The queries of plugins to the buffer: samples, poses, tuples and transforms, up to the tick."""

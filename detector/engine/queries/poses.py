@@ -9,7 +9,7 @@ from detector.engine.queries.geometry import IDENTITY, Pose, unit
 
 
 class PoseError(ValueError):
-    """A message holds no pose where one was asked for."""
+    """A message has no pose at the path."""
 
 
 def pose_in(message: Any, at: str = "") -> Pose:
@@ -22,7 +22,7 @@ def pose_in(message: Any, at: str = "") -> Pose:
     place = here.get("position", here.get("translation")) if isinstance(here, dict) else None
     turn = here.get("orientation", here.get("rotation")) if isinstance(here, dict) else None
     if not isinstance(place, dict):
-        raise PoseError(f"there is no pose {f'at {at!r}' if at else 'in the message'}: say where with `at`, a path")
+        raise PoseError(f"there is no pose {f'at {at!r}' if at else 'in the message'}: give its path with `at`")
     x, y, z = (_number(place, axis, 0.0 if axis == "z" else None) for axis in ("x", "y", "z"))
     if turn is None:
         return Pose((x, y, z), IDENTITY)

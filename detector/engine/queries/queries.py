@@ -1,4 +1,4 @@
-"""What is in the buffer at a tick, as plugins ask for it: decoded samples by client, stream, time and frame.
+"""The contents of the buffer at a tick, for plugins: decoded samples by client, stream, time and frame.
 
 A view at a tick shows the samples up to its time and none later, and never changes anything. `newest`, `last` and
 `between` go by the time at which a sample came in (the engine's time axis, see docs/concepts.md); whatever compares
@@ -29,7 +29,7 @@ _STAMP = attrgetter("stamp")
 
 
 class QueryError(ValueError):
-    """A query that asks for what cannot be; the text says what is wrong with it."""
+    """A query is not valid; the text names the reason."""
 
 
 class DecodedSample(NamedTuple):

@@ -1,7 +1,7 @@
 """The transform tree of each client, from the tf2_msgs/msg/TFMessage samples in the buffer.
 
 A transform says where a child frame is in its parent frame at its stamp; between two of them it is interpolated, before
-the first and after the last it is not known. Where a frame changes its parent, what was said last holds until then. On
+the first and after the last it is not known. Where a frame changes its parent, the last transform holds until then. On
 a latched stream (/tf_static) a transform holds at all times, and the one stamped last counts.
 """
 
@@ -24,11 +24,11 @@ from wayside.expressions import UNKNOWN
 _CLIENT = "${client}"
 
 _REMEMBERED = 10_000_000_000
-"""Nanoseconds for which transforms that were read are kept for the next one who asks."""
+"""Nanoseconds for which transforms stay cached after their last use."""
 
 
 class TransformError(LookupError):
-    """A transform that cannot be told; the text says why."""
+    """A transform is not known; the text names the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ _Parsed = dict[str, list[Link]]
 
 
 class Transforms:
-    """Answers where one frame is in another. Samples are read once, and only when somebody asks."""
+    """Looks up transforms between frames. Samples are read once, on first use."""
 
     def __init__(
         self, streams: Sequence[TransformStream], buffer: Buffer, messages: Messages, counters: Counters
@@ -66,16 +66,16 @@ class Transforms:
         self._counters = counters
         self._parsed: dict[tuple[str, str], dict[Sample, _Parsed]] = {}
         """By client and stream; no more than what is in the buffer."""
-        self._asked: dict[tuple[str, str], int] = {}
-        """When these were last asked for; nanoseconds."""
+        self._used: dict[tuple[str, str], int] = {}
+        """When these were last used; nanoseconds."""
         self._trees: dict[str, _Tree] = {}
         """Of this tick."""
 
     def forget(self, now: int) -> None:
-        """The tick is over. What nobody has asked for lately goes: it may hold samples that the buffer has not."""
+        """The tick is over. Entries that were not used lately go: they may hold samples that the buffer has dropped."""
         self._trees.clear()
-        for place in [place for place, asked in self._asked.items() if not 0 <= now - asked <= _REMEMBERED]:
-            del self._asked[place], self._parsed[place]
+        for place in [place for place, used in self._used.items() if not 0 <= now - used <= _REMEMBERED]:
+            del self._used[place], self._parsed[place]
 
     def lookup(self, client: str, target: str, source: str, stamp: int | None, now: int) -> Pose:
         """See Queries.transform; `now` is the tick. Raises TransformError."""
@@ -95,7 +95,7 @@ class Transforms:
         return _Tree(client, fixed, moving, now)
 
     def _read(self, client: str, stream: TransformStream, now: int) -> Iterator[_Parsed]:
-        """What the samples up to `now` say, oldest first."""
+        """The transforms in the samples up to `now`, oldest first."""
         lane = self._buffer.lane(client, stream.name)
         known = self._parsed.get((client, stream.name), {})
         kept: dict[Sample, _Parsed] = {}
@@ -106,7 +106,7 @@ class Transforms:
             kept[sample] = parsed
             yield parsed
         self._parsed[client, stream.name] = kept
-        self._asked[client, stream.name] = now
+        self._used[client, stream.name] = now
 
     def _parse(self, client: str, stream: TransformStream, sample: Sample) -> _Parsed:
         message = self._messages.message(stream.name, sample)
@@ -196,14 +196,15 @@ class _Tree:
         """Where the frame is in its parent at that time."""
         fixed, links = self._of(frame)
         if not links:
-            assert fixed is not None  # noqa: S101  only frames with a parent are asked for
+            assert fixed is not None  # noqa: S101  only frames with a parent come here
             return fixed.pose
         after = bisect_right(links, stamp, key=_stamp_of)
         if after == 0 or (after == len(links) and links[-1].stamp < stamp):
             beyond = links[0].stamp - stamp if after == 0 else stamp - links[-1].stamp
+            side = "before the first" if after == 0 else "after the last"
             raise TransformError(
-                f"frame {frame!r} of client {self._client} in {links[-1].parent!r} is asked for at {_text(stamp)}, "
-                f"{beyond / 1e9:.3f} s {'before the first' if after == 0 else 'after the last'} of its transforms, "
+                f"frame {frame!r} of client {self._client} in {links[-1].parent!r} is not known at {_text(stamp)}: "
+                f"that is {beyond / 1e9:.3f} s {side} of its transforms, "
                 f"which are from {_text(links[0].stamp)} to {_text(links[-1].stamp)}"
             )
         before = links[after - 1]

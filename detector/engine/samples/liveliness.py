@@ -1,7 +1,7 @@
-"""Liveliness tokens: a client says by a token that it is there, and the network says when the token is gone.
+"""Liveliness tokens: a client declares a token while it is there, and the network reports when the token is gone.
 
 What happens to tokens comes through the intake like samples, on a stream name of its own, so it is recorded and
-replayed in order with them. The payload says what happened to the token of that key.
+replayed in order with them. The payload is what happened to the token of that key.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Tokens:
         return client
 
     def hold(self, client: str) -> bool:
-        """Whether a token says that the client is there."""
+        """Whether the client has a token."""
         return client in self._counts
 
     def dropped(self, client: str) -> bool:
@@ -75,7 +75,7 @@ class Tokens:
         self._dropped.clear()
 
     def forget(self) -> list[str]:
-        """No token counts any more, the Detector asks for others; returns whose they were."""
+        """Forget all tokens, since the Detector watches others; returns whose they were."""
         self.changed = True
         clients = list(self._counts)
         self._clients.clear()

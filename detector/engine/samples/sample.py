@@ -39,7 +39,7 @@ class Stamped(msgspec.Struct, frozen=True, gc=False, order=True):
     received: int
     """The stamp, in nanoseconds: with clock Data there is no other time."""
     number: int
-    """The order of arrival; tells apart samples of the same time."""
+    """The order of arrival; distinguishes samples of the same time."""
     payload: bytes
     """The message as it came, undecoded."""
     key: str
@@ -56,7 +56,7 @@ Sample = Arrival | Stamped
 
 
 class DecodeError(ValueError):
-    """A payload that its codec cannot read; the text says what is wrong with it."""
+    """A payload that its codec cannot read; the text names the reason."""
 
 
 class Decoder(Protocol):
@@ -89,7 +89,7 @@ class Fields(NamedTuple):
     """The payloads that cannot be read, by their places among the payloads; they are MISSING in all columns."""
     odd: Sequence[int]
     """Places of the messages in which a path goes through what has no members, such as a number, a text or null, or a
-    list that is asked for a name. Only the whole message says what an expression makes of it. Ascending, each once."""
+    list where a name is expected. An expression over these needs the whole message. Ascending, each once."""
 
 
 FieldReader = Callable[[Sequence[bytes]], Fields]

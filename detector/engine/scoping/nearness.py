@@ -27,8 +27,8 @@ FEW = 1024
 
 _ROUNDING = 1 + 1e-9
 _SLACK = 1e-6
-"""The trees search a little farther than asked, by a factor and in metres, so that rounding hides no pair: what decides
-is `distance`. Points on the Earth are 6,400 km from the origin, so they are exact to a nanometre only."""
+"""The trees search a little farther than the limit, by a factor and in metres, so that rounding hides no pair;
+`distance` decides. Points on the Earth are 6,400 km from the origin, so they are exact to a nanometre only."""
 
 ROOM = 4
 """Up to this multiple of the wanted number of pairs is made, to be sorted exactly."""
@@ -41,7 +41,7 @@ class Near(NamedTuple):
 
     pairs: list[Pair]
     left_out: int
-    """How many pairs within reach were left out: the number asked for was too small. With many clients it may count
+    """How many pairs within reach were left out: the maximum number was too small. With many clients it may count
     a pair that is beyond reach by a micrometre or a billionth."""
 
 
@@ -49,7 +49,7 @@ class Search(NamedTuple):
     """Whom to search, and how."""
 
     points: Mapping[str, Point]
-    """Where clients are; straight distances are never longer than what `distance` says."""
+    """Where clients are; straight distances are never longer than `distance`."""
     distance: Distance
     first: Collection[str] | None
     """Who can be the first of a pair; None: the first is the one with the smaller name."""

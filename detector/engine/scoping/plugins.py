@@ -1,4 +1,4 @@
-"""Signals that plugins compute: what the engine asks of them, and what it makes of their answers.
+"""Signals that plugins compute: the calls of the engine, and how it uses the results.
 
 A plugin's value is computed at each evaluation, for the rule's subject, from the buffer as it is at the tick. Where and
 how a plugin runs is its host's business (detector/plugins); the engine only calls, in a fixed order, and takes a value,
@@ -31,7 +31,7 @@ class PluginCall(NamedTuple):
 
 
 class PluginFailedError(Exception):
-    """A plugin gave no value: it failed (Reason.ERROR), or it is not running (Reason.ABSENT). The text says why."""
+    """A plugin gave no value: it failed (Reason.ERROR), or it does not run (Reason.ABSENT); the text says why."""
 
     def __init__(self, reason: Reason, message: str) -> None:
         super().__init__(message)

@@ -41,7 +41,7 @@ class Positions:
     ) -> None:
         """`floor`: no look goes back to this time or beyond, in nanoseconds.
 
-        Who can never have a position, as `possible` says, is not counted as one whose position is unknown.
+        A client that can never have a position (see `possible`) does not count as one with an unknown position.
         """
         self._buffer = buffer
         self._messages = messages
@@ -50,7 +50,7 @@ class Positions:
         self._floor = floor
 
     def gap(self, time: int) -> None:
-        """What lies before `time` does not say where a client was."""
+        """Samples before `time` no longer give positions."""
         self._floor = time
 
     def now(self, position: CompiledPosition, client: str, now: int, counters: RuleCounters) -> Place | None:
@@ -65,9 +65,9 @@ class Positions:
         return self._place(position, client, sample, counters)
 
     def common_time(self, position: CompiledPosition, clients: Iterable[str], now: int) -> int:
-        """The newest time for which all of these clients have said where they are, in nanoseconds.
+        """The newest time at which the positions of all these clients are known, in nanoseconds.
 
-        That is `now` where positions have no age: what was said last holds. All have a place now.
+        That is `now` where positions have no age: the last one holds. All have a place now.
         """
         if self.limit(position) is None:
             return now
@@ -137,7 +137,7 @@ def distance(position: CompiledPosition, one: Place, other: Place) -> float:
     """Metres, straight in a flat frame, along the surface on the Earth.
 
     The same number whichever of the two comes first. In a flat frame √(dx² + dy² + dz²), rounded after each operation,
-    so that whoever computes it in this order gets the same number.
+    so that each computation in this order gives the same number.
     """
     if position.geographic:
         return geodesy.distance(*min(one, other), *max(one, other))
@@ -153,7 +153,7 @@ def distance_of_order_1(position: CompiledPosition, one: Place, other: Place) ->
 
 
 def point(position: CompiledPosition, place: Place) -> Point:
-    """The place as a search takes it: no two points are farther apart than `distance` says, however they lie."""
+    """The place as a search takes it: no two points are farther apart than `distance`."""
     if position.geographic:
         return geodesy.cartesian(*place)
     x, y, *rest = place

@@ -32,7 +32,7 @@ class Candidate(NamedTuple):
     variables: Mapping[str, Any]
     """What the conditions see; what is unknown is left out."""
     in_scope: Truth
-    """What `where` says, and the roles of a pair; false ends an open episode."""
+    """Whether `where` and the roles of a pair hold; false ends an open episode."""
     near: Truth
     """Whether an episode may start; unknown for a pair of which one's position is."""
     never: frozenset[Path] = frozenset()
@@ -40,7 +40,7 @@ class Candidate(NamedTuple):
 
 
 class Views:
-    """What a rule sees of each client at one tick, computed when it is first asked for."""
+    """The variables of a rule for each client at one tick, computed on first use."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class Views:
         return self._earlier[at]
 
     def truth(self, expression: Expression | None, variables: Mapping[str, Any], place: str) -> Truth:
-        """What a condition says; one that is absent holds. `place` names field and subject, for errors."""
+        """The truth of a condition; one that is absent holds. `place` names field and subject, for errors."""
         if expression is None:
             return True
         never = self.never(str(variables["client"])) if "client" in variables else frozenset()
@@ -169,7 +169,7 @@ class Views:
 def condition(
     expression: Expression, variables: Mapping[str, Any], place: str, never: frozenset[Path], counters: RuleCounters
 ) -> Truth:
-    """What a condition says. Unknown is counted, unless it reads what can never be there."""
+    """The truth of a condition. Counts an unknown result, unless the condition reads a signal that can never exist."""
 
     def note(reason: Reason, message: str) -> None:
         if (

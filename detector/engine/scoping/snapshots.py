@@ -57,7 +57,7 @@ def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _without_bytes(value: Any) -> Any:
-    """Neither an event nor a task can carry bytes, which CEL yields where it is asked to: null stands for them."""
+    """Replace bytes, which a CEL expression may yield, by null: neither an event nor a task can carry them."""
     if isinstance(value, bytes):
         return None
     if isinstance(value, list):

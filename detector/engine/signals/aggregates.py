@@ -2,9 +2,9 @@
 
 All take the values in order of time, the oldest first, without those that are unknown. Those that calculate take
 numbers only. Sums and differences are exact before they are rounded once, so that neither the order of a sum nor a
-counter of nanoseconds near 1e18 costs digits; beyond what a double holds they are infinite, as IEEE 754 says.
+counter of nanoseconds near 1e18 costs digits; beyond the range of a double they are infinite, as in IEEE 754.
 
-Rate and Delta are (last - first)/(time between) and last - first, as the design says. StdDev is the population's
+Rate and Delta are (last - first)/(time between) and last - first (see docs/rules.md). StdDev is the population's
 (divided by n, so that of one value is 0), in two passes.
 """
 

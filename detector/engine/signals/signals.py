@@ -33,7 +33,7 @@ class Signals:
     ) -> None:
         """`starts` has the samples of signals over rules; windows do not reach back to `floor` (ns) or beyond.
 
-        What a client can never have, as `possible` says, is unknown without being counted.
+        A signal that a client can never have (see `possible`) is unknown and not counted.
         """
         self._buffer = buffer
         self._clients = clients
@@ -53,7 +53,7 @@ class Signals:
         self._picked = {key: last for key, last in self._picked.items() if last <= time}
 
     def forget(self, keep: Callable[[str, str], bool]) -> None:
-        """Drop what is kept for rules and clients that are gone; `keep` says of (rule, client) whether it is needed."""
+        """Drop the state of rules and clients that are gone; `keep` returns whether (rule, client) is needed."""
         for kept in (self._extracted, self._picked):
             for key in [key for key in kept if not keep(key[0], key[2])]:
                 del kept[key]

@@ -44,7 +44,7 @@ class Starts:
     def configure(self, rules: Iterable[CompiledRule], least: int) -> set[str]:
         """These rules are evaluated from now on; starts are kept as long as any signal looks back, or `least` (ns).
 
-        Returns the rules that are named now and were not before: what is open of them must be told (see `started`).
+        Returns the rules that are newly named: report their open episodes with `started`.
         """
         durations: dict[str, int] = {}
         names: dict[str, str] = {}
@@ -119,7 +119,7 @@ class Starts:
         return bool(self._durations)
 
     def is_evaluated(self, stream: str) -> bool:
-        """Whether the rule whose starts these are is there and enabled; else nothing can be said of its episodes."""
+        """Whether the rule whose starts these are is there and enabled; else nothing is known of its episodes."""
         return stream in self._evaluated
 
     def is_open(self, client: str, stream: str, now: int) -> bool:

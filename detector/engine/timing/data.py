@@ -1,4 +1,4 @@
-"""Clock Data: a sample's time is the sender's stamp, and the samples themselves say how far time has come.
+"""Clock Data: a sample's time is the sender's stamp, and the samples advance the time.
 
 Tick t runs once a stamp of at least t + lateness, and later than t, was seen. So samples of equal stamps that come in
 order are all there by then, also with a lateness of zero. At the end, the ticks up to the newest stamp run.
@@ -34,14 +34,14 @@ class DataTimeline:
     A sample waits until the tick that comes after it, and then enters in the order of the stamps: so the order in which
     samples arrive does not matter as long as `lateness` covers it. One that is later than that enters at once.
 
-    A stamp more than `max_ahead` ahead of where the newest one would be by now (the receive times tell how long nothing
+    A stamp more than `max_ahead` ahead of where the newest one would be by now (the receive times show how long nothing
     came), or so far behind that the buffer has no room for it, is dropped and counted. Time that really jumped (a pause
     in a recording, a simulation that began again) shows in what follows: when samples in a row agree on another time,
     that time holds from then on. Two are enough, if they are of two clients or there is only one; one client among
     several must keep it up for `alone_after` while nobody contradicts.
 
-    A sample of a latched stream holds since long ago and says nothing of the time: it never moves it, and takes its
-    place at its stamp, or at the newest one where that is later.
+    A sample of a latched stream may be old: it never advances the time, and takes its place at its stamp, or at the
+    newest one where that is later.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class DataTimeline:
         self.jumps = 0
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
-        """All that the arrivals make happen; `until`, a time of the wall, says nothing here."""
+        """All steps that follow from the arrivals; `until`, a time of the wall clock, is not used here."""
         for arrival in arrivals:
             if arrival.stream == LIVELINESS:
                 yield from self._token(arrival)

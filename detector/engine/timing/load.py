@@ -1,8 +1,8 @@
 """When the machine is too slow: which rules are evaluated less often, in which order. Pure; the level is given.
 
 Each class of rules with one priority, from the lowest on, is thinned out in three steps: every second evaluation, every
-fourth, every eighth. The next class begins when the one below it is at its last step. At level 0 all rules are
-evaluated as they say.
+fourth, every eighth. The next class begins when the one below it is at its last step. At level 0 no
+evaluation is left out.
 """
 
 from __future__ import annotations

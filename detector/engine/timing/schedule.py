@@ -2,7 +2,7 @@
 
 A rule with a period is evaluated at its whole multiples, for everybody. A rule with `onSample` is evaluated at the time
 of each sample of its stream, for the subjects that the sample's client belongs to; and for single subjects when one of
-their times (for, cooldown, unknownTimeout) is over. A rule with `onDemand` is evaluated when the engine is asked.
+their times (for, cooldown, unknownTimeout) is over. A rule with `onDemand` is evaluated by `Engine.evaluate_now`.
 A paused rule is not evaluated at all. While the machine is too slow, evaluations are left out (see load.py).
 """
 
@@ -71,7 +71,7 @@ class Schedule:
         return highest_level(self._priorities)
 
     def set_level(self, level: int) -> None:
-        """Leave out so much from now on; more than `highest` is `highest`."""
+        """Thin evaluations by this level from now on; more than `highest` is `highest`."""
         self.level = min(level, self.highest)
         self._thinning = thinning(self.level, self._priorities)
 
@@ -106,7 +106,7 @@ class Schedule:
         self._wakes.pop(rule, None)
 
     def wake(self, rule: str, subject: Subject, time: int | None) -> None:
-        """Look at the rule's subject at this time (ns), in place of what was said before; None: at no time."""
+        """Evaluate the rule's subject at this time (ns) and at no time that was set before; None: at none."""
         wakes = self._wakes.setdefault(rule, {})
         if time is None:
             wakes.pop(subject, None)

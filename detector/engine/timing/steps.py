@@ -1,4 +1,4 @@
-"""What the engine does next: samples to insert, ticks to evaluate, gaps to say. A time axis makes them of arrivals."""
+"""The steps of the engine: samples to insert, ticks to evaluate, gaps. A time axis makes them from arrivals."""
 
 from __future__ import annotations
 

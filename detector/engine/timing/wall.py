@@ -1,4 +1,4 @@
-"""Clock Wall: a sample's time is its receive time, and the shell says how far time has come.
+"""Clock Wall: a sample's time is its receive time, and the shell advances the time.
 
 A tick sees the samples up to its time, those of exactly its time included, and none later.
 """

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from detector.assembly import RuleBook, inlets, make_engine
 from detector.engine.counters import RuleCounters
 from detector.engine.engine import NoAnswerError
-from detector.engine.evaluation import Sight
+from detector.engine.evaluation import Evaluated
 from detector.engine.samples.sample import Arrival
 from tests.driving import SECOND, START, a_detector, a_rule, a_stream
 from wayside.api import Detector, EventRule
@@ -313,7 +313,7 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
                 found += engine.gap(what)
             case "ask":
                 try:
-                    found, answers = engine.ask(what)
+                    found, answers = engine.evaluate_now(what)
                     events.append(str(answers))
                 except NoAnswerError:
                     pass
@@ -335,7 +335,7 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
     return Outcome(events, demands, {**counted, "undecodable": sorted(engine.counters.undecodable)})
 
 
-def _nobody(_: Sight) -> None:
+def _nobody(_: Evaluated) -> None:
     """Watches."""
 
 

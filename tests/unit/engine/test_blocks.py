@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from detector.engine.buffering import inflow
+from detector.engine.buffering import ingest
 from detector.engine.columns import tables
 from detector.engine.columns.tables import Tables
 from detector.replay.replaying import Outcome, Replay
@@ -122,7 +122,7 @@ GEARS = a_rule(
 
 @pytest.mark.parametrize("limit", ["MAXIMUM_CLIENTS", "_MAXIMUM_TEXTS"])
 def test_numbers_and_texts_that_run_out_begin_anew(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inflow, "MAXIMUM_LOST", 3)
+    monkeypatch.setattr(ingest, "MAXIMUM_LOST", 3)
     detector = a_detector(clientTimeout="1s")
     rules = [speeding("fast", evaluation=OFTEN, **{"for": "300ms"}), GEARS]
     arrivals = fleet_that_comes_and_goes()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from detector.engine.buffering import inflow
+from detector.engine.buffering import ingest
 from detector.engine.samples.sample import Arrival
 from tests.driving import POSITION, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at, lines
 from tests.ros_messages import cdr, pose_stamped
@@ -180,7 +180,7 @@ def test_a_sample_of_a_stream_that_is_not_there_is_counted() -> None:
 def test_made_up_clients_beyond_the_limit_are_dropped_and_the_known_ones_stay(
     monkeypatch: pytest.MonkeyPatch, clock: str
 ) -> None:
-    monkeypatch.setattr(inflow, "MAXIMUM_CLIENTS", 3)
+    monkeypatch.setattr(ingest, "MAXIMUM_CLIENTS", 3)
     drive = Drive(a_detector(clock=clock, clientTimeout="5s", lateness="100ms"), *RULES)
     told = drive.take(
         *(arrival(0.1 + n / 100, f"made{n}" if n else "car", {"v": 1}) for n in range(10)),
@@ -197,7 +197,7 @@ def test_made_up_clients_beyond_the_limit_are_dropped_and_the_known_ones_stay(
 
 
 def test_of_lost_clients_a_bounded_number_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inflow, "MAXIMUM_LOST", 2)
+    monkeypatch.setattr(ingest, "MAXIMUM_LOST", 2)
     drive = Drive(a_detector(clientTimeout="2s"), *RULES)
     for n in range(9):
         drive.take(arrival(5 * n + 0.5, f"made{n}", {"v": 1}), until=5 * n + 5)
@@ -211,13 +211,13 @@ def test_of_lost_clients_a_bounded_number_is_remembered(monkeypatch: pytest.Monk
 
 
 def test_ever_new_keys_of_one_client_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inflow, "MAXIMUM_KEYS", 10)
+    monkeypatch.setattr(ingest, "MAXIMUM_KEYS", 10)
     detector = a_detector({"name": "s", "key": "v/${client:*}/${part:*}", "encoding": "json"})
     rule = a_rule(signals=[{"name": "n", "stream": "s", "aggregate": "Count", "over": "9s"}], when="n == 100")
     drive = Drive(detector, rule)
     arrivals = [Arrival(at(0.1) + n, "s", f"v/car/{n}", b"{}") for n in range(100)]
     assert drive.note(drive.engine.advance(arrivals, at(1))) == ["r car started 1"]
-    known: Any = drive.engine._known.inflow._lanes["s"]
+    known: Any = drive.engine._known.ingest._lanes["s"]
     assert len(known) <= 10
 
 

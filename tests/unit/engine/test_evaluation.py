@@ -130,7 +130,7 @@ def test_how_arrivals_are_parcelled_changes_nothing() -> None:
 def test_on_demand_a_rule_is_evaluated_when_asked_and_tells_what_it_says_of_each_subject() -> None:
     drive = Drive(a_detector(), fast(evaluation={"onDemand": True}))
     assert drive.take(speed(0.3, 20, "a"), speed(0.4, 5, "b"), arrival(0.5, "c", {}), until=3) == []
-    events, answers = drive.engine.ask("r")
+    events, answers = drive.engine.evaluate_now("r")
     assert drive.note(events) == ["r a started 3"]
     assert [(each.subject, each.when, each.values, each.episode is not None) for each in answers] == [
         ("a", True, {"speed": 20}, True),
@@ -138,18 +138,18 @@ def test_on_demand_a_rule_is_evaluated_when_asked_and_tells_what_it_says_of_each
         ("c", None, {}, False),
     ]
     assert drive.take(speed(3.5, 5, "a"), until=4) == []
-    assert drive.note(drive.engine.ask("r")[0]) == ["r a Until 4"]
+    assert drive.note(drive.engine.evaluate_now("r")[0]) == ["r a Until 4"]
 
 
 def test_only_rules_with_on_demand_can_be_asked() -> None:
     drive = Drive(a_detector(), fast(), fast("q", evaluation={"onDemand": True}))
     with pytest.raises(NoAnswerError, match="there is no rule x; there is q, r"):
-        drive.engine.ask("x")
+        drive.engine.evaluate_now("x")
     with pytest.raises(NoAnswerError, match="rule r is not evaluated on demand"):
-        drive.engine.ask("r")
+        drive.engine.evaluate_now("r")
     drive.engine.set_paused({"q"})
     with pytest.raises(NoAnswerError, match="rule q is paused"):
-        drive.engine.ask("q")
+        drive.engine.evaluate_now("q")
 
 
 def test_a_paused_rule_keeps_its_open_episodes_and_forgets_what_was_pending() -> None:

@@ -114,7 +114,7 @@ def test_before_the_first_sample_and_after_the_last_there_is_no_pose() -> None:
 @pytest.mark.parametrize(
     ("message", "at_path", "text"),
     [
-        ({"speed": 3}, "", "no pose in the message: say where with `at`"),
+        ({"speed": 3}, "", "no pose in the message: give its path with `at`"),
         ({"pose": {}}, "pose.pose", "no pose at 'pose.pose'"),
         ({"position": {"x": 1}}, "", "y of the pose is no number: None"),
         ({"position": {"x": 1, "y": math.nan}}, "", "y of the pose is no number: nan"),

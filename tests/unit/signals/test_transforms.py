@@ -99,8 +99,8 @@ def test_beyond_the_stamps_nothing_is_known_and_the_times_are_told() -> None:
     with pytest.raises(TransformError) as error:
         place(drive, "map", "lidar", 1.75)
     assert str(error.value) == (
-        f"frame 'base' of client car in 'map' is asked for at {FIRST + 1}.750000000, 0.250 s after the last of its "
-        f"transforms, which are from {FIRST + 1}.000000000 to {FIRST + 1}.500000000"
+        f"frame 'base' of client car in 'map' is not known at {FIRST + 1}.750000000: that is 0.250 s after the last of "
+        f"its transforms, which are from {FIRST + 1}.000000000 to {FIRST + 1}.500000000"
     )
     assert place(drive, "camera", "lidar", 1.75) == (1, 0, 0)  # what moves is not on the way
 
@@ -171,7 +171,7 @@ def test_what_comes_later_than_the_tick_is_not_seen() -> None:
         drive.engine._known.transforms.lookup("car", "map", "base", at(1.6), at(1.55))
 
 
-def test_what_was_read_is_not_kept_for_longer_than_it_is_asked_for() -> None:
+def test_what_was_read_is_not_kept_for_longer_than_it_is_used() -> None:
     drive = driven(*MOVING)
     assert place(drive, "map", "base", 1.5) == (20, 0, 0)
     transforms = drive.engine._known.transforms
@@ -180,4 +180,4 @@ def test_what_was_read_is_not_kept_for_longer_than_it_is_asked_for() -> None:
     assert len(transforms._parsed) == 2
     drive.take(until=13)
     assert not transforms._parsed
-    assert not transforms._asked
+    assert not transforms._used

@@ -36,7 +36,7 @@ _BY_CLIENT = "/"
 _NO_LANES: Mapping[str, Lane] = {}
 
 
-class Inflow:
+class Ingest:
     """Puts arrivals into the lanes of their clients and streams."""
 
     def __init__(self, buffer: Buffer, clients: Clients, counters: Counters) -> None:
@@ -64,7 +64,7 @@ class Inflow:
         self._read_key = read_key
         self._lane_makers = lane_makers
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
-        """By key; of streams whose messages say whose they are, by client, which no key is: see `_lane_of_message`."""
+        """By key; of streams whose messages name their client, by client, which no key is: see `_lane_of_message`."""
 
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
         """Everything that is received comes through here. `times`: None for the receive times, in order."""
@@ -185,7 +185,7 @@ class Inflow:
         return None if client is None else self._new_lane(stream, key, client, time)
 
     def _lane_of_message(self, stream: str, key: str, time: int, payload: bytes) -> Lane | None:
-        """The lane for a message that says whose it is."""
+        """The lane for a message that names its client."""
         client = self._read_message(stream, key, payload)
         if client is None:
             return None
