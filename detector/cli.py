@@ -165,6 +165,9 @@ def replay(
             "may be repeated.",
         ),
     ] = None,
+    record: Annotated[
+        bool, typer.Option("--record", help="Run the rules' record actions, into the folder clips of the output.")
+    ] = False,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with importing():
@@ -182,6 +185,7 @@ def replay(
         kinds=chosen(results),
         sets=sets or (),
         sweeps=sweeps or (),
+        record=record,
     )
 
 

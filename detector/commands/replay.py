@@ -18,6 +18,7 @@ from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
+from detector.replay.clips import Clips
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import Recording, intake_file_of, name_of, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
@@ -38,6 +39,9 @@ from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document
 from wayside.commandline import refuse
 
+CLIPS = "clips"
+"""The folder of what record actions write, in the output."""
+
 _WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""
 
@@ -46,6 +50,7 @@ class Options(NamedTuple):
     """How recordings are played."""
 
     as_one: bool
+    clips: Clips | None
     sets: Sequence[str]
     sweeps: Sequence[str]
 
@@ -61,6 +66,7 @@ def replay_files(
     kinds: frozenset[Kind] = frozenset(),
     sets: Sequence[str] = (),
     sweeps: Sequence[str] = (),
+    record: bool = False,
 ) -> None:
     """Replay, write the results into the folder, and print a summary.
 
@@ -76,6 +82,7 @@ def replay_files(
         kinds: the results to look at that are written as well.
         sets: fields of rules with other values, as RULE.FIELD=VALUE: a variant that is compared with the rule.
         sweeps: the same with several values, each a variant: RULE.FIELD=FIRST:LAST:STEP.
+        record: run the rules' record actions, into the folder clips of `output`.
 
     Raises:
         VariantError: a variant cannot be made.
@@ -85,7 +92,8 @@ def replay_files(
     check_installed(kinds)
     looking = Looking() if kinds else None
     with Progress(Console(stderr=True)) as progress:
-        options = Options(as_one, tuple(sets), tuple(sweeps))
+        clips = Clips(output / CLIPS) if record else None
+        options = Options(as_one, clips, tuple(sets), tuple(sweeps))
         played, evaluated, variants = _replayed(recordings, detector, rules, options, progress, looking)
         output.mkdir(parents=True, exist_ok=True)
         results = [] if looking is None else looking.results(played.outcomes, evaluated)
@@ -115,7 +123,8 @@ def replay_files(
         show_variants(_console(), variants, compared_variants)
     if results:
         show_summary(_console(), results)
-    typer.echo(f"{_counted(outcomes, tried)}: {output}", err=True)
+    clipped = "" if clips is None else f", {_number(clips.count, 'clip')}"
+    typer.echo(f"{_counted(outcomes, tried)}{clipped}: {output}", err=True)
     if refusals or played.errors:
         raise typer.Exit(1)
 
@@ -205,7 +214,7 @@ def _replayed(
             refuse("--set and --sweep are not for intake files: give the recording itself")
         name = name_of((intake,))
         outcome, given = _intake_replayed(
-            intake, detector, rules, progress, None if looking is None else looking.watch(name)
+            intake, detector, rules, progress, None if looking is None else looking.watch(name), options.clips
         )
         return Played({name: outcome}, []), given, ()
     if detector is None:
@@ -225,12 +234,18 @@ def _replayed(
         lambda: _plugins(Outages(lambda: ())),
         lambda batches: progress.watch_batches(batches if looking is None else looking.batches(batches)),
         lambda name: None if looking is None else looking.watch(name).tracer,
+        options.clips,
     )
     return played, evaluated, variants
 
 
 def _intake_replayed(
-    recording: Path, detector: Path | None, rules: Sequence[Path], progress: Progress, look: Look | None
+    recording: Path,
+    detector: Path | None,
+    rules: Sequence[Path],
+    progress: Progress,
+    look: Look | None,
+    clips: Clips | None,
 ) -> tuple[Outcome, Sequence[EventRule]]:
     if detector is None and rules:
         refuse("give --detector as well: rules are compiled against their Detector")
@@ -243,6 +258,7 @@ def _intake_replayed(
             given.rules if given is not None and rules else None,
             plugins,
             None if look is None else look.tracer,
+            clips,
         )
     return outcome, [] if given is None else given.rules
 
