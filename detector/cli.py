@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +21,9 @@ from wayside import commandline
 from wayside.beginning import importing
 from wayside.commandline import leave, refuse
 from wayside.inputerror import InputError
+
+if TYPE_CHECKING:
+    from detector.running import View
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -80,6 +83,14 @@ def run(
         int | None,
         typer.Option(help="Serve /metrics, /healthz and /readyz on this port; 0: on a free one.", min=0, max=65535),
     ] = None,
+    foxglove: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve a live view for Foxglove and Lichtblick, e.g. 8765. Without a host, only this machine "
+            "reaches it.",
+        ),
+    ] = None,
 ) -> None:
     """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
     if (name is None) == (detector is None):
@@ -102,8 +113,23 @@ def run(
     else:
         assert detector is not None  # noqa: S101  one of both is given
         source = Files(detector, tuple(rules or ()), output or Path("out"))
-    asyncio.run(run_service(Options(source, record_intake, metrics_port)))
+    asyncio.run(run_service(Options(source, record_intake, metrics_port, _view(foxglove))))
     leave()
+
+
+def _view(address: str | None) -> View | None:
+    if address is None:
+        return None
+    host, _, port = address.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        refuse(f"--foxglove {address}: give a port, e.g. 8765, or host and port, e.g. 0.0.0.0:8765")
+    with importing():
+        from detector.results.installed import check_package
+
+        check_package("foxglove", "--foxglove")
+        from detector.results.live import LiveView
+
+    return LiveView(host or "127.0.0.1", int(port))
 
 
 def _holder_in_pod(name: str) -> str:

@@ -95,8 +95,11 @@ class RuleGroup:
             return
         looked = None if only is None else self._looked(clients, only)
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
-        if self.observer is not None and isinstance(block, Block):
-            self.observer.clients(self.columns.tracks, block, codes, looked)
+        if self.observer is not None:
+            if isinstance(block, Block):
+                self.observer.clients(self.columns.tracks, block, codes, looked)
+            else:
+                self.observer.fleet(self.columns.tracks, block)
         self._follow()
         numbers: list[int] = block.numbers.tolist()
         states: list[tuple[int, int, bool, int]] = []
@@ -262,7 +265,7 @@ class Blocks:
                 continue
             if fits_pairs(rule, self._context):
                 pairs.append((depth, run, every))
-            elif fits(rule) or (fits_fleet(rule) and self._observer is None):  # it sees clients and pairs
+            elif fits(rule) or fits_fleet(rule):
                 columns = Group if fits(rule) else FleetGroup
                 together.setdefault((depth, columns, every, every * thinning(run)), []).append(run)
             else:
