@@ -159,10 +159,6 @@ def replay(
     output: Annotated[Path, typer.Option(help="The folder for events.jsonl and tasks.yaml.")],
     detector: DetectorFile = None,
     rules: RuleFiles = None,
-    compared: Annotated[
-        tuple[str, str] | None,
-        typer.Option("--compare", help="Compare the episodes of two rules, and write comparison.json."),
-    ] = None,
     as_one: Annotated[
         bool, typer.Option("--as-one", help="Play all recordings as one, merged by time: they are of one drive.")
     ] = False,
@@ -179,7 +175,7 @@ def replay(
             "--set",
             metavar="RULE.FIELD=VALUE",
             help="Also play the rule with another value of a field, e.g. close.when='distance < 120', and compare the "
-            "two; may be repeated.",
+            "two; or RULE=OTHER: compare it with another rule; may be repeated.",
         ),
     ] = None,
     sweeps: Annotated[
@@ -206,7 +202,6 @@ def replay(
         output,
         detector,
         rules or (),
-        compared,
         as_one=as_one,
         kinds=chosen(results),
         sets=sets or (),

@@ -60,8 +60,8 @@ class Outcome:
     """The intake file ends in the middle: its writer was killed."""
     end: int = 0
     """Up to here all ticks have run; nanoseconds since the epoch."""
-    rules: tuple[str, ...] = ()
-    """The names of all rules that were given at some time."""
+    rules: dict[str, EventRule] = field(default_factory=dict)
+    """All rules that were given at some time, as they were last, by name."""
     lost: int = 0
     """Arrivals that the intake file does not hold: the disk was too slow for them."""
 
@@ -154,7 +154,7 @@ class Replay:
         """Go on with these rules."""
         compiled, refused = self._rule_book.compile(rules, self._detector, self._entries.fields)
         self.outcome.refusals += refused
-        self.outcome.rules = tuple(sorted({*self.outcome.rules, *(rule.name for rule in rules)}))
+        self.outcome.rules |= {rule.name: rule for rule in rules}
         if self._recorders is not None:
             surroundings = Surroundings(self._detector, self._entries.decoders, self._entries.types)
             self._recorders.follow(self._rule_book.good, surroundings)

@@ -17,7 +17,6 @@ from detector.results.kinds import Kind
 from detector.results.quality import Arrivals
 from detector.results.result import Result, result_of
 from detector.results.tracing import Tracer
-from wayside.api import EventRule
 
 _NEEDED = {Kind.REPORT: "bokeh", Kind.MCAP: "foxglove", Kind.EPISODES: "pyarrow"}
 
@@ -50,10 +49,9 @@ class Looking:
         """The batches of the recording that came last, as they are."""
         return [*self._looks.values()][-1].arrivals.watch_batches(batches)
 
-    def results(self, outcomes: Mapping[str, Outcome], rules: Iterable[EventRule]) -> list[Result]:
+    def results(self, outcomes: Mapping[str, Outcome]) -> list[Result]:
         """What each recording came to."""
-        documents = {rule.name: rule for rule in rules}
-        return [result_of(name, outcome, *self._looks[name], documents) for name, outcome in outcomes.items()]
+        return [result_of(name, outcome, *self._looks[name]) for name, outcome in outcomes.items()]
 
 
 def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Kind]) -> list[Path]:
