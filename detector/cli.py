@@ -213,15 +213,29 @@ def replay(
 @app.command()
 def topics(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these.")
-    ],
+        list[Path] | None,
+        typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these."),
+    ] = None,
     as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a Detector with streams that take all of it.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Listen on Zenoh instead of reading recordings.")] = False,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="With --live: Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: the local network's."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="With --live: how long to listen.", min=0.1)] = 5.0,
 ) -> None:
-    """Say what recordings hold: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
+    """List what recordings hold: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
+    if live == bool(recordings):
+        refuse("give recordings, or --live")
+    if connect and not live:
+        refuse("--connect goes with --live")
     with importing():
-        from detector.commands.topics import list_topics
+        from detector.commands.topics import list_live_topics, list_topics
 
-    list_topics(recordings, as_yaml=as_yaml)
+    if live:
+        list_live_topics(connect or (), seconds, as_yaml=as_yaml)
+    else:
+        list_topics(recordings or (), as_yaml=as_yaml)
 
 
 @app.command("try")
