@@ -24,7 +24,7 @@ $(BIN)/.installed: pyproject.toml
 	  { echo "Wayside needs Python 3.11, 3.12 or 3.13, and finds none: make PYTHON=/path/to/python3.12"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing Wayside into $(VENV)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[results]'
 	@touch $@
 
 $(BIN)/.installed-dev: $(BIN)/.installed

@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +21,9 @@ from wayside import commandline
 from wayside.beginning import importing
 from wayside.commandline import leave, refuse
 from wayside.inputerror import InputError
+
+if TYPE_CHECKING:
+    from detector.running import View
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -80,6 +83,14 @@ def run(
         int | None,
         typer.Option(help="Serve /metrics, /healthz and /readyz on this port; 0: on a free one.", min=0, max=65535),
     ] = None,
+    foxglove: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve a live view for Foxglove and Lichtblick, e.g. 8765. Without a host, only this machine "
+            "reaches it.",
+        ),
+    ] = None,
 ) -> None:
     """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
     if (name is None) == (detector is None):
@@ -102,8 +113,23 @@ def run(
     else:
         assert detector is not None  # noqa: S101  one of both is given
         source = Files(detector, tuple(rules or ()), output or Path("out"))
-    asyncio.run(run_service(Options(source, record_intake, metrics_port)))
+    asyncio.run(run_service(Options(source, record_intake, metrics_port, _view(foxglove))))
     leave()
+
+
+def _view(address: str | None) -> View | None:
+    if address is None:
+        return None
+    host, _, port = address.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        refuse(f"--foxglove {address}: give a port, e.g. 8765, or host and port, e.g. 0.0.0.0:8765")
+    with importing():
+        from detector.results.installed import check_package
+
+        check_package("foxglove", "--foxglove")
+        from detector.results.live import LiveView
+
+    return LiveView(host or "127.0.0.1", int(port))
 
 
 def _holder_in_pod(name: str) -> str:
@@ -133,10 +159,6 @@ def replay(
     output: Annotated[Path, typer.Option(help="The folder for events.jsonl and tasks.yaml.")],
     detector: DetectorFile = None,
     rules: RuleFiles = None,
-    compared: Annotated[
-        tuple[str, str] | None,
-        typer.Option("--compare", help="Compare the episodes of two rules, and write comparison.json."),
-    ] = None,
     as_one: Annotated[
         bool, typer.Option("--as-one", help="Play all recordings as one, merged by time: they are of one drive.")
     ] = False,
@@ -153,7 +175,7 @@ def replay(
             "--set",
             metavar="RULE.FIELD=VALUE",
             help="Also play the rule with another value of a field, e.g. close.when='distance < 120', and compare the "
-            "two; may be repeated.",
+            "two; or RULE=OTHER: compare it with another rule; may be repeated.",
         ),
     ] = None,
     sweeps: Annotated[
@@ -165,6 +187,9 @@ def replay(
             "may be repeated.",
         ),
     ] = None,
+    record: Annotated[
+        bool, typer.Option("--record", help="Run the rules' record actions, into the folder clips of the output.")
+    ] = False,
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with importing():
@@ -177,26 +202,40 @@ def replay(
         output,
         detector,
         rules or (),
-        compared,
         as_one=as_one,
         kinds=chosen(results),
         sets=sets or (),
         sweeps=sweeps or (),
+        record=record,
     )
 
 
 @app.command()
 def topics(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these.")
-    ],
+        list[Path] | None,
+        typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these."),
+    ] = None,
     as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a Detector with streams that take all of it.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Listen on Zenoh instead of reading recordings.")] = False,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="With --live: Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: the local network's."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="With --live: how long to listen.", min=0.1)] = 5.0,
 ) -> None:
-    """Say what recordings hold: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
+    """List what recordings hold: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
+    if live == bool(recordings):
+        refuse("give recordings, or --live")
+    if connect and not live:
+        refuse("--connect goes with --live")
     with importing():
-        from detector.commands.topics import list_topics
+        from detector.commands.topics import list_live_topics, list_topics
 
-    list_topics(recordings, as_yaml=as_yaml)
+    if live:
+        list_live_topics(connect or (), seconds, as_yaml=as_yaml)
+    else:
+        list_topics(recordings or (), as_yaml=as_yaml)
 
 
 @app.command("try")

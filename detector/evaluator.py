@@ -22,6 +22,7 @@ from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.evaluation import Answer
+from detector.engine.observing import Observer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.timeline import ORDER
@@ -82,6 +83,16 @@ class Outlet(Protocol):
         """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
 
 
+class Onlooker(Observer, Protocol):
+    """Sees what is evaluated, on the evaluation's thread. It decides nothing, and never waits."""
+
+    def attend(self, engine: Engine) -> None:
+        """The engine has other rules from now on."""
+
+    def looked(self, engine: Engine, events: Sequence[Event]) -> None:
+        """The engine has taken in what came, and these events happened."""
+
+
 class Evaluator:
     """Runs an engine on a thread of its own until it is stopped."""
 
@@ -95,6 +106,7 @@ class Evaluator:
         recorder: Recorder | None = None,
         on_failure: Callable[[BaseException], None],
         outages: Outages | None = None,
+        onlooker: Onlooker | None = None,
     ) -> None:
         """`now` gives nanoseconds since the epoch; `on_failure` is told if the thread dies of an error.
 
@@ -107,6 +119,7 @@ class Evaluator:
         self._recorder = recorder
         self._on_failure = on_failure
         self._outages = outages or Outages()
+        self._onlooker = engine.instruments.observer = onlooker
         self._rule_book = RuleBook()
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
@@ -325,10 +338,14 @@ class Evaluator:
         self.status.refused(refused)
         self._outlet.follow(self._rule_book.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
         events = self._engine.set_rules(compiled)
+        if self._onlooker is not None:
+            self._onlooker.attend(self._engine)
         self._intake.urgent = self._engine.triggers
         return events
 
     def _hand_over(self, events: Sequence[Event]) -> None:
+        if self._onlooker is not None:
+            self._onlooker.looked(self._engine, events)
         if events:
             self._outlet.events(events)
             self._outlet.open_episodes(self._engine.open_episodes)

@@ -17,7 +17,7 @@ from detector.actions.deploy.stores import TaskStore
 from detector.cluster.connection import connect
 from detector.restoring import what_was_open
 from detector.rules.kubernetes import ClusterRules
-from detector.running import Running
+from detector.running import Running, View
 from detector.state import state_file
 from detector.tracing import EpisodeTraces
 
@@ -34,6 +34,7 @@ async def run_in_cluster(
     stopping: asyncio.Event,
     metrics_port: int | None,
     traces: EpisodeTraces | None,
+    view: View | None = None,
 ) -> None:
     """Run the Detector of that name, and emit its tasks as the holder, until it is to stop.
 
@@ -49,7 +50,7 @@ async def run_in_cluster(
             group.create_task(lease.run())
             try:
                 await _run_while_held(
-                    holder, output, record, stopping, rules, lease, store, reconciler, metrics_port, traces
+                    holder, output, record, stopping, rules, lease, store, reconciler, metrics_port, traces, view
                 )
             finally:
                 lease.stop()
@@ -66,6 +67,7 @@ async def _run_while_held(
     reconciler: DemandReconciler,
     metrics_port: int | None,
     traces: EpisodeTraces | None,
+    view: View | None = None,
 ) -> None:
     changes = rules.follow()
     first = await _unless(stopping, anext(changes))
@@ -78,7 +80,9 @@ async def _run_while_held(
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            with Running(first, holder, reconciler, output, record, restored, metrics_port, state, traces) as running:
+            with Running(
+                first, holder, reconciler, output, record, restored, metrics_port, state, traces, view
+            ) as running:
                 following = group.create_task(running.follow(changes))
                 await running.until(stopping)
                 following.cancel()

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequenc
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.outcomes import Outcomes
@@ -18,7 +18,7 @@ from detector.answers import Answers
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.liveliness import LIVELINESS
-from detector.evaluator import Evaluator
+from detector.evaluator import Evaluator, Onlooker
 from detector.event_log import EventLog
 from detector.losses import Loss
 from detector.outlet import LiveOutlet
@@ -45,6 +45,20 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
+class View(Onlooker, Protocol):
+    """Shows people what is evaluated."""
+
+    @property
+    def port(self) -> int:
+        """Where it is served."""
+
+    def losses(self) -> Iterable[Loss]:
+        """What was not shown."""
+
+    def close(self) -> None:
+        """End it."""
+
+
 class Running:
     """Inside the `with`, the detector's threads run."""
 
@@ -59,6 +73,7 @@ class Running:
         metrics_port: int | None = None,
         state: StateFile | None = None,
         traces: EpisodeTraces | None = None,
+        view: View | None = None,
     ) -> None:
         """Raises DetectorError where the Detector cannot run, OSError where a file or the port cannot be had."""
         self._loop = asyncio.get_running_loop()
@@ -84,6 +99,7 @@ class Running:
             recorder=self._writer,
             on_failure=self._fail,
             outages=self._plugins.outages,
+            onlooker=view,
         )
         requested = Requested(self._engine, self._evaluator.call)
         self._outlet.actions.outcomes.heard = requested.heard
@@ -97,6 +113,9 @@ class Running:
         self._evaluator.losses.watch_also(lambda: _of_actions(self._outlet.actions.outcomes))
         if state is not None:
             self._evaluator.losses.watch_also(lambda: _of_state(state))
+        self._view = view
+        if view is not None:
+            self._evaluator.losses.watch_also(view.losses)
         if traces is not None:
             self._evaluator.losses.watch_also(lambda: _of_traces(traces))
         self._sources = Sources(self._intake.putter, self._tally)
@@ -108,6 +127,8 @@ class Running:
         if self._server is not None:
             self._server.start()
             _log.info("/metrics, /healthz and /readyz are served on port %d", self._server.port)
+        if self._view is not None:
+            _log.info("the live view is served on port %d", self._view.port)
         _log.info(
             "Detector %s runs with %d rules and %d restored demands",
             self._rule_set.detector.name,
@@ -123,6 +144,8 @@ class Running:
         if self._server is not None:
             self._server.close()
         self._evaluator.stop()
+        if self._view is not None:
+            self._view.close()
         self._plugins.close()
         self._outlet.actions.close()
         if self._state is not None:

@@ -20,7 +20,7 @@ from detector.memory import tune_garbage_collection
 from detector.restoring import what_was_open
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files, hangups
-from detector.running import Running
+from detector.running import Running, View
 from detector.state import state_file
 from detector.tracing import EpisodeTraces, episode_traces
 
@@ -55,6 +55,7 @@ class Options:
     record_intake: Path | None = None
     metrics_port: int | None = None
     """Where /metrics, /healthz and /readyz are served; None: nowhere."""
+    view: View | None = None
 
 
 async def run(options: Options) -> None:
@@ -82,7 +83,7 @@ async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces 
 
             record, port = options.record_intake, options.metrics_port
             await run_in_cluster(
-                named.name, named.namespace, named.holder, named.output, record, stopping, port, traces
+                named.name, named.namespace, named.holder, named.output, record, stopping, port, traces, options.view
             )
 
 
@@ -104,7 +105,7 @@ async def _run_from_files(
         try:
             record, port = options.record_intake, options.metrics_port
             with Running(
-                loaded.rule_set, holder, reconciler, files.output, record, restored, port, state, traces
+                loaded.rule_set, holder, reconciler, files.output, record, restored, port, state, traces, options.view
             ) as running:
                 following = group.create_task(
                     running.follow(follow_files(files.detector, files.rules, detector_problems, changed))

@@ -47,8 +47,13 @@ class ActionHost:
         *,
         now: Callable[[], int] = time.time_ns,
         maximum_bytes: int = MAXIMUM_BYTES,
+        patient: bool = False,
     ) -> None:
-        """`maximum_bytes` of samples wait for each action; `now` gives nanoseconds since the epoch."""
+        """`maximum_bytes` of samples wait for each action; `now` gives nanoseconds since the epoch.
+
+        `patient`: `tell` waits for an action that is too slow. Otherwise samples are left out.
+        """
+        self._patient = patient
         self._holder = holder
         self._messenger = messenger
         self._maximum = maximum_bytes
@@ -76,7 +81,7 @@ class ActionHost:
         for which, (rule, action) in wanted.items():
             if which not in self._employed:
                 self.outcomes.know(which, action.kind)
-                worker = Worker(which, self._maker(rule, action), self.outcomes, self._maximum)
+                worker = Worker(which, self._maker(rule, action), self.outcomes, self._maximum, patient=self._patient)
                 self._employed[which] = _Employed(rule, action, worker)
         self._dismiss()
 

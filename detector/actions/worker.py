@@ -36,10 +36,20 @@ Make = Callable[[], Action[Any]]
 
 
 class Worker:
-    """Tells an action of its episodes. `tell` from one thread at a time, and never waits."""
+    """Tells an action of its episodes. `tell` from one thread at a time, and never waits, unless it is patient."""
 
-    def __init__(self, which: Which, make: Make, outcomes: Outcomes, maximum_bytes: int = MAXIMUM_BYTES) -> None:
+    def __init__(
+        self,
+        which: Which,
+        make: Make,
+        outcomes: Outcomes,
+        maximum_bytes: int = MAXIMUM_BYTES,
+        *,
+        patient: bool = False,
+    ) -> None:
+        """`patient`: where the queue is full, `tell` waits, and nothing is left out."""
         self.which = which
+        self._patient = patient
         self._make = make
         self._outcomes = outcomes
         self._maximum = maximum_bytes
@@ -74,7 +84,9 @@ class Worker:
         if isinstance(consequence, Sampled):
             size = sum(len(sample.payload) + SAMPLE_OVERHEAD for sample in consequence.samples)
         with self._changed:
-            if size and self._waiting + size > self._maximum:
+            if self._patient:
+                self._changed.wait_for(lambda: not self._waiting or self._waiting + size <= self._maximum)
+            elif size and self._waiting + size > self._maximum:
                 count = len(consequence.samples) if isinstance(consequence, Sampled) else 0
                 self._missing[consequence.run] = self._missing.get(consequence.run, 0) + count
                 self._outcomes.lose(self.which, "samples left out, the action being too slow", count, "")
@@ -113,6 +125,7 @@ class Worker:
                 self._pass_on(action, problem, consequence)
                 with self._changed:
                     self._waiting -= size
+                    self._changed.notify()
             if action is not None and (news or closing or due is None or time.monotonic() >= due):
                 due = self._woken(action)
             if closing and not news:

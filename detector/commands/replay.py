@@ -12,12 +12,12 @@ from rich.console import Console
 
 from detector.actions.deploy.file_store import write_tasks_yaml
 from detector.assembly import lasting_problems
-from detector.comparison import write_comparison
 from detector.engine.episodes.demands import from_task
 from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
+from detector.replay.clips import Clips
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import Recording, intake_file_of, name_of, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
@@ -38,6 +38,9 @@ from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document
 from wayside.commandline import refuse
 
+CLIPS = "clips"
+"""The folder of what record actions write, in the output."""
+
 _WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""
 
@@ -46,6 +49,7 @@ class Options(NamedTuple):
     """How recordings are played."""
 
     as_one: bool
+    clips: Clips | None
     sets: Sequence[str]
     sweeps: Sequence[str]
 
@@ -55,12 +59,12 @@ def replay_files(
     output: Path,
     detector: Path | None,
     rules: Sequence[Path],
-    compared: tuple[str, str] | None,
     *,
     as_one: bool,
     kinds: frozenset[Kind] = frozenset(),
     sets: Sequence[str] = (),
     sweeps: Sequence[str] = (),
+    record: bool = False,
 ) -> None:
     """Replay, write the results into the folder, and print a summary.
 
@@ -71,11 +75,12 @@ def replay_files(
         output: the folder for events.jsonl and tasks.yaml, made where it is missing.
         detector: a file with one Detector; None: the intake file brings its own.
         rules: files or folders with EventRules.
-        compared: the names of two rules whose episodes are compared; None: nothing is compared.
         as_one: merge all recordings by time; otherwise each is replayed on its own.
         kinds: the results to look at that are written as well.
-        sets: fields of rules with other values, as RULE.FIELD=VALUE: a variant that is compared with the rule.
+        sets: fields of rules with other values, as RULE.FIELD=VALUE: a variant that is compared with the rule; or
+            RULE=OTHER: another rule that is compared with it.
         sweeps: the same with several values, each a variant: RULE.FIELD=FIRST:LAST:STEP.
+        record: run the rules' record actions, into the folder clips of `output`.
 
     Raises:
         VariantError: a variant cannot be made.
@@ -85,21 +90,20 @@ def replay_files(
     check_installed(kinds)
     looking = Looking() if kinds else None
     with Progress(Console(stderr=True)) as progress:
-        options = Options(as_one, tuple(sets), tuple(sweeps))
-        played, evaluated, variants = _replayed(recordings, detector, rules, options, progress, looking)
+        clips = Clips(output / CLIPS) if record else None
+        options = Options(as_one, clips, tuple(sets), tuple(sweeps))
+        played, variants = _replayed(recordings, detector, rules, options, progress, looking)
         output.mkdir(parents=True, exist_ok=True)
-        results = [] if looking is None else looking.results(played.outcomes, evaluated)
+        results = [] if looking is None else looking.results(played.outcomes)
         if results:
             progress.note("writing the results")
             write_results(output, results, kinds)
     outcomes = list(played.outcomes.values())
-    tried = {variant.rule.name for variant in variants}
+    tried = {variant.rule.name for variant in variants if not variant.is_written}
     traced = [_traced(outcome) for outcome in outcomes]
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
         file.writelines(event.to_json() + "\n" for events, _ in traced for event in events if event.rule not in tried)
     write_tasks_yaml(output / "tasks.yaml", [task for _, tasks in traced for task in tasks])
-    if compared is not None:
-        write_comparison(outcomes, compared, output)
     refusals = dict.fromkeys(str(refusal) for outcome in outcomes for refusal in outcome.refusals)
     for refusal in refusals:
         typer.echo(refusal, err=True)
@@ -115,7 +119,8 @@ def replay_files(
         show_variants(_console(), variants, compared_variants)
     if results:
         show_summary(_console(), results)
-    typer.echo(f"{_counted(outcomes, tried)}: {output}", err=True)
+    clipped = "" if clips is None else f", {_number(clips.count, 'clip')}"
+    typer.echo(f"{_counted(outcomes, tried)}{clipped}: {output}", err=True)
     if refusals or played.errors:
         raise typer.Exit(1)
 
@@ -197,17 +202,17 @@ def _replayed(
     options: Options,
     progress: Progress,
     looking: Looking | None,
-) -> tuple[Played, Sequence[EventRule], Sequence[Variant]]:
-    """What the recordings came to, the rules as written, where files have them, and their variants."""
+) -> tuple[Played, Sequence[Variant]]:
+    """What the recordings came to, and the variants of rules."""
     intake = intake_file_of(recordings)
     if intake is not None:
-        if options.sets or options.sweeps:
-            refuse("--set and --sweep are not for intake files: give the recording itself")
+        if options.sweeps or any("." in option.partition("=")[0] for option in options.sets):
+            refuse("an intake file has no variants of rules, only --set RULE=OTHER: give the recording itself")
         name = name_of((intake,))
-        outcome, given = _intake_replayed(
-            intake, detector, rules, progress, None if looking is None else looking.watch(name)
+        outcome = _intake_replayed(
+            intake, detector, rules, progress, None if looking is None else looking.watch(name), options.clips
         )
-        return Played({name: outcome}, []), given, ()
+        return Played({name: outcome}, []), variants_of([*outcome.rules.values()], options.sets, ())
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
     loaded = load_rules(detector, rules, lasting_problems)
@@ -215,36 +220,43 @@ def _replayed(
         typer.echo(warning, err=True)
     gathered = recordings_of(recordings, as_one=options.as_one)
     variants = variants_of(loaded.rule_set.rules, options.sets, options.sweeps)
-    evaluated = [*loaded.rule_set.rules, *(variant.rule for variant in variants)]
+    made = [variant for variant in variants if not variant.is_written]
+    evaluated = [*loaded.rule_set.rules, *(variant.rule for variant in made)]
     if progress.shown:
         progress.expect([quick_span_of(recording) for recording in gathered])
     played = play(
         gathered,
-        with_variants(loaded.rule_set.detector, variants),
+        with_variants(loaded.rule_set.detector, made),
         evaluated,
         lambda: _plugins(Outages(lambda: ())),
         lambda batches: progress.watch_batches(batches if looking is None else looking.batches(batches)),
         lambda name: None if looking is None else looking.watch(name).tracer,
+        options.clips,
     )
-    return played, evaluated, variants
+    return played, variants
 
 
 def _intake_replayed(
-    recording: Path, detector: Path | None, rules: Sequence[Path], progress: Progress, look: Look | None
-) -> tuple[Outcome, Sequence[EventRule]]:
+    recording: Path,
+    detector: Path | None,
+    rules: Sequence[Path],
+    progress: Progress,
+    look: Look | None,
+    clips: Clips | None,
+) -> Outcome:
     if detector is None and rules:
         refuse("give --detector as well: rules are compiled against their Detector")
     given = None if detector is None else load_rules(detector, rules, lasting_problems).rule_set
     records = progress.watch(read_intake(recording))
     with _plugins(Outages(lambda: recorded_outages(recording) if detector is None else ())) as plugins:
-        outcome = replay_intake(
+        return replay_intake(
             records if look is None else look.arrivals.watch(records),
             None if given is None else given.detector,
             given.rules if given is not None and rules else None,
             plugins,
             None if look is None else look.tracer,
+            clips,
         )
-    return outcome, [] if given is None else given.rules
 
 
 def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:

@@ -1,18 +1,26 @@
-"""What `detector topics` runs: recordings in, a list of what they hold out."""
+"""What `detector topics` runs: recordings or a network in, a list of what they hold out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import typer
 
 from detector.replay.errors import RecordingError
-from detector.replay.gathering import intake_file_of, recordings_of
+from detector.replay.gathering import Recording, intake_file_of, recordings_of
+from detector.topics.listening import listen
 from detector.topics.listing import lines, yaml_of
 from detector.topics.proposal import proposals
-from detector.topics.survey import survey
+from detector.topics.survey import Survey, survey
+from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.commandline import refuse
+from wayside.inputerror import InputError
+
+
+class NothingHeardError(InputError, ValueError):
+    """Nothing came over the network."""
 
 
 def list_topics(recordings: Sequence[Path], *, as_yaml: bool) -> None:
@@ -29,9 +37,36 @@ def list_topics(recordings: Sequence[Path], *, as_yaml: bool) -> None:
         typer.echo(f"warning: {cut}", err=True)
     if not found.topics:
         raise RecordingError(f"{recordings[0]} holds no message")
+    _show(found, gathered, None, as_yaml=as_yaml)
+
+
+def list_live_topics(connect: Sequence[str], seconds: float, *, as_yaml: bool) -> None:
+    """Print what comes over Zenoh within so many seconds, or a Detector that takes it.
+
+    Args:
+        connect: endpoints; none: whoever is found on the local network.
+        seconds: how long to listen.
+        as_yaml: print a Detector.
+
+    Raises:
+        NetworkError: nobody can be reached.
+        NothingHeardError: nothing came.
+    """
+    config = Zenoh(mode=ZenohMode.CLIENT, connect=[*connect], scouting=False) if connect else Zenoh()
+    found = listen(config, seconds)
+    if not found.topics:
+        where = ", ".join(connect) or "the local network"
+        raise NothingHeardError(
+            f"nothing came from {where} within {seconds:g} s: correct --connect, or raise --seconds"
+        )
+    network = config.model_dump(mode="json", by_alias=True, include={"mode", "connect"}) if connect else None
+    _show(found, (), network, as_yaml=as_yaml)
+
+
+def _show(found: Survey, gathered: Sequence[Recording], network: Mapping[str, Any] | None, *, as_yaml: bool) -> None:
     streams = proposals(found.topics)
     if as_yaml:
-        typer.echo(yaml_of(streams, gathered), nl=False)
+        typer.echo(yaml_of(streams, gathered, network), nl=False)
         return
     for line in lines(streams, gathered):
         typer.echo(line)

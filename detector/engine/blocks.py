@@ -67,7 +67,7 @@ class Blocks:
                 continue
             if fits_pairs(rule, self._context):
                 pairs.append((depth, run, every))
-            elif fits(rule) or (fits_fleet(rule) and self._observer is None):  # it sees clients and pairs
+            elif fits(rule) or fits_fleet(rule):
                 columns = Group if fits(rule) else FleetGroup
                 together.setdefault((depth, columns, every, every * thinning(run)), []).append(run)
             else:

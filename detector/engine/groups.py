@@ -83,8 +83,11 @@ class RuleGroup:
             return
         looked = None if only is None else self._looked(clients, only)
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
-        if self.observer is not None and isinstance(block, Block):
-            self.observer.clients(self.columns.tracks, block, codes, looked)
+        if self.observer is not None:
+            if isinstance(block, Block):
+                self.observer.clients(self.columns.tracks, block, codes, looked)
+            else:
+                self.observer.fleet(self.columns.tracks, block)
         self._follow()
         numbers: list[int] = block.numbers.tolist()
         states: list[tuple[int, int, bool, int]] = []

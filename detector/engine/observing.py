@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from detector.engine.columns.block import Block, Track
+from detector.engine.columns.fleets import FleetBlock
 from detector.engine.columns.pairs import PairBlock
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Codes
@@ -21,6 +22,9 @@ class Observer(Protocol):
 
         The block has the signals and, by field, where conditions are true and false (`verdicts`), one row a track.
         """
+
+    def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
+        """Rules about the fleet: the block has its members and the conditions of each track."""
 
     def pairs(self, track: Track, these: PairBlock) -> None:
         """A rule about pairs at one tick."""

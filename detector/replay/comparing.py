@@ -7,8 +7,7 @@ still open ends with the recording.
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +71,7 @@ class Comparison:
         return shared / either if either else None
 
     def to_json(self) -> dict[str, Any]:
-        """Everything, for `comparison.json`."""
+        """Everything, for `variants.json`."""
         return {
             "rules": [self.first, self.second],
             "both": [
@@ -90,29 +89,6 @@ class Comparison:
             "onlySecond": [span.to_json() for span in self.only_second],
             "agreement": self.agreement,
         }
-
-    def lines(self) -> Iterator[str]:
-        """The same in a few lines for people."""
-        episodes = "episode" if len(self.both) == 1 else "episodes"
-        yield (
-            f"{self.first} and {self.second}: {len(self.both)} {episodes} in both, "
-            f"{len(self.only_first)} only in {self.first}, {len(self.only_second)} only in {self.second}"
-        )
-        for what, differences in (("start", self.start_differences), ("end", self.end_differences)):
-            if differences:
-                yield (
-                    f"{self.second} {what}s {_signed(statistics.median(differences))} s after {self.first} (median; "
-                    f"{_signed(min(differences))} to {_signed(max(differences))} s)"
-                )
-        if self.agreement is not None:
-            yield f"both have an episode in {self.agreement:.1%} of the time in which either has"
-        for rule, spans in ((self.first, self.only_first), (self.second, self.only_second)):
-            for span in spans[:_SHOWN]:
-                where = "" if span.recording is None else f" in {span.recording}"
-                yield f"only {rule}: {span.subject} from {format_time(span.start)}{where}"
-
-
-_SHOWN = 10
 
 
 def compare(events: Iterable[Event], first: str, second: str, end: int) -> Comparison:
@@ -161,7 +137,3 @@ def _matched(first: str, second: str, spans: Sequence[Span], others: Sequence[Sp
         both.append((span, best))
     rest = sorted(other for of_subject in left.values() for other in of_subject)
     return Comparison(first, second, tuple(both), tuple(only), tuple(rest))
-
-
-def _signed(seconds: float) -> str:
-    return f"{seconds:+.3f}"

@@ -10,6 +10,7 @@ import msgspec
 
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
+from detector.replay.clips import Clips
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import Recording, name_of
 from detector.replay.latched import recorded_arrivals
@@ -46,11 +47,13 @@ def play(
     plugins: Plugins = nullcontext,
     watch: Watch = lambda batches: batches,
     onlooker: Callable[[str], Onlooker | None] = lambda _: None,
+    clips: Clips | None = None,
 ) -> Played:
     """What each recording came to. Without `plugins` they run in this process.
 
     Of several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
     task names differ even if all begin at the same time. `onlooker` gives who looks on at the recording of that name.
+    With `clips`, the rules' record actions run.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -64,7 +67,7 @@ def play(
         name = name_of(recording)
         try:
             holder = detector.name if number == 1 else f"{detector.name}.{number}"
-            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, holder, onlooker(name))
+            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, holder, onlooker(name), clips)
         except RecordingError as error:
             errors.append(error)
             continue
@@ -85,6 +88,7 @@ def _played(
     watch: Watch,
     holder: str,
     onlooker: Onlooker | None,
+    clips: Clips | None,
 ) -> tuple[Outcome, list[str]]:
     """What a recording came to, and its keys that belong to no stream."""
     cuts: list[Cut] = []
@@ -92,7 +96,7 @@ def _played(
     router = Router(completed.spec.streams, name_of(recording))
     arrivals = recorded_arrivals(recording, router, completed, cuts.append)
     with plugins() as host:
-        outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder, onlooker)
+        outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder, onlooker, clips)
     outcome.cuts = cuts
     if not outcome.samples:
         keys = router.unrouted

@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
+from detector.actions.base import Surroundings
 from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, from_task, to_task
@@ -21,6 +23,7 @@ from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
 from detector.losses import Losses
+from detector.replay.clips import Clips, Recorders
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control
 from detector.replay.intake_versions import detector_as_of, rule_as_of
@@ -57,8 +60,8 @@ class Outcome:
     """The intake file ends in the middle: its writer was killed."""
     end: int = 0
     """Up to here all ticks have run; nanoseconds since the epoch."""
-    rules: tuple[str, ...] = ()
-    """The names of all rules that were given at some time."""
+    rules: dict[str, EventRule] = field(default_factory=dict)
+    """All rules that were given at some time, as they were last, by name."""
     lost: int = 0
     """Arrivals that the intake file does not hold: the disk was too slow for them."""
 
@@ -78,24 +81,29 @@ class Replay:
         version: int = ORDER,
         order: int = ORDER,
         onlooker: Onlooker | None = None,
+        clips: Clips | None = None,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
 
-        `version` is that of the intake file that the rules stand in; `order`: see `timeline.ORDER`.
+        `version` is that of the intake file that the rules stand in; `order`: see `timeline.ORDER`. With `clips`, the
+        rules' record actions run.
 
         Raises:
             DetectorError: the Detector cannot run.
         """
         self.outcome = outcome
         self._version = version
+        self._clips = clips
+        self._recorders: Recorders | None = None if clips is None else clips.recorders(holder)
+        self._detector = detector = detector if clips is None else clips.placed(detector)
         self._entries: Inlets = inlets(detector)
-        self._detector = detector
         self._rule_book = RuleBook()
         self._engine: Engine = make_engine(
             detector, self._entries, holder=holder, start=start, plugins=plugins, order=order
         )
         self._engine.counters.watch_ages = True
         self._engine.instruments.journal = []
+        self._engine.consequences.wanted = clips is not None
         self._engine.instruments.observer = self._onlooker = onlooker
         self._demands: dict[str, Demand] = {}
         self._demands_version: tuple[int, int] | None = None
@@ -126,21 +134,30 @@ class Replay:
         for events in self._engine.finish():
             self._note(events)
 
+    def close(self) -> None:
+        """The recording is over: clips are completed."""
+        if self._recorders is not None:
+            self._recorders.tell(self._engine.consequences.cut(self._engine.now, "the recording ended"))
+            self.outcome.notes += self._recorders.close()
+
     def gap(self, time: int) -> None:
         """Time went on without ticks."""
         self._note(self._engine.gap(time))
 
     def set_detector(self, detector: Detector) -> None:
         """Go on with a changed Detector; `set_rules` follows."""
+        self._detector = detector = detector if self._clips is None else self._clips.placed(detector)
         self._entries = inlets(detector)
-        self._detector = detector
         self._engine.set_detector(detector, self._entries.decoders, self._entries.read_key)
 
     def set_rules(self, rules: Sequence[EventRule]) -> None:
         """Go on with these rules."""
         compiled, refused = self._rule_book.compile(rules, self._detector, self._entries.fields)
         self.outcome.refusals += refused
-        self.outcome.rules = tuple(sorted({*self.outcome.rules, *(rule.name for rule in rules)}))
+        self.outcome.rules |= {rule.name: rule for rule in rules}
+        if self._recorders is not None:
+            surroundings = Surroundings(self._detector, self._entries.decoders, self._entries.types)
+            self._recorders.follow(self._rule_book.good, surroundings)
         self._note(self._engine.set_rules([rule_as_of(rule, self._version) for rule in compiled]))
         if self._onlooker is not None:
             self._onlooker.attend(self._engine)
@@ -162,6 +179,8 @@ class Replay:
         self.outcome.events += events
         self.outcome.end = max(self.outcome.end, self._engine.now)
         self._note_changes()
+        if self._recorders is not None:
+            self._recorders.tell(self._engine.consequences.take(self._engine.now))
         if self._engine.demands_version == self._demands_version:
             return
         self._demands_version = self._engine.demands_version
@@ -194,10 +213,11 @@ def replay_intake(
     rules: Sequence[EventRule] | None,
     plugins: PluginHost | None = None,
     onlooker: Onlooker | None = None,
+    clips: Clips | None = None,
 ) -> Outcome:
     """Replay an intake file: with what it holds, or with another Detector or other rules where given.
 
-    `plugins` runs them; without it they run in this process.
+    `plugins` runs them; without it they run in this process. With `clips`, record actions run.
 
     Raises:
         RecordingError: it does not begin with a start.
@@ -214,12 +234,13 @@ def replay_intake(
             batch.append(record)
             continue
         if replay is None:
-            replay = _begin(record, detector, rules, outcome, plugins, onlooker)
+            replay = _begin(record, detector, rules, outcome, plugins, onlooker, clips)
             continue
         replay.take(batch, _until(record, batch))
         batch = []
         _control(replay, record, detector, rules, outcome)
     if replay is not None:
+        replay.close()
         outcome.notes += replay.report()
     else:
         raise RecordingError("the intake file holds nothing: its writer was killed before it began; record again")
@@ -240,6 +261,7 @@ def _begin(
     outcome: Outcome,
     plugins: PluginHost | None,
     onlooker: Onlooker | None,
+    clips: Clips | None,
 ) -> Replay:
     document = record.document
     if record.kind != "start":
@@ -255,6 +277,7 @@ def _begin(
         version=version if rules is None else ORDER,
         order=version,
         onlooker=onlooker,
+        clips=clips,
     )
 
 
@@ -302,12 +325,14 @@ def replay_arrivals(
     plugins: PluginHost | None = None,
     holder: str | None = None,
     onlooker: Onlooker | None = None,
+    clips: Clips | None = None,
 ) -> Outcome:
     """Replay what any other recording holds, as the live intake would have queued it; `plugins` as for an intake file.
 
     Args:
         batches: the arrivals, whose times never go back; where a batch ends has no meaning.
         holder: as which detector; by default under the Detector's name.
+        clips: where record actions write; None: they do not run.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -315,13 +340,20 @@ def replay_arrivals(
     outcome = Outcome()
     replay: Replay | None = None
     last = 0
-    holder = holder or detector.name
+    begin = partial(
+        Replay,
+        detector,
+        rules,
+        holder=holder or detector.name,
+        outcome=outcome,
+        plugins=plugins,
+        onlooker=onlooker,
+        clips=clips,
+    )
     for part in parts_of(batches):
         first = part[0].received
         if replay is None:
-            replay = Replay(
-                detector, rules, holder=holder, start=first - 1, outcome=outcome, plugins=plugins, onlooker=onlooker
-            )
+            replay = begin(start=first - 1)
         elif first - last > PAUSE:
             replay.gap(first - 1)
             outcome.notes.append(
@@ -331,8 +363,9 @@ def replay_arrivals(
         last = part[-1].received
         replay.take(part, last)
     if replay is None:
-        replay = Replay(detector, rules, holder=holder, start=0, outcome=outcome, plugins=plugins, onlooker=onlooker)
+        replay = begin(start=0)
         replay.take((), 0)
     replay.finish()
+    replay.close()
     outcome.notes += replay.report()
     return outcome

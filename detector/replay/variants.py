@@ -49,18 +49,26 @@ class Variant(NamedTuple):
     rule: EventRule
     parameters: frozenset[str]
     """Those of the rule that the variant sets for all clients."""
+    is_written: bool = False
+    """It is another rule as written, with its own name and actions, that is only compared."""
 
 
 def variants_of(rules: Sequence[EventRule], sets: Sequence[str], sweeps: Sequence[str]) -> list[Variant]:
     """The variants that the options name: of each rule one with all that is set, and one for each value of each sweep.
+
+    `RULE=OTHER` names another rule in place of a variant.
 
     Raises:
         VariantError: an option cannot be read, names no rule or no field of it, or makes a rule that is wrong.
     """
     known = {rule.name: rule for rule in rules}
     fixed: dict[str, list[Change]] = {}
+    others = []
     for option in sets:
         rule, path, text = _parts("--set", option, known)
+        if not path:
+            others.append(Variant(rule, f"rule {text}", known[_known("--set", option, text, known)], frozenset(), True))
+            continue
         fixed.setdefault(rule, []).append(Change(rule, path, _value(text)))
     chosen = [*fixed.items()]
     for option in sweeps:
@@ -69,7 +77,7 @@ def variants_of(rules: Sequence[EventRule], sets: Sequence[str], sweeps: Sequenc
     if len(chosen) > _MOST:
         raise VariantError(f"--sweep: {len(chosen)} variants are more than {_MOST}: take larger steps")
     taken = set(known)
-    return [_variant(known[rule], changes, taken) for rule, changes in chosen]
+    return [*others, *(_variant(known[rule], changes, taken) for rule, changes in chosen)]
 
 
 def with_variants(detector: Detector, variants: Sequence[Variant]) -> Detector:
@@ -94,16 +102,22 @@ def with_variants(detector: Detector, variants: Sequence[Variant]) -> Detector:
 def _parts(option: str, text: str, rules: Mapping[str, EventRule]) -> tuple[str, tuple[str, ...], str]:
     before, equals, value = text.partition("=")
     rule, *path = before.strip().split(".")
-    if not equals or not path:
+    if not equals or (not path and option != "--set"):
         raise VariantError(f"{option} {text}: write RULE.FIELD=VALUE, e.g. close.when='distance < 120'")
+    _known(option, text, rule, rules)
+    if path[:1] == ["parameters"] and path[1:2] and path[1] not in rules[rule].spec.parameters:
+        there = ", ".join(sorted(rules[rule].spec.parameters)) or "none"
+        raise VariantError(f"{option} {text}: rule {rule} has no parameter {path[1]}; it has {there}")
+    return rule, tuple(path), value.strip()
+
+
+def _known(option: str, text: str, rule: str, rules: Mapping[str, EventRule]) -> str:
+    """The name, where there is such a rule."""
     if rule not in rules:
         close = difflib.get_close_matches(rule, rules, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there is {', '.join(sorted(rules)) or 'none'}"
         raise VariantError(f"{option} {text}: there is no rule {rule}; {hint}")
-    if path[0] == "parameters" and path[1:2] and path[1] not in rules[rule].spec.parameters:
-        there = ", ".join(sorted(rules[rule].spec.parameters)) or "none"
-        raise VariantError(f"{option} {text}: rule {rule} has no parameter {path[1]}; it has {there}")
-    return rule, tuple(path), value.strip()
+    return rule
 
 
 def _value(text: str) -> Any:

@@ -1,55 +1,30 @@
-"""results.mcap: what was evaluated, in channels that Foxglove and Lichtblick show beside the recording.
-
-Each rule and subject has a channel of JSON with a schema; besides there are the episodes, a log and the scene.
-"""
+"""results.mcap: what was evaluated, to open beside the recording in Foxglove or Lichtblick."""
 
 from __future__ import annotations
 
 import operator
-import re
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import foxglove
 import msgspec
-import numpy as np
 from foxglove.channels import LogChannel, SceneUpdateChannel
-from foxglove.messages import Log, LogLevel, Timestamp
 
-from detector.engine.episodes.events import Event
+from detector.results.channels import (
+    EPISODE,
+    EPISODES,
+    LOG,
+    SCENE,
+    episode_message,
+    log_message,
+    subject_channel,
+    topic_of,
+)
 from detector.results.result import Result
-from detector.results.scene import updates
-from detector.results.series import WORDS, Integers, Kind, Series, SubjectTrace
-from detector.results.thinning import thinned
-from wayside.times import format_time
+from detector.results.scene import Scene
 
 MOST = 200_000
 """Approximate limit of messages about values: longer series keep minimum and maximum of equal parts of the time."""
-
-_TYPES = {Kind.NUMBER: "number", Kind.BOOLEAN: "boolean", Kind.TEXT: "string"}
-_SIGNS = {"+": "plus", "-": "minus", "*": "times", "/": "by"}
-
-
-class _Field(NamedTuple):
-    """One value of a message."""
-
-    path: tuple[str, ...]
-    series: Series
-    values: list[Any]
-
-
-def topic_of(rule: str, subject: str) -> str:
-    """The channel of a rule's subject."""
-    return f"/wayside/{rule}/{subject}"
-
-
-def path_of(name: str) -> tuple[str, ...]:
-    """Where a signal or term stands in a message: `a.speed` in `a`, `fastest - speed` under `fastest_minus_speed`."""
-    if re.fullmatch(r"[\w.]+", name):
-        return tuple(name.split("."))
-    spelt = "".join(f" {_SIGNS[char]} " if char in _SIGNS else char for char in name)
-    return (re.sub(r"\W+", "_", spelt).strip("_"),)
 
 
 def write_mcap(path: Path, result: Result) -> None:
@@ -61,124 +36,18 @@ def write_mcap(path: Path, result: Result) -> None:
         series = sum(len(each.signals) for each in result.trace.subjects)
         buckets = max(20, MOST // (2 * max(series, 1)))
         for subject in result.trace.subjects:
-            schema, found = _subject(result, subject, buckets)
+            schema, found = subject_channel(result, subject, buckets)
             topic = topic_of(subject.rule, subject.subject)
             writers.append(foxglove.Channel(topic, schema=schema, message_encoding="json", context=context))
             messages += ((time, len(writers) - 1, payload) for time, payload in found)
-        episodes = foxglove.Channel("/wayside/episodes", schema=_EPISODE, message_encoding="json", context=context)
-        log, scene = LogChannel("/wayside/log", context=context), SceneUpdateChannel("/wayside/scene", context=context)
+        episodes = foxglove.Channel(EPISODES, schema=EPISODE, message_encoding="json", context=context)
+        log, scene = LogChannel(LOG, context=context), SceneUpdateChannel(SCENE, context=context)
         writers += [episodes, log, scene]
         for event in result.events:
             time = event.start_time if event.end_time is None else event.end_time
-            messages.append((time, len(writers) - 3, msgspec.json.encode(_episode(event))))
-            messages.append((time, len(writers) - 2, _line(event, time)))
-        messages += ((time, len(writers) - 1, update) for time, update in updates(result))
+            messages.append((time, len(writers) - 3, msgspec.json.encode(episode_message(event))))
+            messages.append((time, len(writers) - 2, log_message(event, time)))
+        messages += ((time, len(writers) - 1, update) for time, update in Scene().updates(result))
         messages.sort(key=operator.itemgetter(0, 1))
         for time, number, message in messages:
             writers[number].log(message, log_time=time)
-
-
-def _subject(result: Result, subject: SubjectTrace, buckets: int) -> tuple[dict[str, Any], Iterator[tuple[int, bytes]]]:
-    """The schema of a subject's channel, and its messages: all that is known at each time at which a value changes."""
-    trace, terms, exact = result.trace, result.terms.get((subject.rule, subject.subject)), subject.changes
-    named = {**subject.signals, **(terms.computed if terms is not None else {})}
-    short = {name: thinned(series, trace.begin, trace.end, buckets, exact) for name, series in named.items()}
-    times = np.unique(np.concatenate([exact, *(series.times for series in short.values())]))
-    fields = [_Field(path_of(name), named[name], named[name].at(times).tolist()) for name in named]
-    limits: dict[str, Any] = {}
-    for each in terms.thresholds if terms is not None else ():
-        _put(limits, (each.field, *path_of(each.term)), each.value)
-    said = {name: steps.at(times).tolist() for name, steps in subject.conditions.items()}
-    reasons = {name: _reasons(steps.reasons, steps.times, times) for name, steps in subject.conditions.items()}
-    schema: dict[str, Any] = {"type": "object", "title": f"wayside.{subject.rule}", "properties": {}}
-    for field in fields:
-        _declare(schema, field.path, {"type": _TYPES[field.series.kind]})
-    for name in said:
-        _declare(schema, (name,), {"type": "string", "enum": [*WORDS]})
-        _declare(schema, (f"{name}_reason",), {"type": "string"})
-    if limits:
-        schema["properties"]["threshold"] = _shape(limits)
-    return schema, _messages(times, fields, said, reasons, limits)
-
-
-def _messages(
-    times: Integers,
-    fields: list[_Field],
-    said: Mapping[str, list[int]],
-    reasons: Mapping[str, list[str | None]],
-    limits: Mapping[str, Any],
-) -> Iterator[tuple[int, bytes]]:
-    encode = msgspec.json.Encoder().encode
-    for row, time in enumerate(times.tolist()):
-        message: dict[str, Any] = {}
-        for field in fields:
-            value = field.series.plain(field.values[row])
-            if value is not None:
-                _put(message, field.path, value)
-        for name, codes in said.items():
-            message[name] = WORDS[codes[row]]
-            reason = reasons[name][row]
-            if reason is not None:
-                message[f"{name}_reason"] = reason
-        if limits:
-            message["threshold"] = limits
-        yield time, encode(message)
-
-
-def _reasons(reasons: Mapping[int, str], changes: Integers, times: Integers) -> list[str | None]:
-    where = np.searchsorted(changes, times, "right") - 1
-    return [reasons.get(at) for at in where.tolist()]
-
-
-def _put(message: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
-    for step in path[:-1]:
-        message = message.setdefault(step, {})
-    message[path[-1]] = value
-
-
-def _declare(schema: dict[str, Any], path: tuple[str, ...], kind: dict[str, Any]) -> None:
-    for step in path[:-1]:
-        schema = schema["properties"].setdefault(step, {"type": "object", "properties": {}})
-    schema["properties"][path[-1]] = kind
-
-
-def _shape(values: Mapping[str, Any]) -> dict[str, Any]:
-    properties = {
-        name: _shape(value) if isinstance(value, Mapping) else {"type": "number"} for name, value in values.items()
-    }
-    return {"type": "object", "properties": properties}
-
-
-_EPISODE: dict[str, Any] = {
-    "type": "object",
-    "title": "wayside.Episode",
-    "properties": {
-        **{name: {"type": "string"} for name in ("rule", "subject", "episode", "state", "start", "end", "reason")},
-        "values": {"type": "object"},
-    },
-}
-
-
-def _episode(event: Event) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        "rule": event.rule,
-        "subject": event.subject,
-        "episode": event.episode,
-        "state": "started" if event.started else "ended",
-        "start": format_time(event.start_time),
-    }
-    if event.end_time is not None:
-        found |= {"end": format_time(event.end_time), "reason": str(event.reason)}
-    return {**found, "values": dict(event.values)}
-
-
-def _line(event: Event, time: int) -> Log:
-    ended = "" if event.started else f" ({event.reason})"
-    return Log(
-        timestamp=Timestamp(sec=time // 1_000_000_000, nsec=time % 1_000_000_000),
-        level=LogLevel.Info,
-        name=event.rule,
-        message=f"{event.rule} of {event.subject} {'started' if event.started else 'ended'}{ended}",
-        file="",
-        line=0,
-    )

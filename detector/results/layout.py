@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from foxglove import layouts
 
-from detector.results.foxglove_file import path_of, topic_of
+from detector.results.channels import path_of, topic_of
 from detector.results.result import Result
 from detector.results.scene import FRAME
 from detector.results.series import Kind, SubjectTrace

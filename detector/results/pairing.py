@@ -25,6 +25,7 @@ from detector.results.series import (
     Series,
     Steps,
     SubjectTrace,
+    Wanted,
     Way,
 )
 from wayside.expressions.columns.values import Tag
@@ -82,8 +83,8 @@ class PairLog:
                 known = None if tags is None else (tags == Tag.NUMBER) | (tags == Tag.BOOLEAN)
                 values.append(column.values[rows] if known is None else np.where(known, column.values[rows], np.nan))
 
-    def subjects(self, rule: str, names: Sequence[str]) -> Iterator[SubjectTrace]:
-        """Each pair that was looked at; `names` are the clients', by their numbers."""
+    def subjects(self, rule: str, names: Sequence[str], wanted: Wanted) -> Iterator[SubjectTrace]:
+        """Each pair that was looked at and is wanted; `names` are the clients', by their numbers."""
         sizes = [len(keys) for keys in self._keys]
         if not sum(sizes):
             return
@@ -98,6 +99,8 @@ class PairLog:
             key, own = int(keys[begin]), slice(begin, end)
             clients = names[key >> _SHIFT], names[key & (1 << _SHIFT) - 1]
             subject = SubjectTrace(rule, Subject(clients, self._track.element.name).text, clients)
+            if not wanted(rule, subject.subject):
+                continue
             left = _left(ordinals[own], len(ticks))
             for name, column in values.items():
                 kind = self._kinds.get(name, Kind.NUMBER)

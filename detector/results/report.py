@@ -259,7 +259,9 @@ def _rule(result: Result, name: str, episodes: Sequence[Episode]) -> dict[str, A
     evaluations, unknowns, errors = result.counts.get(name, (0, 0, 0))
     text = f"when: {rule.when.source}\n"
     if document is not None:
-        text = to_yaml([document.model_dump(mode="json", by_alias=True, exclude_unset=True)])
+        whole = document.model_dump(mode="json", by_alias=True)
+        brief = document.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+        text = to_yaml([{name: whole[name] for name in ("apiVersion", "kind")} | brief])
     return {
         "name": name,
         "description": "" if document is None else document.spec.description,

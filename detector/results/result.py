@@ -29,7 +29,7 @@ class Result:
     rules: Mapping[str, CompiledRule]
     """Those that were evaluated at the end, by name."""
     documents: Mapping[str, EventRule]
-    """The rules as written, where they are at hand."""
+    """The rules as written."""
     terms: Mapping[tuple[str, str], Terms]
     """By rule and subject, what its conditions compare."""
     streams: Sequence[StreamQuality]
@@ -45,9 +45,7 @@ class Result:
         return episodes_of(self.recording, self.events, self.trace)
 
 
-def result_of(
-    name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals, documents: Mapping[str, EventRule]
-) -> Result:
+def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -> Result:
     """What a replay came to; `tracer` and `arrivals` looked on at it.
 
     Raises:
@@ -68,7 +66,7 @@ def result_of(
         events=outcome.events,
         tasks=[*outcome.tasks.values()],
         rules=rules,
-        documents=documents,
+        documents=outcome.rules,
         terms=terms,
         streams=arrivals.by_stream(engine),
         counts={rule: (each.evaluations, each.unknowns, each.errors) for rule, each in counted.items()},

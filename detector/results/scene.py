@@ -51,42 +51,61 @@ class _Edge(NamedTuple):
     clients: tuple[str, ...]
 
 
-def updates(result: Result) -> Iterator[tuple[int, SceneUpdate]]:
-    """The scene over time; nothing where no position is known. Degrees become metres from the first place."""
-    trace = result.trace
-    if not trace.ways:
-        return
-    origin = next(iter(trace.ways.values())).axes[:, 0]
-    edges = _edges(result)
-    step = max(_STEP, (trace.end - trace.begin) // _MOST)
-    at_edges = np.array([edge.time for edge in edges], np.int64)
-    times = np.unique(np.concatenate((np.arange(trace.begin, trace.end + 1, step), at_edges)))
-    flat = {name: _metres(way.axes, origin, geographic=trace.geographic) for name, way in trace.ways.items()}
-    rows = {name: np.searchsorted(way.times, times, "right") - 1 for name, way in trace.ways.items()}
-    last = {name: int(way.times[-1]) for name, way in trace.ways.items()}
-    yield int(times[0]), SceneUpdate(entities=[*_polygons(result, int(times[0]), origin)])
-    busy: dict[str, _Edge] = {}
-    for at, time in enumerate(times.tolist()):
+class Scene:
+    """The scene over time. Degrees become metres from the first place."""
+
+    def __init__(self) -> None:
+        self._origin: Doubles | None = None
+        self._busy: dict[str, _Edge] = {}
+        """The open episodes."""
+
+    def updates(self, result: Result) -> Iterator[tuple[int, SceneUpdate]]:
+        """The updates of a result, which follows the one before; nothing where no position is known."""
+        trace, edges = result.trace, _edges(result)
+        if not trace.ways:
+            self._pass(edges, trace.end)
+            return
+        if self._origin is None:
+            self._origin = next(iter(trace.ways.values())).axes[:, 0]
+        origin = self._origin
+        step = max(_STEP, (trace.end - trace.begin) // _MOST)
+        at_edges = np.array([edge.time for edge in edges], np.int64)
+        times = np.unique(np.concatenate((np.arange(trace.begin, trace.end + 1, step), at_edges)))
+        flat = {name: _metres(way.axes, origin, geographic=trace.geographic) for name, way in trace.ways.items()}
+        rows = {name: np.searchsorted(way.times, times, "right") - 1 for name, way in trace.ways.items()}
+        last = {name: int(way.times[-1]) for name, way in trace.ways.items()}
+        yield int(times[0]), SceneUpdate(entities=[*_polygons(result, int(times[0]), origin)])
+        for at, time in enumerate(times.tolist()):
+            self._pass(edges, time)
+            there: dict[str, tuple[float, float]] = {}
+            for name, axes in flat.items():
+                row = int(rows[name][at])
+                if row >= 0 and time <= last[name] + _KEPT:
+                    there[name] = float(axes[0, row]), float(axes[1, row])
+            yield time, SceneUpdate(entities=self._entities(there, time))
+
+    def skip(self, result: Result) -> None:
+        """Nobody looks at this result: only know which episodes are open after it."""
+        self._pass(_edges(result), result.trace.end)
+
+    def _pass(self, edges: deque[_Edge], time: int) -> None:
+        """Know which episodes are open at a time."""
         while edges and edges[0].time <= time:
             edge = edges.popleft()
             if edge.starts:
-                busy[edge.episode] = edge
+                self._busy[edge.episode] = edge
             else:
-                busy.pop(edge.episode, None)
-        there: dict[str, tuple[float, float]] = {}
-        for name, axes in flat.items():
-            row = int(rows[name][at])
-            if row >= 0 and time <= last[name] + _KEPT:
-                there[name] = float(axes[0, row]), float(axes[1, row])
+                self._busy.pop(edge.episode, None)
+
+    def _entities(self, there: Mapping[str, tuple[float, float]], time: int) -> list[SceneEntity]:
         named: dict[str, list[str]] = {}
         pairs = []
-        for each in busy.values():
+        for each in self._busy.values():
             if len(each.clients) == 1:
                 named.setdefault(each.clients[0], []).append(each.rule)
             elif len(each.clients) == 2 and there.keys() >= {*each.clients}:
                 pairs.append(_pair(each.rule, each.clients, there, time))
-        entities = [_client(name, place, named.get(name, ()), time) for name, place in there.items()] + pairs
-        yield time, SceneUpdate(entities=entities)
+        return [_client(name, place, named.get(name, ()), time) for name, place in there.items()] + pairs
 
 
 def _edges(result: Result) -> deque[_Edge]:

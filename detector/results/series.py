@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -17,6 +17,10 @@ FALSE, TRUE, UNKNOWN, AWAY = 0, 1, 2, 3
 """What a condition says; AWAY: the rule does not look at the subject, which is out of its scope or reach."""
 
 WORDS = ("false", "true", "unknown", "away")
+
+
+Wanted = Callable[[str, str], bool]
+"""Whether somebody wants to see a subject, by the rule's name and the subject's text."""
 
 
 class Kind(StrEnum):

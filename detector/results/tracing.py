@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Track
+from detector.engine.columns.fleets import FleetBlock
 from detector.engine.columns.pairs import PairBlock
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Codes
 from detector.engine.engine import Engine
 from detector.engine.episodes.episodes import OUTSIDE
+from detector.engine.episodes.subjects import FLEET, Subject
 from detector.results.changes import Changes
 from detector.results.joining import Seen, Waiting, joined_blocks
 from detector.results.pairing import PairLog, WayLog
-from detector.results.reasons import why_unknown
+from detector.results.reasons import of_variables, why_unknown
 from detector.results.series import (
     AWAY,
     FALSE,
@@ -31,10 +33,11 @@ from detector.results.series import (
     Steps,
     SubjectTrace,
     Trace,
+    Wanted,
 )
 from detector.results.witnessing import Witnessed
 from wayside.expressions.columns.values import Tag
-from wayside.rules import PairSubject
+from wayside.rules import CompiledRule, PairSubject
 
 _POINTS = 20_000
 """Number of points (client and tick) that are noted together."""
@@ -87,7 +90,11 @@ class Tracer:
         self.engine = engine
         for name, run in engine.rules.items():
             if name not in engine.in_columns:
-                run.witness = self._witnessed.setdefault(name, Witnessed(run.rule)).saw
+                run.witness = self.witnessed(run.rule).saw
+
+    def witnessed(self, rule: CompiledRule) -> Witnessed:
+        """What a rule that is not in columns sees goes there."""
+        return self._witnessed.setdefault(rule.name, Witnessed(rule))
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
         """Note what changes in a block of rules about clients."""
@@ -95,7 +102,7 @@ class Tracer:
         self._time(block.ticks[0], block.ticks[-1])
         plan = self._plans.get(id(tracks))
         if plan is None:
-            self._flush_all()  # rules that were evaluated otherwise until now
+            self.settle()  # rules that were evaluated otherwise until now
             plan = self._plans[id(tracks)] = self._plan(tracks)
         if looked is None and not _has_texts(block):  # codes of texts may not last
             plan.waiting.append(Waiting(block, codes, numbers))
@@ -105,7 +112,8 @@ class Tracer:
         self._flush(plan)
         self._note(plan, Seen([block]), codes, numbers, looked)
 
-    def _flush_all(self) -> None:
+    def settle(self) -> None:
+        """Note what waits. From here on, the trace no longer needs the engine."""
         for plan in self._plans.values():
             self._flush(plan)
 
@@ -130,6 +138,28 @@ class Tracer:
             plan.seen.clear()
             plan.seen.update(numbers.tolist())
 
+    def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
+        """Note what changes in a block of rules about the fleet: the number of members, and conditions."""
+        self._time(block.ticks[0], block.ticks[-1])
+        numbers = np.array([self._number(FLEET)], np.int64)
+        for track, members, verdicts in zip(tracks, block.members, block.verdicts, strict=True):
+            key = _key(track, "count")
+            changes = self._signals.setdefault("/".join(key), Changes())
+            self._aliases.setdefault((track.rule.name, track.element.name, "count"), {})["/".join(key)] = changes
+            count = members.sum(axis=0, dtype=float).reshape(1, -1)
+            changes.add(numbers, block.times, count, np.full(count.shape, Tag.NUMBER, np.uint8), None)
+            for field, verdict in verdicts.items():
+                name = track.rule.name, track.element.name, field
+                reasons = self._reasons.setdefault(name, {})
+                said = np.where(verdict.true, float(TRUE), np.where(verdict.false, float(FALSE), float(UNKNOWN)))
+                codes = said.reshape(1, -1)
+                conditions = self._conditions.setdefault(name, Changes())
+                found = conditions.add(numbers, block.times, codes, np.zeros(codes.shape, np.uint8), None)
+                expression = track.rule.when if field == "when" else track.rule.until
+                for tick in found.ticks[found.values == UNKNOWN].tolist():
+                    why = of_variables(track.rule, expression, block.variables(track, tick))
+                    reasons[int(numbers[0]), block.ticks[tick]] = why
+
     def pairs(self, track: Track, these: PairBlock) -> None:
         """Note what a rule about pairs sees at a tick."""
         time = these.block.ticks[0]
@@ -142,30 +172,35 @@ class Tracer:
 
     # What came of it
 
-    def trace(self) -> Trace:
-        """All that was seen."""
-        self._flush_all()
+    def trace(self, wanted: Wanted = lambda rule, subject: True) -> Trace:
+        """All that was seen of the subjects that are wanted."""
+        self.settle()
         found: dict[tuple[str, str], SubjectTrace] = {}
-        self._of_clients(found)
+        self._of_clients(found, wanted)
         for (name, _), log in self._pairs.items():
-            for pair in log.subjects(name, self._names):
+            for pair in log.subjects(name, self._names, wanted):
                 found[name, pair.subject] = pair
         for name, witnessed in self._witnessed.items():
             for each in witnessed.subjects():
+                if not wanted(name, each.subject):
+                    continue
                 found.setdefault((name, each.subject), each)
                 self._time(*witnessed.span)
         subjects = [found[key] for key in sorted(found)]
         ways = self._ways.ways(self._names)
         return Trace(subjects, ways, self._ways.geographic, self._begin or 0, self._end)
 
-    def _of_clients(self, found: dict[tuple[str, str], SubjectTrace]) -> None:
+    def _of_clients(self, found: dict[tuple[str, str], SubjectTrace], wanted: Wanted) -> None:
         subjects: dict[tuple[str, str | None, int], SubjectTrace] = {}
         for (rule, element, field), changes in self._conditions.items():
             reasons = self._reasons[rule, element, field]
             for client, times, values, _ in changes.by_client():
                 name = self._names[client]
-                text = name if element is None else f"{name}~{element}"
-                subject = found.setdefault((rule, text), SubjectTrace(rule, text, (name,)))
+                clients = () if name == FLEET else (name,)
+                text = Subject(clients, element).text
+                if not wanted(rule, text):
+                    continue
+                subject = found.setdefault((rule, text), SubjectTrace(rule, text, clients))
                 subjects[rule, element, client] = subject
                 subject.conditions[field] = _steps(times, values.astype(np.uint8), reasons, client)
         texts = tuple(self._texts)
@@ -175,10 +210,10 @@ class Tracer:
             by_client: dict[int, list[Series]] = {}
             for changes in parts.values():
                 for client, times, values, tags in changes.by_client():
-                    by_client.setdefault(client, []).append(_series(times, values, tags, texts))
+                    if (rule, element, client) in subjects:
+                        by_client.setdefault(client, []).append(_series(times, values, tags, texts))
             for client, series in by_client.items():
-                if (rule, element, client) in subjects:
-                    subjects[rule, element, client].signals[signal] = _joined(series)
+                subjects[rule, element, client].signals[signal] = _joined(series)
 
     # Blocks
 
@@ -273,13 +308,16 @@ class Tracer:
     def _numbers_of(self, clients: Sequence[str]) -> Integers:
         known, numbers = self._clients
         if known is not clients and known != clients:
-            for client in clients:
-                if client not in self._numbers:
-                    self._numbers[client] = len(self._names)
-                    self._names.append(client)
-            numbers = np.array([self._numbers[client] for client in clients], np.int64)
+            numbers = np.array([self._number(client) for client in clients], np.int64)
             self._clients = clients, numbers
         return numbers
+
+    def _number(self, client: str) -> int:
+        number = self._numbers.get(client)
+        if number is None:
+            number = self._numbers[client] = len(self._names)
+            self._names.append(client)
+        return number
 
     def _time(self, first: int, last: int) -> None:
         self._begin = first if self._begin is None else min(self._begin, first)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,25 +12,19 @@ from rich.table import Table
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import Outcome
 from detector.results.episodes import Episode, write_csv, write_parquet
+from detector.results.installed import check_package
 from detector.results.kinds import Kind
 from detector.results.quality import Arrivals
 from detector.results.result import Result, result_of
 from detector.results.tracing import Tracer
-from wayside.api import EventRule
-from wayside.inputerror import InputError
 
 _NEEDED = {Kind.REPORT: "bokeh", Kind.MCAP: "foxglove", Kind.EPISODES: "pyarrow"}
-
-
-class MissingExtraError(InputError, RuntimeError):
-    """A result needs a package that is not installed."""
 
 
 def check_installed(kinds: Iterable[Kind]) -> None:
     """Raises MissingExtraError where a package of the extra is missing: before hours of replay, not after them."""
     for kind in sorted(kinds):
-        if find_spec(_NEEDED[kind]) is None:
-            raise MissingExtraError(f"--results {kind} needs {_NEEDED[kind]}: pip install 'wayside[results]'")
+        check_package(_NEEDED[kind], f"--results {kind}")
 
 
 class Look(NamedTuple):
@@ -56,10 +49,9 @@ class Looking:
         """The batches of the recording that came last, as they are."""
         return [*self._looks.values()][-1].arrivals.watch_batches(batches)
 
-    def results(self, outcomes: Mapping[str, Outcome], rules: Iterable[EventRule]) -> list[Result]:
+    def results(self, outcomes: Mapping[str, Outcome]) -> list[Result]:
         """What each recording came to."""
-        documents = {rule.name: rule for rule in rules}
-        return [result_of(name, outcome, *self._looks[name], documents) for name, outcome in outcomes.items()]
+        return [result_of(name, outcome, *self._looks[name]) for name, outcome in outcomes.items()]
 
 
 def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Kind]) -> list[Path]:

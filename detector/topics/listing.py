@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from detector.assembly import DetectorError, inlets
 from detector.replay.gathering import Recording
@@ -53,11 +54,11 @@ def _fields(each: Proposal, types: dict[str, Fields]) -> Iterator[tuple[str, str
         yield "msg", "bytes, for numberAt, utf8 and checksum"
 
 
-def yaml_of(found: Sequence[Proposal], recordings: Sequence[Recording]) -> str:
+def yaml_of(found: Sequence[Proposal], recordings: Sequence[Recording], zenoh: Mapping[str, Any] | None = None) -> str:
     """A Detector with the streams, and the definitions of types that only the recordings have."""
     completed = _completed(found, recordings)
     messages = [message.model_dump(mode="json", by_alias=True) for message in completed.spec.messages]
-    return to_yaml([detector_document(found, messages)])
+    return to_yaml([detector_document(found, messages, zenoh)])
 
 
 def _completed(found: Sequence[Proposal], recordings: Sequence[Recording]) -> Detector:

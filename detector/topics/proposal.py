@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from detector.topics.survey import Topic, encoding_of, shape_of
-from wayside.api.stream import Encoding
+from wayside.api.stream import Encoding, Layout
 
 _STALE_S = 5.0
 """The default of staleAfter."""
@@ -56,6 +56,8 @@ class Proposal:
         found["encoding"] = self.encoding.value
         if self.encoding is Encoding.CDR and self.type is not None:
             found["type"] = self.type
+        if self.topics[0].layout is not Layout.PLAIN:
+            found["layout"] = self.topics[0].layout.value
         rate = self.rate
         if rate is not None and _MISSED / rate > _STALE_S:
             found["staleAfter"] = f"{math.ceil(_MISSED / rate)}s"
@@ -87,9 +89,13 @@ def proposals(topics: Sequence[Topic]) -> list[Proposal]:
     return found
 
 
-def detector_document(found: Sequence[Proposal], messages: Sequence[Mapping[str, str]] = ()) -> dict[str, Any]:
+def detector_document(
+    found: Sequence[Proposal], messages: Sequence[Mapping[str, str]] = (), zenoh: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """A Detector with these streams; `messages`: definitions of types that are known from the recording alone."""
     spec: dict[str, Any] = {"mode": "Standalone", "streams": [each.document() for each in found]}
+    if zenoh is not None:
+        spec = {"zenoh": zenoh, **spec}
     if messages:
         spec["messages"] = [*messages]
     return {"apiVersion": "wayside.dev/v1alpha1", "kind": "Detector", "metadata": {"name": "my-detector"}, "spec": spec}

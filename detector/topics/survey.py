@@ -14,7 +14,7 @@ from detector.replay.message import Cut
 from detector.replay.recordings import open_recordings
 from detector.streams.codecs.cbor import CborDecoder
 from detector.topics.shape import Shape
-from wayside.api.stream import Encoding
+from wayside.api.stream import Encoding, Layout
 
 _SAMPLES = 512
 """Maximum number of messages of a key that are looked at, spread evenly."""
@@ -31,6 +31,8 @@ class Topic:
     """The encoding as the recording has it."""
     type: str | None
     decode: Callable[[bytes], object] | None
+    layout: Layout = Layout.PLAIN
+    """How the key was laid out on the network."""
     count: int = 0
     gap: int = 0
     """The longest time between two messages of one recording."""

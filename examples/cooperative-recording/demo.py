@@ -32,7 +32,9 @@ from wayside.manifests import to_yaml
 HERE = Path(__file__).resolve().parent
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where detector.yaml listens."""
-WRITTEN = ("events.jsonl", "tasks.yaml", "manifests.yaml", "detector.log")
+INTAKE = "intake.mcap"
+"""What the detector took in, for the report."""
+WRITTEN = ("events.jsonl", "tasks.yaml", "manifests.yaml", "detector.log", INTAKE, "report.html")
 """What comes out, beside the folder tasks."""
 DURATION_S = 22.5
 """Of the drive: by then all have parted, and the demo is no longer than it must be."""
@@ -68,6 +70,9 @@ def main() -> int:
                     until = time.monotonic() + PATIENCE_S
         drove = drive.wait() == 0
     teller.write_manifests(output / "manifests.yaml")
+    if (ended := _report(output)) != 0:
+        console.print(f"[red]the replay for the report ended with {ended}:[/] see {output / 'detector.log'}")
+        return 1
     return _verdict(console, output, expected, teller.running, drove=drove)
 
 
@@ -95,6 +100,7 @@ def _vehicles() -> Iterator[subprocess.Popen[bytes]]:
 def _detector(output: Path) -> Iterator[subprocess.Popen[bytes]]:
     """`detector run` on the example's files; ended in good order."""
     command = ["-m", "detector.cli", "run", "--detector", "detector.yaml", "--rules", "rules.yaml"]
+    command += ["--record-intake", str(output.resolve() / INTAKE)]
     with (output / "detector.log").open("wb") as log:
         process = subprocess.Popen(
             [sys.executable, *command, "--output", str(output.resolve())], cwd=HERE, stderr=log, stdout=log
@@ -104,6 +110,13 @@ def _detector(output: Path) -> Iterator[subprocess.Popen[bytes]]:
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(PATIENCE_S)
+
+
+def _report(output: Path) -> int:
+    """Replay what the detector took in, for a report. The replay gives the same events and tasks."""
+    command = ["-m", "detector.cli", "replay", INTAKE, "--output", ".", "--results", "report"]
+    with (output / "detector.log").open("ab") as log:
+        return subprocess.run([sys.executable, *command], cwd=output, stderr=log, stdout=log, check=False).returncode
 
 
 @contextmanager
@@ -210,6 +223,7 @@ def _verdict(console: Console, output: Path, expected: list[str], running: list[
         f" {len(running) or 'No'} application{'s' if len(running) > 1 else ''} would still run.[/]"
     )
     console.print(f"See {output}/events.jsonl, {output}/tasks.yaml, {output}/manifests.yaml (and detector.log).")
+    console.print(f"Open {output}/report.html in a browser to see what happened, and why.")
     if found != expected or running or not drove:
         console.print(f"[red]Not as expected:[/] detected {found}, expected {expected}, still running {running}")
         return 1

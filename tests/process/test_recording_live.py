@@ -17,6 +17,7 @@ import zenoh
 from detector.engine.samples.sample import Arrival
 from detector.replay.intake_file import read_intake
 from detector.streams.codecs.cdr import CdrDecoder
+from tests import programs
 from tests.driving import a_rule, a_stream
 from tests.mongodb.way import Way
 from tests.process.database_desk import wait_until
@@ -210,6 +211,21 @@ def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_th
         assert sorted(in_the_database) == sorted(as_stored(each) for each in window)
         compared += len(window)
     assert compared > 6 * 100
+    assert clips_of(process) == {bag.name: contents(bag) for bag in bags}
+
+
+def contents(recording: Path) -> tuple[Any, list[Recorded]]:
+    """What a recording says of itself, and its messages."""
+    told = json.loads((recording / "recording.json").read_text())
+    return told, sorted(each for file in mcap_files(recording) for each in read_with_mcap(file))
+
+
+def clips_of(process: Process) -> dict[str, tuple[Any, list[Recorded]]]:
+    """What a replay cuts from the intake that the detector recorded."""
+    command = ["detector", "replay", "intake", "--output", "replayed", "--record"]
+    replay = programs.Program(command, process.folder / "replay.log", folder=process.folder)
+    assert replay.wait(PATIENCE) == 0, (process.folder / "replay.log").read_text()
+    return {clip.name: contents(clip) for clip in process.folder.glob("replayed/clips/*/*")}
 
 
 def test_a_killed_detector_leaves_what_it_wrote_and_goes_on_in_another_recording(process: Process) -> None:

@@ -62,6 +62,8 @@ class FleetBlock:
         self.times = block.times
         self.of_clients = block
         self.members = members
+        self.verdicts: list[Mapping[str, Verdict]] = []
+        """By track and field, where conditions are true and false; shape (ticks,)."""
 
     def variables(self, track: Track, point: int) -> dict[str, Any]:
         """What expressions see at a tick, as in `scopes`."""
@@ -175,6 +177,7 @@ class FleetGroup:
         codes = np.empty((len(self.tracks), 1, count), np.uint8)
         for row, conditions in enumerate(self._of):
             verdicts = {field: self._verdict(fleet, row, field, inner, outer) for field in conditions}
+            fleet.verdicts.append(verdicts)
             when = verdicts["when"]
             codes[row, 0] = observed(when, verdicts.get("until", Verdict(when.false, when.true)))
         return codes

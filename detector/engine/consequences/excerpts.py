@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import NamedTuple
 
 from detector.engine.buffering.buffer import Buffer, Lane
@@ -31,6 +32,9 @@ class EpisodeSample(NamedTuple):
     """Nanoseconds since the epoch; the stamp as well with clock Data."""
     payload: bytes
     """As it came, undecoded."""
+
+
+_TIME = attrgetter("time")
 
 
 @dataclass(slots=True, eq=False)
@@ -58,7 +62,7 @@ class Excerpt:
         return self.clients is None or lane.client in self.clients
 
     def take(self, now: int) -> list[EpisodeSample]:
-        """What time has reached, in the order in which it came; what lies outside of the window is forgotten."""
+        """What time has reached, in order of time; what lies outside of the window is forgotten."""
         reached = now if self.until is None else min(now, self.until)
         taken: list[EpisodeSample] = []
         waiting: list[tuple[Lane, Sample]] = []
@@ -70,6 +74,7 @@ class Excerpt:
             elif time > self.begin or lane.latched:
                 taken.append(EpisodeSample(lane.client, lane.stream, sample.key, time, sample.received, sample.payload))
         self.waiting = waiting
+        taken.sort(key=_TIME)
         return taken
 
 

@@ -16,6 +16,7 @@ from detector.replay.comparing import compare
 from tests import onnx_models
 from tests.driving import START, a_detector, a_rule, at
 from wayside.commandline import run
+from wayside.inputerror import InputError
 
 
 def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car") -> list[Event]:
@@ -49,7 +50,6 @@ def test_episodes_that_overlap_are_the_same_and_their_times_are_compared() -> No
     assert [span.start for span in comparison.only_first] == [at(20)]
     assert [span.start for span in comparison.only_second] == [at(40)]
     assert comparison.agreement == (9 + 10) / (12 + 10 + 5 + 11)
-    assert next(comparison.lines()) == "a and b: 2 episodes in both, 1 only in a, 1 only in b"
 
 
 def test_one_that_is_open_ends_with_the_recording_and_has_no_end_to_compare() -> None:
@@ -104,9 +104,14 @@ def test_a_learning_based_and_a_rule_based_rule_over_one_recording(
     (tmp_path / "drive.jsonl").write_text("\n".join(lines))
     files = ["--detector", str(tmp_path / "detector.yaml"), "--rules", str(tmp_path / "rules.yaml")]
     command = ["replay", str(tmp_path / "drive.jsonl"), *files, "--output", str(tmp_path / "out")]
-    assert run(cli.app, "detector", (), [*command, "--compare", "threshold", "learned"]) == 0
-    assert "1 episode in both, 1 only in threshold, 0 only in learned" in capsys.readouterr().err
-    comparison = json.loads((tmp_path / "out" / "comparison.json").read_text())
-    assert [each["startDifference"] for each in comparison["both"]] == [2.0]
-    assert run(cli.app, "detector", (), [*command, "--compare", "threshold", "lerned"]) == 2
-    assert "--compare lerned: there is no such rule; there are learned, threshold" in capsys.readouterr().err
+    assert run(cli.app, "detector", (InputError,), [*command, "--set", "threshold=learned"]) == 0
+    table = [line.split() for line in capsys.readouterr().err.splitlines()]
+    assert ["threshold", "as", "written", "2"] in table
+    assert ["rule", "learned", "1", "1", "+0", "-1", "+2.00", "s"] in [line[:8] for line in table]
+    (compared,) = json.loads((tmp_path / "out" / "variants.json").read_text())
+    assert (compared["rule"], compared["variant"]) == ("threshold", "rule learned")
+    assert [each["startDifference"] for each in compared["both"]] == [2.0]
+    events = (tmp_path / "out" / "events.jsonl").read_text()
+    assert {json.loads(line)["data"]["rule"] for line in events.splitlines()} == {"threshold", "learned"}
+    assert run(cli.app, "detector", (InputError,), [*command, "--set", "threshold=lerned"]) == 2
+    assert "--set threshold=lerned: there is no rule lerned; did you mean learned?" in capsys.readouterr().err

@@ -18,9 +18,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from detector.commands.replay import replay_files
 from detector.engine.timing.timeline import ORDER
 from detector.replay.intake_writer import IntakeWriter
-from detector.results import writing
+from detector.results import installed
+from detector.results.channels import path_of
 from detector.results.episodes import TIMES
-from detector.results.foxglove_file import path_of
 from detector.results.kinds import Kind, chosen
 from tests.unit.results.drives import SECOND, START, arrivals, documents, write
 from wayside.times import format_time, parse_time
@@ -62,7 +62,7 @@ def table_of(path: Path) -> list[dict[str, Any]]:
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     folder = tmp_path_factory.mktemp("results")
     recording, detector, rules = write(folder)
-    replay_files([recording], folder / "out", detector, [rules], None, as_one=False, kinds=ALL)
+    replay_files([recording], folder / "out", detector, [rules], as_one=False, kinds=ALL)
     messages: dict[str, list[tuple[int, Any]]] = {}
     schemas = {}
     with (folder / "out/results.mcap").open("rb") as file:
@@ -226,11 +226,11 @@ def test_the_report_has_the_rules_the_data_and_what_actions_would_have_done(resu
 
 def test_results_change_neither_events_nor_tasks_and_are_the_same_each_time(tmp_path: Path, results: Results) -> None:
     recording, detector, rules = (results.folder / name for name in ("drive.jsonl", "detector.yaml", "rules.yaml"))
-    replay_files([recording], tmp_path / "plain", detector, [rules], None, as_one=False)
+    replay_files([recording], tmp_path / "plain", detector, [rules], as_one=False)
     assert sorted(path.name for path in (tmp_path / "plain").iterdir()) == ["events.jsonl", "tasks.yaml"]
     for name in ("events.jsonl", "tasks.yaml"):
         assert (tmp_path / "plain" / name).read_bytes() == (results.folder / "out" / name).read_bytes()
-    replay_files([recording], tmp_path / "again", detector, [rules], None, as_one=False, kinds=ALL)
+    replay_files([recording], tmp_path / "again", detector, [rules], as_one=False, kinds=ALL)
     for path in (tmp_path / "again").iterdir():
         assert path.read_bytes() == (results.folder / "out" / path.name).read_bytes(), path.name
 
@@ -239,7 +239,7 @@ def test_each_of_several_recordings_has_files_of_its_own(tmp_path: Path) -> None
     recording, detector, rules = write(tmp_path)
     other = tmp_path / "other.jsonl"
     other.write_bytes(recording.read_bytes())
-    replay_files([recording, other], tmp_path / "out", detector, [rules], None, as_one=False, kinds=ALL)
+    replay_files([recording, other], tmp_path / "out", detector, [rules], as_one=False, kinds=ALL)
     assert {"report-1.html", "report-2.html", "results-1.mcap", "results-2.mcap"} <= {
         path.name for path in (tmp_path / "out").iterdir()
     }
@@ -249,9 +249,9 @@ def test_each_of_several_recordings_has_files_of_its_own(tmp_path: Path) -> None
 
 def test_a_missing_package_is_named_before_the_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording, detector, rules = write(tmp_path)
-    monkeypatch.setattr(writing, "find_spec", lambda name: None)
-    with pytest.raises(writing.MissingExtraError, match=r"mcap needs foxglove: pip install 'wayside\[results\]'"):
-        replay_files([recording], tmp_path / "out", detector, [rules], None, as_one=False, kinds=frozenset({Kind.MCAP}))
+    monkeypatch.setattr(installed, "find_spec", lambda name: None)
+    with pytest.raises(installed.MissingExtraError, match=r"mcap needs foxglove: pip install 'wayside\[results\]'"):
+        replay_files([recording], tmp_path / "out", detector, [rules], as_one=False, kinds=frozenset({Kind.MCAP}))
     assert not (tmp_path / "out").exists()
 
 
@@ -277,7 +277,7 @@ def test_an_intake_file_whose_rules_change_on_the_way_has_results_too(tmp_path: 
     end = samples[-1].received
     writer.control(end, {"kind": "end", "until": end, "finished": True})
     writer.close()
-    replay_files([tmp_path / "intake.mcap"], tmp_path / "out", None, [], None, as_one=False, kinds=ALL)
+    replay_files([tmp_path / "intake.mcap"], tmp_path / "out", None, [], as_one=False, kinds=ALL)
     rows = table_of(tmp_path / "out/episodes.parquet")
     assert {row["reason"] for row in rows} >= {"RuleChanged", "Until"}
     later = [row for row in rows if row["rule"] == "too-fast" and row["start_time"] > middle]

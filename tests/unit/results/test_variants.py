@@ -23,17 +23,15 @@ def test_a_sweep_plays_all_values_in_one_pass_as_if_each_were_written(
 ) -> None:
     recording, detector, rules = write(tmp_path)
     plain, swept = tmp_path / "plain", tmp_path / "swept"
-    replay_files([recording], plain, detector, [rules], None, as_one=False)
-    replay_files(
-        [recording], swept, detector, [rules], None, as_one=False, sweeps=["too-fast.parameters.limit=19:23:2"]
-    )
+    replay_files([recording], plain, detector, [rules], as_one=False)
+    replay_files([recording], swept, detector, [rules], as_one=False, sweeps=["too-fast.parameters.limit=19:23:2"])
     for name in ("events.jsonl", "tasks.yaml"):
         assert (swept / name).read_bytes() == (plain / name).read_bytes()
     found = json.loads((swept / "variants.json").read_text())
     assert [each["variant"] for each in found] == [f"parameters.limit={limit}" for limit in (19, 21, 23)]
     for each, limit in zip(found, (19, 21, 23), strict=True):
         rules.write_text(rules.read_text().replace("limit: 21", f"limit: {limit}"))
-        replay_files([recording], tmp_path / str(limit), detector, [rules], None, as_one=False)
+        replay_files([recording], tmp_path / str(limit), detector, [rules], as_one=False)
         rules.write_text(rules.read_text().replace(f"limit: {limit}", "limit: 21"))
         own = sorted(each["onlySecond"], key=str) + [pair["second"] for pair in each["both"]]
         assert sorted(span["startTime"] for span in own) == sorted(started(tmp_path / str(limit), "too-fast"))

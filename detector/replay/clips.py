@@ -1,0 +1,90 @@
+"""Clips: what the record actions of rules cut from a recording, as they would have done live.
+
+Only `record` runs. Other actions reach databases, systems and people, which a replay must leave alone.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from detector.actions.base import ActionError, Surroundings
+from detector.actions.host import ActionHost
+from detector.actions.record.destination import finished
+from detector.engine.consequences.consequences import Consequence
+from wayside.api import Detector, EventRule
+from wayside.api.recordings import Recordings
+
+RECORD = "record"
+_GRACE = 3600.0
+"""Seconds: a slow disk has time to complete the clips."""
+
+
+class Clips:
+    """The folder of all clips of one replay. Its limits are those of the Detector's `recordings`."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises OSError where clips of an earlier replay cannot be removed."""
+        self.folder = folder
+        for each in [*finished(folder)]:
+            shutil.rmtree(each.path)
+
+    def placed(self, detector: Detector) -> Detector:
+        """The Detector with its recordings in this folder; it need not have any."""
+        path = str(self.folder)
+        limits = detector.spec.recordings
+        recordings = (limits or Recordings(path=path)).model_copy(update={"path": path, "age": None})
+        return detector.model_copy(update={"spec": detector.spec.model_copy(update={"recordings": recordings})})
+
+    def recorders(self, holder: str) -> Recorders:
+        """The actions of one replay."""
+        return Recorders(holder)
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return sum(1 for _ in finished(self.folder))
+
+
+class Recorders:
+    """The record actions of the rules of one replay. They are never too slow: the replay waits for them."""
+
+    def __init__(self, holder: str) -> None:
+        self._host = ActionHost(holder, _Nobody(), patient=True)
+
+    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+        """The rules are these from now on."""
+        self._host.follow([_recording(rule) for rule in rules], surroundings)
+
+    def tell(self, consequences: Sequence[Consequence]) -> None:
+        """Pass on what happened, in order."""
+        self._host.tell(consequences)
+
+    def close(self) -> Iterator[str]:
+        """Complete all clips. Gives a line for each action that failed or lost something."""
+        self._host.close(_GRACE)
+        for which, tally in self._host.outcomes.tallies().items():
+            if tally.failed:
+                of = f"{tally.failed} of {tally.done + tally.failed} clips"
+                yield f"{of} of action {which.action}, EventRule {which.rule}, are not whole: {tally.last_failure}"
+        for lost in self._host.outcomes.lost():
+            where = f"action {lost.which.action}, EventRule {lost.which.rule}"
+            yield f"{lost.count} {lost.what} ({where}): {lost.last}"
+
+
+class _Nobody:
+    """Follow-ups of a replay are for nobody."""
+
+    def publish(self, key: str, payload: bytes, encoding: str) -> None:
+        """See `Messenger`."""
+
+    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+        """See `Messenger`."""
+        raise ActionError("a replay has no Zenoh session")
+
+
+def _recording(rule: EventRule) -> EventRule:
+    """The rule with its record actions alone."""
+    actions = [action for action in rule.spec.actions if action.field == RECORD]
+    return rule.model_copy(update={"spec": rule.spec.model_copy(update={"actions": actions})})

@@ -1,0 +1,17 @@
+"""Whether the packages of the extra `results` are installed."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from wayside.inputerror import InputError
+
+
+class MissingExtraError(InputError, RuntimeError):
+    """A result needs a package that is not installed."""
+
+
+def check_package(package: str, option: str) -> None:
+    """Raises MissingExtraError where the package is missing that the option needs."""
+    if find_spec(package) is None:
+        raise MissingExtraError(f"{option} needs {package}: pip install 'wayside[results]'")

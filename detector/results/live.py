@@ -1,0 +1,292 @@
+"""The live view: what a detector evaluates now, over Foxglove's WebSocket protocol.
+
+    evaluation ─▶ a tracer for each half second ─▶ queue ─▶ thread: messages ─▶ server ─▶ clients
+
+The evaluation only hands tracers over. A subject's messages are made where somebody has subscribed to its channel.
+While nobody has, the view looks for new subjects from time to time.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import foxglove
+import msgspec
+from foxglove.channels import LogChannel, SceneUpdateChannel
+from foxglove.websocket import ChannelView, Client, ServerListener
+
+from detector.engine.columns.block import Block, Track
+from detector.engine.columns.fleets import FleetBlock
+from detector.engine.columns.pairs import PairBlock
+from detector.engine.columns.table import Truths
+from detector.engine.columns.verdicts import Codes
+from detector.engine.engine import Engine
+from detector.engine.episodes.events import Event
+from detector.engine.evaluation import Evaluated
+from detector.losses import Loss
+from detector.results.channels import (
+    EPISODE,
+    EPISODES,
+    LOG,
+    SCENE,
+    episode_message,
+    log_message,
+    subject_channel,
+    topic_of,
+)
+from detector.results.result import Result
+from detector.results.scene import Scene
+from detector.results.thresholds import terms_of
+from detector.results.tracing import Tracer
+from wayside.inputerror import InputError
+from wayside.rules import CompiledRule
+
+_log = logging.getLogger(__name__)
+
+_SLICE = 500_000_000
+"""Nanoseconds of evaluation that are handed over at a time."""
+_SURVEY = 5_000_000_000
+"""Nanoseconds between two looks for new subjects while nobody has subscribed."""
+_WAITING = 8
+"""Maximum number of slices that wait for the view's thread."""
+_NEW = 50
+"""Maximum number of channels that are opened with one slice."""
+_MOST = 1000
+"""Maximum number of channels of subjects."""
+_BACKLOG = 16384
+"""Maximum number of messages that wait for a client; then the oldest is dropped."""
+_ALL = 1 << 20
+"""Nothing is thinned."""
+
+
+class ViewError(InputError, OSError):
+    """The view cannot be served."""
+
+
+class _Slice(NamedTuple):
+    """What was evaluated in half a second."""
+
+    tracer: Tracer
+    rules: Mapping[str, CompiledRule]
+    events: Sequence[Event]
+
+
+class _Open(NamedTuple):
+    """The channel of a subject."""
+
+    rule: str
+    digest: str
+    schema: dict[str, Any]
+    channel: foxglove.Channel
+
+
+class LiveView:
+    """Serves the channels. `attend`, `looked` and the observer's methods belong to the evaluation's thread."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """Raises ViewError where the address is not free."""
+        self._context = foxglove.Context()
+        self._subscriptions = _Subscriptions()
+        try:
+            self._server = foxglove.start_server(
+                name="Wayside",
+                host=host,
+                port=port,
+                context=self._context,
+                server_listener=self._subscriptions,
+                message_backlog_size=_BACKLOG,
+            )
+        except Exception as error:
+            raise ViewError(f"--foxglove: {host}:{port} cannot be served ({error}): give another port") from error
+        self._tracer: Tracer | None = None
+        self._since = 0
+        """When the tracer began, or the last one ended."""
+        self._events: list[Event] = []
+        self._dropped = 0
+        self._slices: queue.Queue[_Slice | None] = queue.Queue(_WAITING)
+        self._channels: dict[str, _Open] = {}
+        self._full = False
+        self._scene = Scene()
+        self._episodes = foxglove.Channel(EPISODES, schema=EPISODE, message_encoding="json", context=self._context)
+        self._log_lines = LogChannel(LOG, context=self._context)
+        self._scenes = SceneUpdateChannel(SCENE, context=self._context)
+        self._thread = threading.Thread(target=self._serve, name="live view", daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """Where it is served."""
+        return self._server.port
+
+    def close(self) -> None:
+        """End; clients are disconnected."""
+        self._slices.put(None)
+        self._thread.join()
+        self._server.stop()
+
+    def losses(self) -> Iterator[Loss]:
+        """What was not shown."""
+        what = "half seconds left out of the live view, its thread being too slow"
+        yield Loss(what, self._dropped, cause="view_dropped")
+
+    # The evaluation
+
+    def attend(self, engine: Engine) -> None:
+        """The engine has other rules from now on."""
+        for name, run in engine.rules.items():
+            if name not in engine.in_columns:
+                run.witness = self._witness(run.rule)
+
+    def looked(self, engine: Engine, events: Sequence[Event]) -> None:
+        """The engine has taken in what came, and these events happened."""
+        self._events += events
+        if self._tracer is None:
+            if self._subscriptions.topics or engine.now - self._since >= _SURVEY:
+                self._tracer, self._since = Tracer(), engine.now
+        elif engine.now - self._since >= _SLICE:
+            self._hand_over(self._tracer, engine)
+            self._tracer = Tracer() if self._subscriptions.topics else None
+            self._since = engine.now
+
+    def _hand_over(self, tracer: Tracer, engine: Engine) -> None:
+        tracer.settle()
+        rules = {name: run.rule for name, run in engine.rules.items()}
+        try:
+            self._slices.put_nowait(_Slice(tracer, rules, self._events))
+        except queue.Full:
+            self._dropped += 1  # its events come with the next
+        else:
+            self._events = []
+
+    def _witness(self, rule: CompiledRule) -> Any:
+        def saw(evaluated: Evaluated) -> None:
+            if self._tracer is not None:
+                self._tracer.witnessed(rule).saw(evaluated)
+
+        return saw
+
+    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
+        """See `Observer`."""
+        if self._tracer is not None:
+            self._tracer.clients(tracks, block, codes, looked)
+
+    def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
+        """See `Observer`."""
+        if self._tracer is not None:
+            self._tracer.fleet(tracks, block)
+
+    def pairs(self, track: Track, these: PairBlock) -> None:
+        """See `Observer`."""
+        if self._tracer is not None:
+            self._tracer.pairs(track, these)
+
+    # The view's thread
+
+    def _serve(self) -> None:
+        while (each := self._slices.get()) is not None:
+            try:
+                self._show(each)
+            except Exception:  # noqa: BLE001  an error here must cost the view alone
+                _log.exception("half a second is left out of the live view")
+                self._dropped += 1
+
+    def _show(self, shown: _Slice) -> None:
+        topics = self._subscriptions.topics
+        self._forget(shown.rules)
+        result = self._result(shown, topics)
+        for subject in result.trace.subjects:
+            schema, messages = subject_channel(result, subject, _ALL)
+            topic = topic_of(subject.rule, subject.subject)
+            channel = self._channel(topic, result.rules[subject.rule], schema)
+            if topic in topics:
+                for time, payload in messages:
+                    channel.log(payload, log_time=time)
+        for event in shown.events:
+            time = event.start_time if event.end_time is None else event.end_time
+            self._episodes.log(msgspec.json.encode(episode_message(event)), log_time=time)
+            self._log_lines.log(log_message(event, time), log_time=time)
+        if SCENE in topics:
+            for time, update in self._scene.updates(result):
+                self._scenes.log(update, log_time=time)
+        else:
+            self._scene.skip(result)
+
+    def _result(self, shown: _Slice, topics: frozenset[str]) -> Result:
+        """The slice, with the subjects that somebody has subscribed to, and some that have no channel yet."""
+        new: set[str] = set()
+
+        def wanted(rule: str, subject: str) -> bool:
+            topic = topic_of(rule, subject)
+            if topic in self._channels:
+                return topic in topics
+            if topic not in new and len(new) < min(_NEW, _MOST - len(self._channels)):
+                new.add(topic)
+            return topic in new
+
+        trace = shown.tracer.trace(wanted)
+        trace.subjects = [each for each in trace.subjects if each.rule in shown.rules]
+        if len(self._channels) >= _MOST and not self._full:
+            self._full = True
+            _log.warning("the live view has %d channels: further subjects have none", _MOST)
+        rules = shown.rules
+        terms = {(each.rule, each.subject): terms_of(rules[each.rule], each) for each in trace.subjects}
+        return Result("live", trace, shown.events, (), rules, {}, terms, (), {}, (), 0)
+
+    def _channel(self, topic: str, rule: CompiledRule, schema: dict[str, Any]) -> foxglove.Channel:
+        """The subject's channel; it is opened again where there is more to declare."""
+        known = self._channels.get(topic)
+        if known is not None:
+            schema = {**schema, "properties": _merged(known.schema["properties"], schema["properties"])}
+            if schema == known.schema:
+                return known.channel
+            known.channel.close()
+        channel = foxglove.Channel(topic, schema=schema, message_encoding="json", context=self._context)
+        self._channels[topic] = _Open(rule.name, rule.digest, schema, channel)
+        return channel
+
+    def _forget(self, rules: Mapping[str, CompiledRule]) -> None:
+        """Close the channels of rules that are gone or changed."""
+        digests = {name: rule.digest for name, rule in rules.items()}
+        for topic, known in [*self._channels.items()]:
+            if digests.get(known.rule) != known.digest:
+                known.channel.close()
+                del self._channels[topic]
+
+
+class _Subscriptions(ServerListener):
+    """Knows the topics that clients have subscribed to. Called on the server's threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self.topics: frozenset[str] = frozenset()
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """See `ServerListener`."""
+        self._count(channel.topic, 1)
+
+    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
+        """See `ServerListener`."""
+        self._count(channel.topic, -1)
+
+    def _count(self, topic: str, change: int) -> None:
+        with self._lock:
+            self._counts[topic] += change
+            self.topics = frozenset(name for name, count in self._counts.items() if count > 0)
+
+
+def _merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """The properties of two schemas of one channel: a value that was unknown is declared as a number."""
+    found = dict(new)
+    for name, kind in old.items():
+        other = found.get(name)
+        if other is None or other == {"type": "number"}:
+            found[name] = kind
+        elif "properties" in kind and "properties" in other:
+            found[name] = {**kind, "properties": _merged(kind["properties"], other["properties"])}
+    return found
