@@ -21,7 +21,7 @@ from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.evaluation import Answer
+from detector.engine.evaluation import OnDemandResult
 from detector.engine.observing import Observer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
@@ -179,7 +179,7 @@ class Evaluator:
             self._wake.notify()
         return future
 
-    def ask(self, rule: str) -> Future[list[Answer]]:
+    def ask(self, rule: str) -> Future[list[OnDemandResult]]:
         """Evaluate a rule with onDemand now; thread-safe. Gives what it says of each subject, or NoAnswerError."""
         return self.call(lambda: self._ask(rule))
 
@@ -269,7 +269,7 @@ class Evaluator:
             events += self._configure(wanted)
         self._hand_over(events)
 
-    def _ask(self, rule: str) -> list[Answer]:
+    def _ask(self, rule: str) -> list[OnDemandResult]:
         events, answers = self._engine.evaluate_now(rule)
         self._record(self._engine.now, {"kind": "ask", "rule": rule})
         self._hand_over(events)

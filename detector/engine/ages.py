@@ -16,7 +16,7 @@ _MANY, _SHARE = 10, 0.1
 """Uses of old samples are reported from this number and share on; a client that leaves always gives a few."""
 
 
-class Lane(Protocol):
+class AgedLane(Protocol):
     """The samples of one client on one stream, in order of time."""
 
     @property
@@ -76,7 +76,7 @@ class Ages:
     def __init__(self) -> None:
         self.uses: dict[str, Use] = {}
 
-    def used(self, lane: Lane, now: int) -> None:
+    def used(self, lane: AgedLane, now: int) -> None:
         """A value was computed of the lane's newest sample and those before it, at the tick `now` (ns)."""
         use = self.uses.setdefault(lane.stream, Use())
         use.ages[_rounded(now - lane.latest)] += 1

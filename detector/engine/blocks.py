@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 
 from detector.engine.columns.block import Context
 from detector.engine.columns.fleets import FleetGroup, fits_fleet
-from detector.engine.columns.group import Group, fit_signals, fits, signals_of
+from detector.engine.columns.group import ClientGroup, fit_signals, fits_clients, signals_of
 from detector.engine.columns.pairs import fits_pairs
 from detector.engine.evaluation import RuleRun
 from detector.engine.groups import RuleGroup
@@ -51,7 +51,7 @@ class Blocks:
         """These rules are evaluated from now on; `thinning`: one in this number of a rule's evaluations takes place."""
         orders = {name: order for order, name in enumerate(runs)}
         depths: dict[str, int] = {}
-        together: dict[tuple[int, type[Group | FleetGroup], int, int], list[RuleRun]] = {}
+        together: dict[tuple[int, type[ClientGroup | FleetGroup], int, int], list[RuleRun]] = {}
         by_stream: dict[str, list[RuleRun]] = {}
         pairs: list[tuple[int, RuleRun, int]] = []
         for run in runs.values():
@@ -62,13 +62,13 @@ class Blocks:
             if depth is None:
                 continue
             if every is None:
-                if rule.on_sample is not None and fits(rule) and not depth:
+                if rule.on_sample is not None and fits_clients(rule) and not depth:
                     by_stream.setdefault(rule.on_sample, []).append(run)
                 continue
             if fits_pairs(rule, self._context):
                 pairs.append((depth, run, every))
-            elif fits(rule) or fits_fleet(rule):
-                columns = Group if fits(rule) else FleetGroup
+            elif fits_clients(rule) or fits_fleet(rule):
+                columns = ClientGroup if fits_clients(rule) else FleetGroup
                 together.setdefault((depth, columns, every, every * thinning(run)), []).append(run)
             else:
                 continue

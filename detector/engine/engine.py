@@ -17,7 +17,7 @@ from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
-from detector.engine.evaluation import Answer, RuleRun, same_semantics
+from detector.engine.evaluation import OnDemandResult, RuleRun, same_semantics
 from detector.engine.executor import Executor
 from detector.engine.knowledge import Knowledge
 from detector.engine.observing import Instruments
@@ -224,7 +224,7 @@ class Engine:
         self.schedule.set_level(level)
         self._executor.plan()
 
-    def evaluate_now(self, name: str) -> tuple[list[Event], list[Answer]]:
+    def evaluate_now(self, name: str) -> tuple[list[Event], list[OnDemandResult]]:
         """Evaluate a rule with `onDemand` now: after the last tick, with what was taken in since up to `now`.
 
         Returns what started and ended, and the result for each subject.

@@ -40,7 +40,7 @@ class Evaluated(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class OnDemandResult:
     """The result of a rule with `onDemand` for one subject."""
 
     subject: str
@@ -54,7 +54,7 @@ class Answer:
     """When it started; nanoseconds since the epoch."""
 
 
-class Change(NamedTuple):
+class DemandChange(NamedTuple):
     """A demand began or changed (end None), or ended; nanoseconds since the epoch."""
 
     time: int
@@ -82,12 +82,12 @@ class RuleRun:
         self._muted: set[Subject] = set()
         """Subjects in an episode beyond the budget: it goes on, without events."""
         self._budget = Budget()
-        self._answers: list[Answer] | None = None
+        self._answers: list[OnDemandResult] | None = None
         self.looked_at: list[Subject] = []
         """The subjects of the last evaluation."""
         self.disturbed = True
         """Whether states changed otherwise than by `run`, so that every subject has to be looked at again."""
-        self.journal: list[Change] | None = None
+        self.journal: list[DemandChange] | None = None
         """What became of demands, in order of time; None while nobody reads it."""
 
     def tick(
@@ -115,7 +115,7 @@ class RuleRun:
 
     def answer(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals
-    ) -> tuple[list[Event], list[Answer]]:
+    ) -> tuple[list[Event], list[OnDemandResult]]:
         """Evaluate the rule for all subjects; returns events, and the result for each, in order of the subjects."""
         self._answers = []
         events = self.tick(now, views, clients, plugins)
@@ -335,11 +335,11 @@ class RuleRun:
             return
         for action, demand in episode.demands.items():
             if end is not None or demand != before.get(action):
-                self.journal.append(Change(now, demand, end))
+                self.journal.append(DemandChange(now, demand, end))
 
-    def _answer(self, candidate: Candidate, when: Truth) -> Answer:
+    def _answer(self, candidate: Candidate, when: Truth) -> OnDemandResult:
         episode = self._open.get(candidate.subject)
-        return Answer(
+        return OnDemandResult(
             candidate.subject.text,
             None if isinstance(when, Unknown) else when,
             snapshot(self.rule, candidate),

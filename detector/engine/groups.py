@@ -10,7 +10,7 @@ import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.fleets import FleetBlock, FleetGroup
-from detector.engine.columns.group import Group
+from detector.engine.columns.group import ClientGroup
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes
 from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
@@ -23,7 +23,7 @@ from detector.engine.timing.schedule import Only
 from wayside.rules import ClientSubject
 
 
-class Changes(NamedTuple):
+class SubjectChanges(NamedTuple):
     """When a subject has to be looked at, by the block's ticks, and its observations then."""
 
     row: int
@@ -44,7 +44,7 @@ class RuleGroup:
         context: Context,
         every: int,
         period: int,
-        columns: type[Group | FleetGroup] = Group,
+        columns: type[ClientGroup | FleetGroup] = ClientGroup,
     ) -> None:
         """`every` is the rules' period, `period` that at which they are evaluated: longer where some are left out."""
         self.every = every
@@ -139,7 +139,7 @@ class RuleGroup:
         for run in self.runs:
             run.disturbed = False
 
-    def _changed(self, block: Block | FleetBlock, codes: Codes, looked: Truths | None) -> Iterator[Changes]:
+    def _changed(self, block: Block | FleetBlock, codes: Codes, looked: Truths | None) -> Iterator[SubjectChanges]:
         """Of each subject, where it matters, the ticks at which the observation changes or something is due."""
         numbers, last = block.numbers, int(block.times[-1])
         changed = np.empty(codes.shape, bool)
@@ -172,10 +172,10 @@ class RuleGroup:
         seen: list[int] = codes.ravel()[flat].tolist()
         tracks, subjects = (each.tolist() for each in np.divmod(which[bounds[:-1]], len(block.clients)))
         for row, at, (begin, end) in zip(tracks, subjects, itertools.pairwise(bounds), strict=True):
-            yield Changes(row, at, ticks[begin:end], seen[begin:end])
+            yield SubjectChanges(row, at, ticks[begin:end], seen[begin:end])
 
     def _step(
-        self, block: Block | FleetBlock, changes: Changes, number: int, states: list[tuple[int, int, bool, int]]
+        self, block: Block | FleetBlock, changes: SubjectChanges, number: int, states: list[tuple[int, int, bool, int]]
     ) -> list[Happened]:
         """Bring one subject's state forward over all ticks of the block; adds whether it has one, and when to look."""
         row, at = changes.row, changes.at

@@ -11,7 +11,7 @@ from detector.engine.columns.fleets import FleetBlock
 from detector.engine.columns.pairs import PairBlock
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Codes
-from detector.engine.evaluation import Change
+from detector.engine.evaluation import DemandChange
 
 
 class Observer(Protocol):
@@ -36,6 +36,6 @@ class Instruments:
 
     stopwatch: Callable[[], int] = int
     """Returns nanoseconds of any clock that runs; the counters use it."""
-    journal: list[Change] | None = None
+    journal: list[DemandChange] | None = None
     """What became of demands, in order."""
     observer: Observer | None = None

@@ -30,7 +30,7 @@ _REMEMBERED = 100_000
 """Maximum number of clients whose last result of CEL is cached."""
 
 
-class Condition(NamedTuple):
+class ClientCondition(NamedTuple):
     """One of a rule's conditions, for one element."""
 
     field: str
@@ -57,17 +57,17 @@ class Conditions:
         self._chosen = chosen
         self._leaves = ClientLeaves(context, tracks)
         self._graph = Graph()
-        self._of: list[dict[str, Condition]] = [self._conditions(track) for track in tracks]
+        self._of: list[dict[str, ClientCondition]] = [self._conditions(track) for track in tracks]
         """By track and field."""
         roots = [each.node for conditions in self._of for each in conditions.values() if each.node is not None]
         self._program = Program(self._graph, roots, context.tables.texts)
         self._cache: dict[tuple[int, str], dict[str, tuple[Hashable, int, tuple[Reason, str] | None]]] = {}
 
-    def _conditions(self, track: Track) -> dict[str, Condition]:
-        found = dict[str, Condition]()
+    def _conditions(self, track: Track) -> dict[str, ClientCondition]:
+        found = dict[str, ClientCondition]()
         for field, expression in self._chosen(track.rule).items():
             node = self._graph.add(expression, lambda path: self._leaves.leaf(track, path))
-            found[field] = Condition(
+            found[field] = ClientCondition(
                 field,
                 expression,
                 None if node is None else self._graph.truth(node),
@@ -116,7 +116,7 @@ class Conditions:
 
     # CEL
 
-    def _ask_cel(self, block: Block, row: int, condition: Condition, true: Truths, false: Truths) -> None:
+    def _ask_cel(self, block: Block, row: int, condition: ClientCondition, true: Truths, false: Truths) -> None:
         """Evaluate a condition by CEL, at the points where anything changes that it reads."""
         count = len(block.ticks)
         changed = np.zeros(block.shape, bool)
@@ -144,7 +144,14 @@ class Conditions:
             self._ask_point(block, row, condition, point, true, false, end - point)
 
     def _ask_point(
-        self, block: Block, row: int, condition: Condition, point: int, true: Truths, false: Truths, times: int = 1
+        self,
+        block: Block,
+        row: int,
+        condition: ClientCondition,
+        point: int,
+        true: Truths,
+        false: Truths,
+        times: int = 1,
     ) -> None:
         """Evaluate a condition by CEL at a point, and take the result for `times` points from there on."""
         track, client = self._tracks[row], block.clients[point // len(block.ticks)]
@@ -163,7 +170,7 @@ class Conditions:
         if note is not None:
             self._note(block, row, condition, point, note, times)
 
-    def _inputs(self, block: Block, condition: Condition, point: int) -> Hashable | None:
+    def _inputs(self, block: Block, condition: ClientCondition, point: int) -> Hashable | None:
         """A key that differs whenever the inputs of a condition do; None: evaluate it each time."""
         inputs: list[Hashable] = []
         for at in condition.signals:
@@ -178,7 +185,7 @@ class Conditions:
         return tuple(inputs)
 
     def _note_unknown(
-        self, block: Block, row: int, condition: Condition, unknown: Truths, tags: NDArray[np.uint8] | None
+        self, block: Block, row: int, condition: ClientCondition, unknown: Truths, tags: NDArray[np.uint8] | None
     ) -> None:
         """Count a condition's unknown results. Points that look alike have one reason, which CEL gives for the last."""
         own = block.points(row)
@@ -199,7 +206,7 @@ class Conditions:
                 self._note(block, row, condition, point, note, int(counts[kind]))
 
     def _note(
-        self, block: Block, row: int, condition: Condition, point: int, note: tuple[Reason, str], times: int
+        self, block: Block, row: int, condition: ClientCondition, point: int, note: tuple[Reason, str], times: int
     ) -> None:
         track, client = self._tracks[row], block.clients[point // len(block.ticks)]
         reason, message = note

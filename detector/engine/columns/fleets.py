@@ -18,7 +18,7 @@ from detector.engine.columns.conditions import Conditions
 from detector.engine.columns.group import present
 from detector.engine.columns.leaves import ClientLeaves, stacked
 from detector.engine.columns.reading import constant
-from detector.engine.columns.signals import Signals
+from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes, Verdict, observed
 from detector.engine.episodes.subjects import FLEET, Subject
@@ -39,7 +39,7 @@ def fits_fleet(rule: CompiledRule) -> bool:
     return isinstance(rule.subject, FleetSubject) and not budgeted
 
 
-class Condition(NamedTuple):
+class FleetCondition(NamedTuple):
     """One of a rule's conditions about the fleet, for one element."""
 
     expression: Expression
@@ -86,7 +86,7 @@ class FleetGroup:
         """All rules fit (see `fits_fleet`)."""
         self.tracks = tracks
         self._context = context
-        self._signals = Signals(context, tracks)
+        self._signals = SignalColumns(context, tracks)
         if any(_reads_streams(track.rule) for track in tracks):
             self._signals.watch_all_streams()
         self._leaves = ClientLeaves(context, tracks)
@@ -109,7 +109,7 @@ class FleetGroup:
         """The number of a subject among those of its rule and element: there is one."""
         return 0
 
-    def _condition(self, track: Track, field: str, expression: Expression) -> Condition:
+    def _condition(self, track: Track, field: str, expression: Expression) -> FleetCondition:
         rest, folds = folded(expression, _MEMBERS)
         of_points, of_ticks = len(self._of_points.nodes), len(self._of_ticks.nodes)
         found: dict[str, tuple[How, int | None]] = {}
@@ -119,15 +119,15 @@ class FleetGroup:
                 lowered = self._of_points.add(fold.predicate, partial(self._inside, track, fold))
                 if lowered is None:
                     self._of_points.forget(of_points)
-                    return Condition(expression, None, {})
+                    return FleetCondition(expression, None, {})
                 node = self._of_points.truth(lowered)
             found[name] = (fold.how, node)
         lowered = self._of_ticks.add(rest, partial(self._outside, track, field, found))
         if lowered is None:
             self._of_points.forget(of_points)
             self._of_ticks.forget(of_ticks)
-            return Condition(expression, None, {})
-        return Condition(expression, self._of_ticks.truth(lowered), found)
+            return FleetCondition(expression, None, {})
+        return FleetCondition(expression, self._of_ticks.truth(lowered), found)
 
     def _inside(self, track: Track, fold: Fold, path: Path) -> Hashable | Constant | None:
         """The leaf of a path in a predicate."""
@@ -219,7 +219,7 @@ class FleetGroup:
         return verdict
 
     def _strange(
-        self, fleet: FleetBlock, row: int, condition: Condition, inner: Results | None, outer: Results
+        self, fleet: FleetBlock, row: int, condition: FleetCondition, inner: Results | None, outer: Results
     ) -> Truths:
         """The ticks that the columns cannot decide."""
         assert condition.node is not None  # noqa: S101  only conditions in columns come here

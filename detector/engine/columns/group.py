@@ -9,7 +9,7 @@ import numpy as np
 from detector.engine.buffering.clients import Clients
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.conditions import Conditions
-from detector.engine.columns.signals import Signals
+from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Truths
 from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Codes, Verdict, observed
@@ -20,7 +20,7 @@ from wayside.expressions import Expression
 from wayside.rules import ClientSubject, CompiledRule, CompiledSignal
 
 
-def fits(rule: CompiledRule) -> bool:
+def fits_clients(rule: CompiledRule) -> bool:
     """Whether a rule about clients whose signals fit can be evaluated in columns."""
     budgeted = rule.maximum_per_hour is not None and len(rule.elements) > 1
     return isinstance(rule.subject, ClientSubject) and not budgeted
@@ -50,16 +50,16 @@ def signals_of(rule: CompiledRule) -> Iterator[CompiledSignal]:
         yield from element.signals
 
 
-class Group:
+class ClientGroup:
     """The rules about clients that are evaluated at the same ticks."""
 
     needs_clients = True
 
     def __init__(self, tracks: Sequence[Track], context: Context) -> None:
-        """All rules fit (see `fits`)."""
+        """All rules fit (see `fits_clients`)."""
         self.tracks = tracks
         self._context = context
-        self._signals = Signals(context, tracks)
+        self._signals = SignalColumns(context, tracks)
         self._conditions = Conditions(context, tracks, _conditions)
         if any("streams" in names_of(track.rule) for track in tracks):
             self._signals.watch_all_streams()

@@ -14,7 +14,7 @@ from detector.engine.columns.leaves import ClientLeaves
 from detector.engine.columns.nearby import Crowd, Nearby, nearby
 from detector.engine.columns.places import Places, Whereabouts
 from detector.engine.columns.reading import constant
-from detector.engine.columns.signals import Signals
+from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Codes, Verdict, observed
@@ -76,7 +76,7 @@ class PairColumns:
         self._subject = rule.subject
         self._track = track
         self._context = context
-        self._signals = Signals(context, [track], shared=False)
+        self._signals = SignalColumns(context, [track], shared=False)
         if _reads_streams(rule):
             self._signals.watch_all_streams()
         self._reads_streams = bool(rule.signals) or _reads_streams(rule)

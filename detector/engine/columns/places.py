@@ -9,7 +9,7 @@ import numpy as np
 from detector.engine.columns.block import Block, Context
 from detector.engine.columns.reading import Reading
 from detector.engine.columns.table import Integers, Table, Truths
-from detector.engine.columns.watching import Ages
+from detector.engine.columns.watching import SampleAges
 from detector.engine.counters import RuleCounters
 from detector.engine.scoping.positions import FARTHEST, LIMITS, Place, distance, point
 from wayside.expressions.columns.values import Doubles, Tag
@@ -36,7 +36,7 @@ class Places(NamedTuple):
 class Whereabouts:
     """Looks up a position of many clients in the table of its stream."""
 
-    def __init__(self, position: CompiledPosition, context: Context, counters: RuleCounters, ages: Ages) -> None:
+    def __init__(self, position: CompiledPosition, context: Context, counters: RuleCounters, ages: SampleAges) -> None:
         """`ages` are those of the rule's signals, where they are watched."""
         reader = context.tables.add(position.stream)
         uses = [reader.use(Reading(each, position.parameters, None), None) for each in position.axes.values()]

@@ -12,8 +12,8 @@ from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.episodes import of_episodes
 from detector.engine.columns.reading import Reading, Used
 from detector.engine.columns.table import Integers, Truths, rows_between
-from detector.engine.columns.watching import Ages
-from detector.engine.columns.windows import Ranges, aggregated, misfits
+from detector.engine.columns.watching import SampleAges
+from detector.engine.columns.windows import Ranges, aggregated_ranges, misfits
 from wayside.api.eventrule import OF_A_SAMPLE, Aggregate
 from wayside.expressions.columns.values import Column, Tag, value_at
 from wayside.rules import CompiledSignal
@@ -31,7 +31,7 @@ class Key(NamedTuple):
     aggregate: Aggregate
 
 
-class Signals:
+class SignalColumns:
     """The signals of all rules of a group."""
 
     def __init__(self, context: Context, tracks: Sequence[Track], *, shared: bool = True) -> None:
@@ -52,7 +52,7 @@ class Signals:
         self._new: dict[int, int] = {}
         """By signal, where the rows begin that were in no window of it: one of its table's marks; unless shared."""
         self._version = -1
-        self.ages = Ages()
+        self.ages = SampleAges()
         self._all_streams = False
         for row, track in enumerate(tracks):
             own = {signal.name: signal for signal in track.element.signals}
@@ -218,7 +218,7 @@ class Signals:
             found = misfits(key.aggregate, rows)
             if found is not None:
                 self._note_misfits(block, at, key, rows, *found)
-            column = aggregated(key.aggregate, rows, self._context.tables.texts)
+            column = aggregated_ranges(key.aggregate, rows, self._context.tables.texts)
         if key.aggregate in _ALWAYS_KNOWN:
             return column
         fresh = block.fresh[key.stream].ravel()

@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.engine.ages import Ages as Noted
-from detector.engine.ages import Use
+from detector.engine.ages import Ages, Use
 from detector.engine.columns.table import Integers, Table, Truths
 from detector.engine.timing.ticks import HOUSEKEEPING
 
@@ -33,7 +32,7 @@ class Points(Protocol):
         """Their clients."""
 
 
-class Ages:
+class SampleAges:
     """Notes the ages of the samples that a group of rules uses."""
 
     def __init__(self) -> None:
@@ -42,7 +41,7 @@ class Ages:
 
     def used(
         self,
-        rules: Sequence[Noted],
+        rules: Sequence[Ages],
         stream: str,
         table: Table,
         duration: int,

@@ -56,7 +56,7 @@ class Ranges:
         self.others = None if self.others is None else self.others[keep]
 
 
-def aggregated(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Column:
+def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Column:
     """The aggregate of each range, flat. Values that the aggregate does not take are left out: see `misfits`."""
     low, high = rows.low.ravel(), rows.high.ravel()
     count = high - low

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.columns.windows import Ranges, misfits
-from detector.engine.columns.windows import aggregated as in_columns
+from detector.engine.columns.windows import aggregated_ranges as in_columns
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Arrival
 from detector.engine.signals.signals import aggregated
