@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 
-from tests.guides import ROOT
+from detector import findings as detector_checks
+from tests.guides import ROOT, guide
 
 DECISIONS = ROOT / "docs/decisions"
 STATUS = re.compile(r"(?:Accepted|Superseded by \[\d+\]\(\d{4}-[a-z0-9-]+\.md\)), \d{4}-\d\d-\d\d")
@@ -34,3 +35,11 @@ def test_links_between_pages_lead_to_files() -> None:
         if not (page.parent / to).exists()
     ]
     assert not dead
+
+
+def test_findings_are_documented_with_their_severities() -> None:
+    rows = [f"| `{each.name}` | {each.severity} | {each.meaning} |" for each in detector_checks.CHECKS]
+    section = guide("findings").partition("\n## `detector check`\n")[2].partition("\n## ")[0]
+    assert [line for line in section.splitlines() if line.startswith("| `")] == rows
+    names = [each.name for each in detector_checks.CHECKS]
+    assert len(set(names)) == len(names)
