@@ -7,6 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from detector.assembly import DetectorError, Inlets, inlets, offer_problems
+from detector.findings import (
+    INVALID_DETECTOR,
+    INVALID_RULE,
+    MISSING_DETECTOR,
+    RULE_NOT_SELECTED,
+    STREAM_WITHOUT_STAMPS,
+    UNKNOWN_RULE,
+)
 from detector.models.binding import bind_models
 from detector.sources.registry import plugin_problems
 from wayside.api import Detector, EventRule
@@ -20,7 +28,7 @@ _CHECKED = (Detector, EventRule)
 
 
 class Findings(NamedTuple):
-    """What is wrong, and what is doubtful: where a rule's classification contradicts the rule."""
+    """Errors, and warnings without those that the annotation of their object ignores."""
 
     problems: list[Problem]
     warnings: list[Problem]
@@ -39,18 +47,22 @@ def findings(documents: Sequence[Document]) -> Findings:
     for document in documents:
         if isinstance(document.object, Detector):
             try:
-                problems += [document.problem(each.path, each.message) for each in plugin_problems(document.object)]
+                problems += [
+                    document.problem(each.path, each.message, INVALID_DETECTOR.name)
+                    for each in plugin_problems(document.object)
+                ]
                 entries = inlets(document.object)
                 detectors.append((document, document.object, entries))
-                warnings += _without_stamps(document, document.object, entries)
+                warnings += _unignored(document, _without_stamps(document, document.object, entries))
             except DetectorError as error:
-                problems += [document.problem(each.path, each.message) for each in error.problems]
+                problems += [
+                    document.problem(each.path, each.message, INVALID_DETECTOR.name) for each in error.problems
+                ]
     any_detector = any(isinstance(document.object, Detector) for document in documents)
     rules = [document for document in documents if isinstance(document.object, EventRule)]
     if rules and not any_detector:
-        problems.append(
-            rules[0].problem((), "a rule is checked against its Detector: give the Detector's file as well")
-        )
+        missing = "a rule is checked against its Detector: give the Detector's file as well"
+        problems.append(rules[0].problem((), missing, MISSING_DETECTOR.name))
     wrong = {
         detector.name: dependency_problems(
             [rule for rule in _objects(rules) if detector.spec.rules.matches(rule.metadata.labels)]
@@ -61,7 +73,9 @@ def findings(documents: Sequence[Document]) -> Findings:
         problems += _rule_problems(document, detectors, wrong, _by_name(rules), warnings)
     names = [document.object.name for document in rules]
     for of_detector, detector, _ in detectors if rules else ():
-        problems += [of_detector.problem(path, text) for path, text in unknown_rules(detector, names)]
+        problems += [
+            of_detector.problem(path, text, UNKNOWN_RULE.name) for path, text in unknown_rules(detector, names)
+        ]
     return Findings(list(dict.fromkeys(problems)), list(dict.fromkeys(warnings)))
 
 
@@ -79,7 +93,13 @@ def _without_stamps(document: Document, detector: Detector, entries: Inlets) -> 
                 ("spec", "streams", index),
                 f"stream {stream.name} carries no stamp, and others do: with clock Data the receive time counts for "
                 "it; give its stamp, e.g. msg.time or sample.received, or write clock: Wall",
+                STREAM_WITHOUT_STAMPS.name,
             )
+
+
+def _unignored(document: Document, warnings: Iterable[Problem]) -> Iterator[Problem]:
+    """The warnings of an object that its annotation does not ignore."""
+    return (each for each in warnings if not document.ignores(each.check))
 
 
 def _has_stamp(stream: Stream, fields: Fields | None) -> bool:
@@ -112,7 +132,8 @@ def _rule_problems(
     selecting = [each for each in detectors if each[1].spec.rules.matches(rule.metadata.labels)]
     if detectors and not selecting:
         names = ", ".join(detector.name for _, detector, _ in detectors)
-        yield document.problem(("metadata", "labels"), f"no Detector selects the rule: compare spec.rules of {names}")
+        unselected = f"no Detector selects the rule: compare spec.rules of {names}"
+        yield document.problem(("metadata", "labels"), unselected, RULE_NOT_SELECTED.name)
     for of_detector, detector, entries in selecting:
         try:
             known = (*wrong[detector.name].get(rule.name, ()), *offer_problems(rule, detector))
@@ -120,10 +141,11 @@ def _rule_problems(
             bind_models(compiled)
         except RuleError as error:
             for each in error.problems:
-                yield (document if each.detector is None else of_detector).problem(each.path, each.message)
+                place = document if each.detector is None else of_detector
+                yield place.problem(each.path, each.message, INVALID_RULE.name)
         else:
-            doubts = contradictions(rule, compiled, detector, others)
-            warnings += [document.problem(each.path, each.message) for each in doubts]
+            found = contradictions(rule, compiled, detector, others)
+            warnings += _unignored(document, (document.problem(each.path, each.message, each.check) for each in found))
 
 
 def summary(documents: Sequence[Document]) -> str:

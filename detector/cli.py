@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -275,7 +274,7 @@ def schema(
 
 @app.command()
 def check(
-    files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
+    files: Annotated[list[Path] | None, typer.Argument(help="YAML files or folders.")] = None,
     recordings: Annotated[
         list[Path] | None,
         typer.Option(
@@ -285,41 +284,25 @@ def check(
         ),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where there is a warning, too.")] = False,
+    ignore: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Do not report the warnings of this name; may be repeated."),
+    ] = None,
+    listing: Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")] = False,
 ) -> None:
     """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong.
 
-    A classification that contradicts its rule is a warning.
+    Each finding has a name. A classification that contradicts its rule is a warning.
     """
+    if not listing and not files:
+        refuse("give YAML files or folders, or --list")
     with importing():
-        from detector.checking import findings, summary
-        from wayside.api.documents import DocumentError, load_documents
+        from detector.commands.checking import check_files, list_checks
 
-    try:
-        documents = load_documents(files)
-    except DocumentError as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(1) from None
-    problems, warnings = findings(documents)
-    for problem in problems:
-        typer.echo(str(problem), err=True)
-    for warning in warnings:
-        typer.echo(warning.as_warning(), err=True)
-    doubted: list[str] = []
-    unread: Sequence[Exception] = ()
-    if recordings and not problems:
-        with importing():
-            from detector.commands.replay import doubts_of
-
-        doubted, unread = doubts_of(documents, recordings)
-    for doubt in doubted:
-        typer.echo(f"warning: {doubt}", err=True)
-    for each in unread:
-        typer.echo(f"error: {each}", err=True)
-    if problems or unread or (strict and (warnings or doubted)):
-        raise typer.Exit(1)
-    count = len(warnings) + len(doubted)
-    doubts = f", {count} warning{'s' if count > 1 else ''}" if count else ""
-    typer.echo(f"{summary(documents)}: nothing wrong{doubts}", err=True)
+    if listing:
+        list_checks()
+    else:
+        check_files(files or (), recordings or (), ignore or (), strict=strict)
 
 
 app.add_typer(recordings.app, name="recordings")

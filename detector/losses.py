@@ -16,7 +16,9 @@ from detector.engine.counters import RuleCounters
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
 from detector.engine.timing.data import DataTimeline
+from detector.findings import DIVERGING_STAMPS, OLD_SAMPLES, STALE_BETWEEN_SAMPLES, STREAM_WITHOUT_STAMPS, ZERO_STAMPS
 from detector.streams.tally import Tally
+from wayside.findings import Finding
 from wayside.rules import PairSubject
 
 _log = logging.getLogger(__name__)
@@ -74,10 +76,10 @@ class Losses:
             if loss.count > said and now - since >= _EVERY:
                 self._said[loss.what] = loss.count, now
                 _log.warning("%s", _line(loss, loss.count - said))
-        for what, text in self._apart():
+        for what, finding in self._apart():
             if what not in self._said:
                 self._said[what] = 1, now
-                _log.warning("%s", text)
+                _log.warning("%s", finding)
 
     def sum_up(self) -> None:
         """Log how many samples came, all losses since the start, and how the evaluations went."""
@@ -97,9 +99,9 @@ class Losses:
                 of_rule = f"{rule.unknowns} unknown values in {rule.evaluations} evaluations of EventRule {name}"
                 yield f"{of_rule}: {often}" if often else of_rule
 
-    def doubts(self) -> Iterator[str]:
+    def doubts(self) -> Iterator[Finding]:
         """Streams whose stamps do not fit the clock; where counters watch ages, rules that use or lack old samples."""
-        yield from (text for _, text in self._apart())
+        yield from (finding for _, finding in self._apart())
         spec = self._engine.detector.spec
         for name, rule in self._engine.counters.rules.items():
             for stream_name, use in {} if rule.ages is None else rule.ages.uses.items():
@@ -109,17 +111,21 @@ class Losses:
                     continue  # it never goes stale: what was said last holds
                 every = f"every {period / 1e9:.2g} s"
                 if period > limit:
-                    yield (
+                    yield Finding(
+                        STALE_BETWEEN_SAMPLES.name,
                         f"samples of stream {stream_name} come {every} and go stale after {limit / 1e9:g} s: EventRule "
-                        f"{name} finds them unknown in between; raise streams[{stream_name}].staleAfter"
+                        f"{name} finds them unknown in between; raise streams[{stream_name}].staleAfter",
+                        name,
                     )
                 elif use.old:
                     old = f"{use.old} of the {use.count} it used were older than {OLD * period / 1e9:.2g} s"
-                    yield (
+                    yield Finding(
+                        OLD_SAMPLES.name,
                         f"EventRule {name} used old samples of stream {stream_name}: they come {every}, and {old}. "
                         "A client's last sample counts on after it falls silent: lower "
                         f"streams[{stream_name}].staleAfter"
-                        + (", or maxAge of the position" if self._in_pairs(name) else "")
+                        + (", or maxAge of the position" if self._in_pairs(name) else ""),
+                        name,
                     )
 
     def _in_pairs(self, rule: str) -> bool:
@@ -127,7 +133,7 @@ class Losses:
         run = self._engine.rules.get(rule)
         return run is not None and isinstance(run.rule.subject, PairSubject)
 
-    def _apart(self) -> Iterator[tuple[str, str]]:
+    def _apart(self) -> Iterator[tuple[str, Finding]]:
         """With clock Data, streams whose stamps do not fit those of the others: a name for each line, and it."""
         counters = self._engine.counters
         all_unstamped = counters.delays.keys() <= counters.unstamped.keys()
@@ -136,19 +142,20 @@ class Losses:
             remedy = f"give streams[{name}].stamp, e.g. msg.time or sample.received, or write clock: Wall"
             if zeros := counters.zeros[name]:
                 what = f"{zeros} samples of stream {name} are without a time: their stamps are 0"
-                yield f"zero {name}", f"{what}; let the sender fill them in, {remedy}"
+                yield f"zero {name}", Finding(ZERO_STAMPS.name, f"{what}; let the sender fill them in, {remedy}")
             if (unstamped := counters.unstamped[name]) and not all_unstamped:
                 what = f"{unstamped} samples of stream {name} carry no stamp, those of other streams do"
-                yield f"unstamped {name}", f"{what}: with clock Data their receive time counts; {remedy}"
+                counted = f"{what}: with clock Data their receive time counts; {remedy}"
+                yield f"unstamped {name}", Finding(STREAM_WITHOUT_STAMPS.name, counted)
             behind = counters.delays.get(name, right[1]) - right[1]
             if behind < -_APART:
                 what = f"stamps of stream {name} are {-counters.delays[name] / 1e9:.1f} s ahead of the receive times"
                 late = "with clock Data the samples of other streams are late for it; set the sender's clock"
-                yield f"ahead {name}", f"{what}: {late}, {remedy}"
+                yield f"ahead {name}", Finding(DIVERGING_STAMPS.name, f"{what}: {late}, {remedy}")
             elif behind > _APART:
                 what = f"stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those"
                 late = "with clock Data its samples are late for the others; set the sender's clock"
-                yield f"behind {name}", f"{what} of stream {right[0]}: {late}, {remedy}"
+                yield f"behind {name}", Finding(DIVERGING_STAMPS.name, f"{what} of stream {right[0]}: {late}, {remedy}")
 
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, also those that did not happen."""

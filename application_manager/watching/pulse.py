@@ -3,7 +3,7 @@
 kopf has a timeout of its own for inactive watches, and it can kill them: its `asyncio.timeout` stays armed while kopf's
 consumer, and not the stream, is waiting. Expired there, as after a stall of the process, it cancels the consumer, and
 kopf takes that task as one that was meant to end. So that timeout is out of the way here, and ours is armed only while
-the stream is waited for. docs/decisions/0031 has the details.
+the stream is waited for. docs/decisions/0026 has the details.
 """
 
 from __future__ import annotations

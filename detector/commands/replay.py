@@ -15,6 +15,7 @@ from detector.assembly import lasting_problems
 from detector.engine.episodes.demands import from_task
 from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
+from detector.findings import CUT_RECORDING
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.clips import Clips
@@ -35,8 +36,9 @@ from detector.topics.doubts import topic_doubts
 from detector.topics.survey import survey
 from detector.tracing import episode_traces
 from wayside.api import ApplicationTask, Detector, EventRule
-from wayside.api.documents import Document
+from wayside.api.documents import Document, Problem
 from wayside.commandline import refuse
+from wayside.findings import Finding, ignored_by
 
 CLIPS = "clips"
 """The folder of what record actions write, in the output."""
@@ -155,29 +157,42 @@ def _number(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def doubts_of(documents: Sequence[Document], recordings: Sequence[Path]) -> tuple[list[str], list[RecordingError]]:
-    """What the recordings show of the Detectors and their rules; and why some of several recordings cannot be read."""
+def doubts_of(
+    documents: Sequence[Document], recordings: Sequence[Path]
+) -> tuple[list[Finding | Problem], list[RecordingError]]:
+    """What the recordings show of the Detectors and their rules; and why some of several recordings cannot be read.
+
+    Warnings that an annotation of the Detector or the rule ignores are left out.
+    """
     intake = intake_file_of(recordings)
     gathered = [] if intake is not None else recordings_of(recordings)
     rules = [document.object for document in documents if isinstance(document.object, EventRule)]
     errors: dict[str, RecordingError] = {}
-    found = [] if intake is not None else [*_topic_doubts(documents, gathered, errors)]
+    found: list[Finding | Problem] = [] if intake is not None else [*_topic_doubts(documents, gathered, errors)]
     for detector in (document.object for document in documents if isinstance(document.object, Detector)):
         selected = select(detector, rules).rules
         if intake is not None:
             with _plugins(Outages(lambda: ())) as plugins:
-                found += replay_intake(read_intake(intake), detector, selected, plugins).doubts
+                doubts = replay_intake(read_intake(intake), detector, selected, plugins).doubts
+            found += _unignored(doubts, detector, selected)
             continue
         played = play(gathered, detector, selected, lambda: _plugins(Outages(lambda: ())))
         for outcome in played.outcomes.values():
-            found += [*map(str, outcome.cuts), *outcome.doubts]
+            cuts = [Finding(CUT_RECORDING.name, str(each)) for each in outcome.cuts]
+            found += _unignored([*cuts, *outcome.doubts], detector, selected)
         errors.update((str(error), error) for error in played.errors)
     return list(dict.fromkeys(found)), list(errors.values())
 
 
+def _unignored(found: Iterable[Finding], detector: Detector, rules: Iterable[EventRule]) -> Iterator[Finding]:
+    of_detector = ignored_by(detector.metadata.annotations)
+    of_rules = {rule.name: ignored_by(rule.metadata.annotations) for rule in rules}
+    return (each for each in found if each.check not in of_detector | of_rules.get(each.rule, frozenset()))
+
+
 def _topic_doubts(
     documents: Sequence[Document], gathered: Sequence[Recording], errors: dict[str, RecordingError]
-) -> Iterator[str]:
+) -> Iterator[Problem]:
     """What the messages show before anything is replayed; errors of recordings are noted."""
     readable = []
     for recording in gathered:
@@ -187,7 +202,7 @@ def _topic_doubts(
             errors[str(error)] = error
     topics = [topic for each in readable for topic in each]
     if topics:
-        yield from (str(doubt) for doubt in topic_doubts(documents, topics))
+        yield from topic_doubts(documents, topics)
 
 
 def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:

@@ -30,6 +30,7 @@ from detector.replay.intake_versions import detector_as_of, rule_as_of
 from detector.replay.message import Cut
 from detector.replay.parts import PAUSE, parts_of
 from wayside.api import ApplicationTask, Detector, EventRule
+from wayside.findings import Finding
 from wayside.times import format_time
 
 _BATCH = 4096
@@ -54,7 +55,7 @@ class Outcome:
     """What a person should know: pauses, losses, and what was unknown or failed."""
     cuts: list[Cut] = field(default_factory=list)
     """Files of the recording whose end is missing."""
-    doubts: list[str] = field(default_factory=list)
+    doubts: list[Finding] = field(default_factory=list)
     """Stamps that do not fit the clock, many old samples, streams that go stale between their samples."""
     cut: bool = False
     """The intake file ends in the middle: its writer was killed."""

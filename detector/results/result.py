@@ -70,6 +70,6 @@ def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -
         terms=terms,
         streams=arrivals.by_stream(engine),
         counts={rule: (each.evaluations, each.unknowns, each.errors) for rule, each in counted.items()},
-        notes=[*map(str, outcome.cuts), *outcome.doubts, *outcome.notes],
+        notes=[*map(str, (*outcome.cuts, *outcome.doubts)), *outcome.notes],
         samples=outcome.samples,
     )

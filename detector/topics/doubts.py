@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, inlets
+from detector.findings import FIELD_NOT_RECORDED, UNMATCHED_STREAM
 from detector.rules.selection import select
 from detector.topics.proposal import Proposal
 from detector.topics.shape import Shape
@@ -32,11 +33,12 @@ def topic_doubts(documents: Sequence[Document], topics: Sequence[Topic]) -> Iter
         seen: dict[str, Fields] = {}
         for index, stream in enumerate(detector.spec.streams):
             own = _topics_of(stream, topics)
-            if not own:
+            if not own and not document.ignores(UNMATCHED_STREAM.name):
                 keys = ", ".join(sorted(topic.key for topic in topics)[:_SHOWN])
                 yield document.problem(
                     ("spec", "streams", index, "key"),
                     f"no message of the recording belongs to stream {stream.name}; its keys are {keys}",
+                    UNMATCHED_STREAM.name,
                 )
             fields = _seen(stream.encoding, own)
             if fields is not None:
@@ -48,14 +50,14 @@ def _fields_missing(detector: Detector, rules: Sequence[Document], fields: dict[
     """Fields that rules name, and no message that was looked at has."""
     selected = {rule.name for rule in select(detector, [_rule(document) for document in rules]).rules}
     for document in rules:
-        if document.object.name not in selected:
+        if document.object.name not in selected or document.ignores(FIELD_NOT_RECORDED.name):
             continue
         try:
             compile_rule(_rule(document), detector, fields)
         except RuleError as error:
             for each in error.problems:
                 if " has no field " in each.message:
-                    yield document.problem(each.path, f"in the recording, {each.message}")
+                    yield document.problem(each.path, f"in the recording, {each.message}", FIELD_NOT_RECORDED.name)
 
 
 def _rule(document: Document) -> EventRule:

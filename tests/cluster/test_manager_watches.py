@@ -31,7 +31,7 @@ def cancel(*_):
 
 signal.signal(signal.SIGUSR1, cancel)
 """
-"""What a stall does to a watch of kopf, see docs/decisions/0031: the task that reads it is cancelled."""
+"""What a stall does to a watch of kopf, see docs/decisions/0026: the task that reads it is cancelled."""
 
 
 def test_a_watch_whose_connection_brings_nothing_is_begun_again(

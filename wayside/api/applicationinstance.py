@@ -108,9 +108,8 @@ class ApplicationInstanceStatus(Model):
     )
     demands: Demands = Field(default=Demands(), description="The live tasks that it serves.")
     conditions: list[Condition] = conditions_field(
-        "Applied: all objects are as the template says. Ready: that, and its workloads are ready. "
+        "Applied: all objects are as the template states. Ready: they are, and the workloads are ready. "
         "Stalled: its objects are refused, or were not ready in time. Capped: a merged Sum is held "
-        "Applied: all objects are as the template says. Ready: its workloads are ready. Capped: a merged Sum is held "
         "at its parameter's bound. Suspended: its workloads are at zero. Paused, Held: a person wants it left as it is "
         "(annotation wayside.dev/pause), or kept without demand (wayside.dev/hold). TimedOut: it was not ready for its "
         "template's readyTimeout. StandsIn: it serves tasks of instances that are."

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from wayside.api import API_VERSION, KINDS
 from wayside.api.base import Kind
 from wayside.api.wording import FieldPath, field_text, messages
+from wayside.findings import ignored_by
 from wayside.inputerror import InputError
 
 __all__ = ["Document", "DocumentError", "FieldPath", "Problem", "field_text", "load_documents", "parse_object"]
@@ -38,6 +39,8 @@ class Problem:
     column: int
     field: str
     message: str
+    check: str = ""
+    """The name of the check that found it; empty for what makes a file unreadable."""
 
     def __str__(self) -> str:
         return self._said("")
@@ -72,10 +75,14 @@ class Document:
         """The line on which the object begins."""
         return self.marks.get((), (1, 1))[0]
 
-    def problem(self, path: FieldPath, message: str) -> Problem:
+    def ignores(self, check: str) -> bool:
+        """Whether the object's annotation excludes the warnings of this name."""
+        return check in ignored_by(self.object.metadata.annotations)
+
+    def problem(self, path: FieldPath, message: str, check: str = "") -> Problem:
         """A problem at a field, e.g. ("spec", "signals", 0, "value"); its closest ancestor where it is absent."""
         line, column = _mark(self.marks, path)
-        return Problem(self.file, line, column, field_text(path), message)
+        return Problem(self.file, line, column, field_text(path), message, check)
 
 
 def load_documents(paths: Iterable[str | Path]) -> list[Document]:

@@ -16,6 +16,8 @@ class RuleProblem:
     message: str
     detector: str | None = None
     """The Detector whose field it is; None: the rule's."""
+    check: str = ""
+    """The name of its finding, where it is a warning."""
 
     def __str__(self) -> str:
         whose = "" if self.detector is None else f"Detector {self.detector}: "

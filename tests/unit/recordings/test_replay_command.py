@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 
+from detector.findings import CHECKS
 from tests.driving import START, a_detector, a_rule, a_stream, at
 from tests.unit.recordings.desk import FAST, Desk
 from tests.unit.recordings.test_recordings import write_lines
+from wayside.findings import Severity
 
 
 def test_a_key_may_begin_with_the_slash_of_its_ros_topic(desk: Desk) -> None:
@@ -93,7 +95,7 @@ def test_what_is_wrong_with_a_stream_has_file_line_and_column_in_replay_as_in_ch
     detector["spec"]["streams"] = [stream]
     desk.write(detector, a_rule("fast", **FAST))
     desk.drive("drive.jsonl", (0.5, {"v": 20}))
-    checked = desk.run("check", "detector.yaml").said
+    checked = desk.run("check", "detector.yaml").said.removesuffix(" [invalid-detector]\n")
     assert said in checked
     assert checked in desk.replay("drive.jsonl").said
 
@@ -221,3 +223,54 @@ def test_that_no_message_belongs_to_a_stream_is_an_error_with_both_keys(desk: De
     ran = desk.replay(path, other)
     assert ran.code == 0
     assert "drive.jsonl: no message belongs to a stream of the Detector; keys: veh/car/speed" in ran.said
+
+
+CLASSIFIED = {**FAST, "classification": {"incidence": ["Rare"]}, "when": "true"}
+STAMPED = a_detector(a_stream("pose", stamp="msg.time"), a_stream("speed"), clock="Data")
+IGNORING = {"wayside.dev/ignore-findings": "classification-incidence, old-samples"}
+
+
+@pytest.mark.parametrize(
+    ("objects", "name"),
+    [
+        ([{**a_detector().to_json(), "spec": 5}], "unreadable-file"),
+        ([a_detector(a_stream("speed", encoding="cdr", type="nobody/msg/Nothing"))], "invalid-detector"),
+        ([a_detector(a_stream("speed")), a_rule("r", when="v > 1")], "invalid-rule"),
+        ([a_rule("r", **FAST)], "missing-detector"),
+        ([a_detector(a_stream("speed"), rules={"matchLabels": {"a": "b"}}), a_rule("r", **FAST)], "rule-not-selected"),
+        (
+            [
+                a_detector(a_stream("speed"), clients=[{"name": "car", "parameters": {"fats": {"limit": 1}}}]),
+                a_rule("fast", **FAST),
+            ],
+            "unknown-rule",
+        ),
+        ([STAMPED, a_rule("fast", **FAST)], "stream-without-stamps"),
+        ([a_detector(a_stream("speed")), a_rule("r", **CLASSIFIED)], "classification-incidence"),
+    ],
+)
+def test_a_finding_of_check_ends_with_its_name_and_only_errors_fail(desk: Desk, objects: list[Any], name: str) -> None:
+    desk.write(*objects)
+    ran = desk.run("check", "detector.yaml", "rules.yaml")
+    severity = {each.name: each.severity for each in CHECKS}[name]
+    [line] = [line for line in ran.said.splitlines() if line.endswith(f" [{name}]")]
+    assert (": warning: " in line, ran.code) == ((True, 0) if severity is Severity.WARNING else (False, 1)), line
+
+
+def test_warnings_are_ignored_by_option_and_by_annotation_and_errors_never(desk: Desk) -> None:
+    rule = a_rule("r", **CLASSIFIED).to_json()
+    desk.write(a_detector(a_stream("speed"), a_stream("unused")), rule)
+    recording = desk.drive("drive.jsonl", (0.5, {"v": 20}))
+    strict = ("check", "--strict", "detector.yaml", "rules.yaml", "--recording", str(recording))
+    assert desk.run(*strict).said.count(" [") == 2
+    unmatched = desk.run(*strict, "--ignore", "classification-incidence")
+    assert (unmatched.code, unmatched.said.count(" ["), "[unmatched-stream]" in unmatched.said) == (1, 1, True)
+    rule["metadata"]["annotations"] = IGNORING
+    desk.write(a_detector(a_stream("speed"), a_stream("unused")), rule)
+    assert desk.run(*strict).said == unmatched.said
+    both = desk.run(*strict, "--ignore", "unmatched-stream")
+    assert (both.code, both.said) == (0, "1 Detector, 1 EventRule: nothing wrong\n")
+    misspelt = desk.run("check", "detector.yaml", "--ignore", "old-sample")
+    assert (misspelt.code, "there is no such finding; did you mean old-samples?" in misspelt.said) == (2, True)
+    error = desk.run("check", "detector.yaml", "--ignore", "invalid-rule")
+    assert (error.code, "only warnings can be ignored" in error.said) == (2, True)

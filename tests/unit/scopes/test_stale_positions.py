@@ -224,7 +224,7 @@ def test_check_and_replay_warn_of_old_samples(
         assert ran(monkeypatch, *arguments) == code
         said = capsys.readouterr().err
         assert warning in said
-        assert remedy in said
+        assert remedy in said.replace(" [old-samples]", "")
     left_behind(tmp_path, stay=5.0, staleAfter="300ms")
     assert ran(monkeypatch, "check", "--strict", detector, rules, "--recording", drive) == 0
     assert "warning" not in capsys.readouterr().err

@@ -8,7 +8,7 @@ that one fits.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from wayside.api import Detector, EventRule
 from wayside.api.scheme import (
@@ -44,6 +44,8 @@ _SENDERS = {
 class Contradiction:
     """One way in which a classification can be wrong."""
 
+    check: str
+    """The name of its finding."""
     dimension: type[Value]
     says: str
     """When there is a warning, for people."""
@@ -64,7 +66,7 @@ def contradictions(
     if rule.spec.classification is None:
         return []
     case = Case(rule, compiled, detector, others)
-    return [problem for each in CONTRADICTIONS for problem in each.find(case)]
+    return [replace(problem, check=each.check) for each in CONTRADICTIONS for problem in each.find(case)]
 
 
 def _senders(case: Case) -> Iterator[RuleProblem]:
@@ -201,40 +203,60 @@ def _unaccounted_type(case: Case) -> Iterator[RuleProblem]:
 
 CONTRADICTIONS = (
     Contradiction(
+        "classification-sender",
         TypeOfParticipants,
         "the rule looks at a stream of VAM without VRU, or of SPATEM or MAPEM without RoadInfrastructure",
         _senders,
     ),
-    Contradiction(NumberOfParticipants, "One alone, and the scope is pairs or the fleet", _one_of_several),
     Contradiction(
-        EventDetectionEntity, "External alone, and numberOfParticipants One: two take part", _one_and_external
+        "classification-participants",
+        NumberOfParticipants,
+        "One alone, and the scope is pairs or the fleet",
+        _one_of_several,
     ),
-    Contradiction(ActingEntity, "External alone, and all actions are record or database", _records_itself),
     Contradiction(
+        "classification-detecting-entity",
+        EventDetectionEntity,
+        "External alone, and numberOfParticipants One: two take part",
+        _one_and_external,
+    ),
+    Contradiction(
+        "classification-acting-entity",
+        ActingEntity,
+        "External alone, and all actions are record or database",
+        _records_itself,
+    ),
+    Contradiction(
+        "classification-observation-period",
         ObservationPeriod,
         "no value fits the time that the rule looks back, with windows, for, models and the rules that it names: "
         "Immediate is below 2 s, ShortTerm below 1 h and more than the newest samples, LongTerm is 1 h or more",
         _observed,
     ),
     Contradiction(
+        "classification-time-sensitivity",
         TimeSensitivity,
         "Immediate alone, and evaluation.every with the grouping of notifications delays the action by 2 s or more; "
         "or without LongTerm by 1 h or more",
         _late,
     ),
-    Contradiction(Incidence, "Rare or Unexpected, and when always holds", _always),
+    Contradiction("classification-incidence", Incidence, "Rare or Unexpected, and when always holds", _always),
     Contradiction(
+        "classification-algorithm",
         DetectionAlgorithm,
         "RuleBased alone with a model that decides, or LearningBased alone without a model or plugin that does",
         _algorithm,
     ),
     Contradiction(
+        "classification-missing-action-type",
         TypeOfAction,
         "an action whose type is not named: deploy needs Deployment (Reconfigure: Reconfiguration; Suspend: "
         "Reconfiguration or Other), record, database and trigger.detector need DataCollection (but not beside a notify "
         "action with Notification: that is a report), notify.alertmanager needs Notification",
         _unnamed_action,
     ),
-    Contradiction(TypeOfAction, "a type that no action of the rule can be", _unaccounted_type),
+    Contradiction(
+        "classification-unused-action-type", TypeOfAction, "a type that no action of the rule can be", _unaccounted_type
+    ),
 )
 """All of them, in the order of the scheme."""

@@ -1,0 +1,60 @@
+"""What `detector check` prints: a line for each finding, with its name at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+
+from detector.checking import findings, summary
+from detector.findings import CHECKS, UNREADABLE_FILE, UNREADABLE_RECORDING
+from wayside.api.documents import DocumentError, load_documents
+from wayside.findings import ignorable, listed
+
+
+def list_checks() -> None:
+    """Print the name, severity and meaning of every finding."""
+    for line in listed(CHECKS):
+        typer.echo(line)
+
+
+def check_files(files: Sequence[Path], recordings: Sequence[Path], ignore: Sequence[str], *, strict: bool) -> None:
+    """Print what is wrong with the files, and exit with 1 where there is an error, or with `strict` a warning.
+
+    Args:
+        files: Detectors and EventRules.
+        recordings: are looked at, too, where the files are free of errors.
+        ignore: the names of warnings that are not printed.
+        strict: whether a warning fails the check.
+
+    Raises InputError where a name in `ignore` is not that of a warning.
+    """
+    ignored = ignorable(ignore, CHECKS)
+    try:
+        documents = load_documents(files)
+    except DocumentError as error:
+        for problem in error.problems:
+            typer.echo(f"{problem} [{UNREADABLE_FILE.name}]", err=True)
+        raise typer.Exit(1) from None
+    found = findings(documents)
+    warnings = [f"{each.as_warning()} [{each.check}]" for each in found.warnings if each.check not in ignored]
+    for problem in found.problems:
+        typer.echo(f"{problem} [{problem.check}]", err=True)
+    for line in warnings:
+        typer.echo(line, err=True)
+    unread: Sequence[Exception] = ()
+    if recordings and not found.problems:
+        from detector.commands.replay import doubts_of  # noqa: PLC0415  a replay loads much more than a check
+
+        doubts, unread = doubts_of(documents, recordings)
+        shown = [f"warning: {each} [{each.check}]" for each in doubts if each.check not in ignored]
+        for line in shown:
+            typer.echo(line, err=True)
+        warnings += shown
+    for damaged in unread:
+        typer.echo(f"error: {damaged} [{UNREADABLE_RECORDING.name}]", err=True)
+    if found.problems or unread or (strict and warnings):
+        raise typer.Exit(1)
+    count = f", {len(warnings)} warning{'s' if len(warnings) > 1 else ''}" if warnings else ""
+    typer.echo(f"{summary(documents)}: nothing wrong{count}", err=True)
