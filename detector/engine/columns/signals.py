@@ -13,7 +13,7 @@ from detector.engine.columns.episodes import of_episodes
 from detector.engine.columns.reading import Reading, Used
 from detector.engine.columns.table import Integers, Truths, rows_between
 from detector.engine.columns.watching import SampleAges
-from detector.engine.columns.windows import Ranges, aggregated_ranges, misfits
+from detector.engine.columns.windows import EXTREMES, Ranges, aggregated_ranges, extremes, misfits
 from wayside.api.eventrule import OF_A_SAMPLE, Aggregate
 from wayside.expressions.columns.values import Column, Tag, value_at
 from wayside.rules import CompiledSignal
@@ -62,6 +62,8 @@ class SignalColumns:
         """The signals and their places, by the stream that they read."""
         for key, at in self._keys.items():
             self._by_stream.setdefault(key.stream, []).append((at, key))
+        self._nested = _nested(self._keys)
+        """The signals that differ in the length of their windows alone, from the shortest on."""
 
     def watch_all_streams(self) -> None:
         """Know of every stream whether it is fresh: some rule reads it."""
@@ -105,10 +107,11 @@ class SignalColumns:
             high, lows = self._ranges(block, stream, {key.over for _, key in keys}, floor)
             if keys:
                 self._fill(stream, block, high, [(key, lows[key.over]) for _, key in keys])
+            ready = self._extremes(stream, high, lows)
             for at, key in keys:
                 if not self._shared:
                     self._note_new(block, at, key, high[:, -1], lows[key.over][:, -1])
-                found[at] = self._computed(block, at, key, high, lows)
+                found[at] = self._computed(block, at, key, high, lows, ready.get(at))
             self._watch(block, stream, high, keys)
         for at, track, signal in self._over_rules:
             found[at] = of_episodes(self._context, block, track, signal)
@@ -195,12 +198,34 @@ class SignalColumns:
         for row, signal in self._users[at] if failures else ():
             tables.note(self._tracks[row].counters, signal, failures)
 
-    def _computed(self, block: Block, at: int, key: Key, high: Integers, lows: Mapping[int | None, Integers]) -> Column:
+    def _extremes(self, stream: str, high: Integers, lows: Mapping[int | None, Integers]) -> dict[int, Column]:
+        """The signals of the stream whose windows are computed together."""
+        table, found = self._context.tables.table(stream), dict[int, Column]()
+        for family in self._nested.get(stream, ()):
+            key = family[0][1]
+            column = table.columns[key.used.value or 0]
+            if not column.odd and column.others is None:
+                columns = extremes(key.aggregate, column.values, [lows[each.over] for _, each in family], high)
+                found |= {at: computed for (at, _), computed in zip(family, columns, strict=True)}
+        return found
+
+    def _computed(
+        self,
+        block: Block,
+        at: int,
+        key: Key,
+        high: Integers,
+        lows: Mapping[int | None, Integers],
+        ready: Column | None = None,
+    ) -> Column:
+        """A signal at all points; `ready`: its windows, where they are computed already."""
         if key.aggregate is Aggregate.AGE:
             return self._age(block, key)
         table, low = self._context.tables.table(key.stream), lows[key.over]
         if key.used.value is None and key.used.where is None:  # Count
             column = Column((high - low).ravel().astype(float), None, None)
+        elif ready is not None:
+            column = ready
         else:
             value = None if key.used.value is None else table.columns[key.used.value]
             rows = Ranges(
@@ -281,6 +306,19 @@ class SignalColumns:
             self.ages.used(
                 watching, stream, tables.table(stream), tables.duration(stream), block, high, block.latest[stream], seen
             )
+
+
+def _nested(keys: Mapping[Key, int]) -> Mapping[str, Sequence[Sequence[tuple[int, Key]]]]:
+    """By stream, the signals that are Min or Max of the same column over several lengths."""
+    families: dict[tuple[str, Used, Aggregate], list[tuple[int, Key]]] = {}
+    for key, at in sorted(keys.items(), key=lambda each: each[0].over or 0):
+        if key.aggregate in EXTREMES and key.used.where is None and key.over is not None:
+            families.setdefault((key.stream, key.used, key.aggregate), []).append((at, key))
+    found: dict[str, list[Sequence[tuple[int, Key]]]] = {}
+    for (stream, _, _), family in families.items():
+        if len(family) > 1:
+            found.setdefault(stream, []).append(family)
+    return found
 
 
 def _needs_all(key: Key) -> bool:

@@ -22,6 +22,8 @@ from wayside.expressions.columns.values import Column, Tag, Texts, value_at
 Numbers = NDArray[np.float64]
 Tags = NDArray[np.uint8]
 
+EXTREMES: Final = frozenset({Aggregate.MIN, Aggregate.MAX})
+
 _HUGE = 1e290
 """Sums of numbers up to here do not overflow."""
 
@@ -56,6 +58,32 @@ class Ranges:
         self.others = None if self.others is None else self.others[keep]
 
 
+def extremes(aggregate: Aggregate, values: Numbers, lows: Sequence[Integers], high: Integers) -> list[Column]:
+    """The aggregate Min or Max of windows of several lengths that end at the same rows, from the shortest on.
+
+    All rows are numbers. Each row is looked at once, not once for each length. Shapes: values (N,), lows and high any.
+    """
+    begin = int(lows[-1].min(initial=len(values)))
+    end = max(int(high.max(initial=0)), begin)
+    longer = values[begin : end + 1] if end < len(values) else np.append(values[begin:end], 0.0)
+    borders = np.stack([*(low.ravel() for low in reversed(lows)), high.ravel()], axis=1) - begin
+    least = np.minimum if aggregate is Aggregate.MIN else np.maximum
+    parts = least.reduceat(longer, borders.ravel()).reshape(borders.shape)[:, :-1]
+    # A part without rows: reduceat gives the row at which it would begin.
+    nothing = np.inf if aggregate is Aggregate.MIN else -np.inf
+    parts = np.where(borders[:, 1:] > borders[:, :-1], parts, nothing)
+    found = least.accumulate(parts[:, ::-1], axis=1) + 0.0  # which of two zeros wins is no matter: no -0.0
+    columns = []
+    for at, low in enumerate(lows):
+        some = (high > low).ravel() & ~np.isnan(found[:, at])
+        if some.all():
+            columns.append(Column(found[:, at], None, None))
+        else:
+            tags = np.where(some, Tag.NUMBER, Tag.ABSENT).astype(np.uint8)
+            columns.append(Column(np.where(some, found[:, at], 0.0), tags, None))
+    return columns
+
+
 def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Column:
     """The aggregate of each range, flat. Values that the aggregate does not take are left out: see `misfits`."""
     low, high = rows.low.ravel(), rows.high.ravel()
@@ -83,11 +111,10 @@ def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Colum
     if aggregate in (Aggregate.RATE, Aggregate.STD_DEV):
         return _each(aggregate, rows, texts)
     some = count > (1 if aggregate is Aggregate.DELTA else 0)
+    if aggregate in EXTREMES:
+        return extremes(aggregate, rows.values, [rows.low], rows.high)[0]
     values = np.append(rows.values, 0.0)
-    if aggregate in (Aggregate.MIN, Aggregate.MAX):
-        least = np.minimum if aggregate is Aggregate.MIN else np.maximum
-        found = least.reduceat(values, _pairs(low, high))[::2] + 0.0  # which of two zeros wins is no matter: no -0.0
-    elif aggregate is Aggregate.DELTA:
+    if aggregate is Aggregate.DELTA:
         with np.errstate(all="ignore"):
             found = values[np.maximum(high - 1, 0)] - values[low] + 0.0
     else:

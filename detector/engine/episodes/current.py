@@ -46,7 +46,7 @@ class Episode:
 
     def started(self, rule: CompiledRule, identity: Identity) -> Event:
         """The event of its start, with what is rendered for the rule's actions as they are now."""
-        rendered = {action.name: render(action, self.variables) for action in rule.actions}
+        rendered = {action.name: render(action, self.variables) for action in rule.actions} if rule.actions else {}
         return self._event(rule, identity, None, None, self.values, rendered)
 
     def ended(
@@ -144,8 +144,13 @@ class Episode:
             reason=reason,
             values=values,
             classification=rule.classification,
-            models={model.name: model.runner.sha256 for model in rule.models if model.runner is not None},
+            models=_models(rule) if rule.models else {},
             element=self.subject.element,
             dry_run=rule.dry_run,
             rendered=rendered,
         )
+
+
+def _models(rule: CompiledRule) -> dict[str, str]:
+    """The digests of the rule's models, by name."""
+    return {model.name: model.runner.sha256 for model in rule.models if model.runner is not None}

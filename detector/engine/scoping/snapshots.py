@@ -48,12 +48,14 @@ def _member(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
-    names = [signal.name for signal in rule.signals]
-    if rule.models:
-        names += [model.name for model in rule.models]
-    return {
-        name: value if type(value := view[name]) in _PLAIN else _without_bytes(value) for name in names if name in view
-    }
+    values: dict[str, Any] = {}
+    for signals in (rule.signals, rule.models):
+        for signal in signals:
+            name = signal.name
+            if name in view:
+                value = view[name]
+                values[name] = value if type(value) in _PLAIN else _without_bytes(value)
+    return values
 
 
 def _without_bytes(value: Any) -> Any:
