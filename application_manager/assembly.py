@@ -18,6 +18,7 @@ from application_manager.cluster.nodes import NodeLook
 from application_manager.cluster.store import Name
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey
+from application_manager.headroom import Headroom
 from application_manager.knowledge.detectorbook import DetectorBook
 from application_manager.knowledge.world import DETECTOR, INSTANCE, TASK, TEMPLATE, World
 from application_manager.measures import Measures
@@ -74,7 +75,9 @@ class Assembly:
         measures: Measures,
         traced: Tracing | None,
     ) -> None:
-        self.world = World(options.policy, options.max_instances)
+        headroom = Headroom(options.memory_limit)
+        measures.registry.register(headroom)
+        self.world = World(options.policy, options.max_instances, headroom.tight, options.tasks)
         self._traces = None if traced is None else TaskTraces(traced, self.world)
         if traced is not None:
             measures.registry.register(LostSpans(traced))
@@ -129,6 +132,7 @@ class Assembly:
             self._configurations.add,
         )
         self.world.claims.settled = self.router.settled
+        self.world.claims.moved = self.router.claimed
         self._status_work = InstanceStatusWork(
             world=self.world,
             client=client,

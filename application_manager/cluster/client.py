@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 from urllib.parse import urlencode
@@ -31,12 +31,16 @@ Object = dict[str, Any]
 """A Kubernetes object, as JSON."""
 
 FIELD_MANAGER = "wayside"
+PAGE = 50
+"""Objects that a list brings at a time: each may have 1.5 MB."""
+
 _APPLY = "application/apply-patch+yaml"
 _MERGE = "application/merge-patch+json"
 _JSON = "application/json"
 _TIMEOUT = 15.0  # s for one request
 _CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
 _PATIENCE = 30.0  # s in which a request is asked again that the API server did not look at
+_RESTARTS = 3  # of a list whose rest is not there any more
 _NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
 _BAD_MANIFEST = "failed to create typed patch object"
 
@@ -155,16 +159,46 @@ class Client:
                 return None
             raise
 
+    async def pages(
+        self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", size: int = PAGE
+    ) -> AsyncIterator[tuple[list[Object], str]]:
+        """The objects and the version of `list`, `size` at a time, so that no more of them are in memory at once.
+
+        Should the rest not be there any more (410), it begins anew, and objects may come twice.
+        """
+        kind = {"apiVersion": resource.api_version, "kind": resource.kind}
+        query = {"labelSelector": labels, "fieldSelector": fields, "limit": str(size)}
+        rest, restarts = "", 0
+        while True:
+            asked = {key: value for key, value in {**query, "continue": rest}.items() if value}
+            try:
+                answer = await self._request("GET", resource.path(namespace), asked)
+            except ApiError as error:
+                if error.code != 410 or not rest or restarts == _RESTARTS:
+                    raise
+                rest, restarts = "", restarts + 1
+                continue
+            metadata = answer["metadata"]
+            yield [{**kind, **item} for item in answer["items"]], metadata["resourceVersion"]
+            rest = metadata.get("continue", "")
+            if not rest:
+                return
+
     async def list(
         self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", limit: int = 0
     ) -> tuple[list[Object], str]:
-        """The objects, with apiVersion and kind, and the resourceVersion of the list; read from the storage itself."""
-        query = {"labelSelector": labels, "fieldSelector": fields, "limit": str(limit) if limit else ""}
-        answer = await self._request(
-            "GET", resource.path(namespace), {key: value for key, value in query.items() if value}
-        )
-        kind = {"apiVersion": resource.api_version, "kind": resource.kind}
-        return [{**kind, **item} for item in answer["items"]], answer["metadata"]["resourceVersion"]
+        """The objects, with apiVersion and kind, and the resourceVersion of the list; read from the storage itself.
+
+        `limit`: so many at most; 0: all of them.
+        """
+        found: list[Object] = []
+        version = ""
+        async for page, as_of in self.pages(resource, namespace, labels=labels, fields=fields, size=limit or PAGE):
+            found += page
+            version = as_of
+            if limit:
+                break
+        return found, version
 
     async def apply(self, resource: Resource, manifest: Object) -> Object:
         """Server-side apply, as the one field manager that we are."""
@@ -187,6 +221,16 @@ class Client:
         body = {"metadata": {"uid": uid, "annotations": dict(annotations)}}
         query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
         return await self._request("PATCH", resource.path(namespace, name), query, body, _MERGE)
+
+    async def merge(self, resource: Resource, namespace: str, name: str, body: Object) -> bool:
+        """Merge into the object; whether it was there."""
+        try:
+            await self._request("PATCH", resource.path(namespace, name), {"fieldManager": FIELD_MANAGER}, body, _MERGE)
+        except ApiError as error:
+            if error.code == 404:
+                return False
+            raise
+        return True
 
     async def scale(self, resource: Resource, namespace: str, name: str, version: str, replicas: int) -> Object:
         """Set the replicas of the object by its subresource `scale`, if it is still of this resourceVersion."""

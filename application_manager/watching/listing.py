@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from application_manager.cluster.client import ApiError, Client, Resource, Unreachable
 from application_manager.cluster.starting import until_answered
+from application_manager.cluster.store import Name, name_of
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.knowledge.world import World
 from application_manager.measures import Measures
@@ -73,9 +74,12 @@ class Listing:
 
     async def _list(self, resource: Resource, labels: str) -> None:
         for namespace in self.namespaces or (None,):
-            listed, version = await self.client.list(resource, namespace, labels=labels)
-            for raw in listed:
-                self.router.observe(raw)
+            present, version = set[Name](), "0"
+            async for page, as_of in self.client.pages(resource, namespace, labels=labels):
+                version = as_of
+                for raw in page:
+                    present.add(name_of(raw))
+                    self.router.observe(raw)
             kind = (resource.api_version, resource.kind)
-            for entry in self.world.store.missing(kind, listed, version, namespace):
+            for entry in self.world.store.missing(kind, present, version, namespace):
                 self.router.vanished(entry.raw)

@@ -13,7 +13,7 @@ from typing import Any
 
 import kopf
 
-from application_manager.cluster.client import LEASES, Object, Resource
+from application_manager.cluster.client import LEASES, PAGE, Object, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
 from wayside.leases import holder_of
@@ -22,6 +22,7 @@ News = Callable[[Object], None]
 
 _PAUSES = (0.1, 0.2, 0.5)  # s, between attempts to reach the API server; then the last again and again
 _LONG_PAUSE = 1.0  # s
+_IDLE = 0.1  # s that kopf keeps an object's last event, and a task for the object, after it was handled
 
 
 class _Pauses:
@@ -58,6 +59,8 @@ async def watch(
     settings.networking.request_timeout = 15
     settings.networking.connect_timeout = 5
     settings.watching.inactivity_timeout = NEVER  # see pulse
+    settings.watching.chunk_size = PAGE
+    settings.queueing.idle_timeout = _IDLE
     settings.process.ultimate_exiting_timeout = None
     settings.queueing.exit_timeout = 0.1  # s; what is lost by stopping at once is seen again at the next start
 

@@ -54,6 +54,8 @@ class Router:
         old = self.world.store.get(kind, name)
         entry = self.world.store.put(raw)
         if entry is None:
+            if kind == TASK and name in self.world.store.shed:
+                self.task(name)
             return
         if old is not None and old.uid != entry.uid:
             self.applier.forget(old.raw)
@@ -67,7 +69,7 @@ class Router:
             if old is None or _written(old) != _written(entry):
                 self._rules(name[0])
         else:
-            self._child(old, entry)
+            self._child(raw, old, entry)
 
     def vanished(self, raw: Object) -> None:
         """Take the news that an object is gone."""
@@ -142,7 +144,7 @@ class Router:
     def _template(self, name: Name, old: Entry | None, entry: Entry) -> None:
         self.template(name)
         self.world.note_limits(name)
-        if old is None or old.uid != entry.uid or old.raw["spec"] != entry.raw["spec"]:
+        if old is None or old.uid != entry.uid or _written(old)[:2] != _written(entry)[:2]:
             self._claim_again(name)
             self._rules(name[0])
 
@@ -162,9 +164,9 @@ class Router:
         if (old is None or old.uid != entry.uid) and isinstance(entry.model, ApplicationInstance):
             self.template((name[0], entry.model.spec.template))
 
-    def _child(self, old: Entry | None, entry: Entry) -> None:
-        if kind_of(entry.raw) == POD:
-            if self.world.pods.note(entry.raw):
+    def _child(self, raw: Object, old: Entry | None, entry: Entry) -> None:
+        if kind_of(raw) == POD:
+            if self.world.pods.note(raw):
                 self._ask_for_owner(entry.raw)
             if _is_a_workloads(entry.raw):
                 return  # that its pods are ready, a workload says itself
@@ -233,9 +235,9 @@ def _instance_of(raw: Object) -> Name | None:
     return (raw["metadata"]["namespace"], owner) if owner else None
 
 
-def _written(entry: Entry) -> tuple[object, object]:
-    """What people write of a rule or a detector."""
-    return entry.raw["spec"], entry.raw["metadata"].get("labels")
+def _written(entry: Entry) -> tuple[object, ...]:
+    """What people write of a rule or a detector, or what is wrong with that."""
+    return entry.raw["spec"], entry.problem, entry.raw["metadata"].get("labels")
 
 
 def _is_a_workloads(pod: Object) -> bool:
