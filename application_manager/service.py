@@ -13,6 +13,7 @@ import signal
 from collections.abc import Coroutine
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import kopf
 
@@ -215,11 +216,15 @@ class Manager:
             self._listing.children,
             observe=self._work.router.observe,
             vanished=self._work.router.vanished,
+            relist=self._relist,
             connect=self._connection,
             namespaces=self._options.namespaces,
             ready=watching,
             pulse=self._pulse,
         )
+
+    async def _relist(self, resource: Any, namespace: str | None) -> None:
+        await self._listing.again(resource.group, resource.plural, namespace)
 
     async def _connection(self) -> kopf.ConnectionInfo:
         configuration = self._client.configuration

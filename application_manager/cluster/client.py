@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 from urllib.parse import urlencode
@@ -117,6 +117,19 @@ LEASES = Resource("coordination.k8s.io/v1", "Lease", "leases")
 EVENTS = Resource("events.k8s.io/v1", "Event", "events")
 
 
+class _ListMetadata(msgspec.Struct):
+    resource_version: str = msgspec.field(name="resourceVersion")
+    rest: str = msgspec.field(name="continue", default="")
+
+
+class _Page(msgspec.Struct):
+    metadata: _ListMetadata
+    items: list[msgspec.Raw] | None = None
+
+
+_DECODE_PAGE = msgspec.json.Decoder(_Page).decode
+
+
 class Client:
     """The verbs. Each raises ApiError where the API server refuses, and Unreachable where it does not answer.
 
@@ -161,10 +174,11 @@ class Client:
 
     async def pages(
         self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", size: int = PAGE
-    ) -> AsyncIterator[tuple[list[Object], str]]:
-        """The objects and the version of `list`, `size` at a time, so that no more of them are in memory at once.
+    ) -> AsyncIterator[tuple[Iterator[Object], str]]:
+        """The objects and the version of `list`, `size` at a time.
 
-        Should the rest not be there any more (410), it begins anew, and objects may come twice.
+        Each object is decoded when it is reached: Python needs up to twenty times the size of the text. Should the
+        rest not be there any more (410), the list begins anew, and objects may come twice.
         """
         kind = {"apiVersion": resource.api_version, "kind": resource.kind}
         query = {"labelSelector": labels, "fieldSelector": fields, "limit": str(size)}
@@ -172,15 +186,14 @@ class Client:
         while True:
             asked = {key: value for key, value in {**query, "continue": rest}.items() if value}
             try:
-                answer = await self._request("GET", resource.path(namespace), asked)
+                answer = _DECODE_PAGE(await self._asked("GET", resource.path(namespace), asked))
             except ApiError as error:
                 if error.code != 410 or not rest or restarts == _RESTARTS:
                     raise
                 rest, restarts = "", restarts + 1
                 continue
-            metadata = answer["metadata"]
-            yield [{**kind, **item} for item in answer["items"]], metadata["resourceVersion"]
-            rest = metadata.get("continue", "")
+            yield ({**kind, **self._decode(item)} for item in answer.items or ()), answer.metadata.resource_version
+            rest = answer.metadata.rest
             if not rest:
                 return
 
@@ -296,6 +309,18 @@ class Client:
         *,
         writes: bool | None = None,
     ) -> Object:
+        return cast("Object", self._decode(await self._asked(method, path, query, body, content_type, writes=writes)))
+
+    async def _asked(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None = None,
+        body: Object | None = None,
+        content_type: str = _JSON,
+        *,
+        writes: bool | None = None,
+    ) -> bytes:
         """Ask, and ask again what the API server did not look at, as long as it keeps to a reasonable time."""
         deadline = time.monotonic() + _PATIENCE
         changes = method != "GET" if writes is None else writes
@@ -312,7 +337,7 @@ class Client:
 
     async def _ask(
         self, method: str, path: str, query: dict[str, str], body: Object | None, content_type: str, writes: bool
-    ) -> Object:
+    ) -> bytes:
         headers = {"Accept": _JSON, "Content-Type": content_type, "User-Agent": "wayside-application-manager"}
         token = await self.configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
         if token:
@@ -341,7 +366,7 @@ class Client:
             self._measures.asked(method, time.monotonic() - began, code)
         if response.status >= 400:
             raise self._error(response.status, raw, response.headers.get("Retry-After"))
-        return cast("Object", self._decode(raw))
+        return cast("bytes", raw)
 
     def _error(self, code: int, raw: bytes, retry_after: str | None) -> ApiError:
         seconds = float(retry_after) if retry_after and retry_after.isdigit() else None

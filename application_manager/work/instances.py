@@ -244,9 +244,9 @@ class InstanceWork:
             return False
         # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
         fields = f"spec.template={instance.spec.template}"
-        listed, _ = await self.client.list(self.tasks, name[0], fields=fields)
-        for raw in listed:
-            self.observe(raw)
+        async for page, _ in self.client.pages(self.tasks, name[0], fields=fields):
+            for raw in page:
+                self.observe(raw)
         over = self._over(name)
         if over is None:
             return False

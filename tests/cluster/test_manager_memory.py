@@ -12,11 +12,11 @@ from tests.cluster.managed_world import condition, start_manager, task, template
 from tests.cluster.processes import Process, Processes
 
 MIB = 1024 * 1024
-MANY, PIECE = 40, 60_000
-"""Tasks, and characters of one of their values: the API server takes no more than 65,536 in one."""
+MANY, VALUES, ITEMS = 10, 83, 4000
+"""Tasks, their values and the items of each: the API server takes no more than 4,096 in one."""
 
-GROWTH = 200 * MIB
-"""Memory that 40 tasks of 1 MB may take. All their values in memory take over 300 MiB at the least."""
+GROWTH = 100 * MIB
+"""Memory that these tasks of 1 MB may take. With all their values in memory they take 200 MiB."""
 
 
 def event(values: dict[str, Any]) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def test_tasks_of_a_megabyte_take_little_memory(api: Api, manager: Process) -> N
     wait_settled(api)
     before = manager.resident_bytes()
     for number in range(MANY):
-        values = {f"x{index}": "x" * PIECE for index in range(16)}
+        values = {f"x{index}": [[]] * ITEMS for index in range(VALUES)}
         api.create(with_spec(task(f"large-{number}"), event=event(values)))
     wait_settled(api)
     assert manager.resident_bytes() - before < GROWTH
