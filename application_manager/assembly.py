@@ -107,7 +107,8 @@ class Assembly:
             lambda name: self._rules.add((DETECTOR, name)),
             SidecarNews(self.world, self.book, self.recorder),
         )
-        self.detectors: WorkQueue[Name] = WorkQueue("detector", detectors.reconcile, 1, self._instances, measures)
+        self._detector_work = detectors
+        self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measures)
         queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
         measures.registry.register(Overview(self.world, lambda: [(each.name, *each.depth) for each in queues]))
         self.publisher = Publisher(options.zenoh)
@@ -133,6 +134,8 @@ class Assembly:
         )
         self.world.claims.settled = self.router.settled
         self.world.claims.moved = self.router.claimed
+        self.world.overlap.every = options.resync
+        self.world.overlap.resumed = lambda _: self.router.everything()
         self._status_work = InstanceStatusWork(
             world=self.world,
             client=client,
@@ -189,6 +192,7 @@ class Assembly:
             templates=resources[TEMPLATE],
             observe=self.router.observe,
             pool=self.pool,
+            again=self._templates.add_at,
         )
         self._rule_work = RuleWork(
             world=self.world,
@@ -227,22 +231,31 @@ class Assembly:
             self._configurations.add(name)
 
     async def _reconcile_instance(self, name: Name) -> None:
+        if self.world.overlap.yields(name[0]):
+            return
         if self._traces is None:
             await self._instance_work.reconcile(name)
         else:
             await self._traces.reconciling(name, self._instance_work.reconcile)
 
     async def _say_instance(self, name: Name) -> None:
-        await self._status_work.reconcile(name)
+        if not self.world.overlap.yields(name[0]):
+            await self._status_work.reconcile(name)
 
     async def _reconcile_task(self, name: Name) -> None:
-        await self._task_work.reconcile(name)
+        if not self.world.overlap.yields(name[0]):
+            await self._task_work.reconcile(name)
 
     async def _reconcile_template(self, name: Name) -> None:
         await self._template_work.reconcile(name)
 
+    async def _reconcile_detector(self, name: Name) -> None:
+        if not self.world.overlap.yields(name[0]):
+            await self._detector_work.reconcile(name)
+
     async def _reconcile_rule(self, key: RuleKey) -> None:
-        await self._rule_work.reconcile(key)
+        if not self.world.overlap.yields(key[1][0]):
+            await self._rule_work.reconcile(key)
 
     def _judge(self, key: RuleKey) -> None:
         """Ask for a rule or Detector to be judged, soon; a Detector's objects are looked after before."""

@@ -29,13 +29,13 @@ from tests.cluster.crds import CRDS
 TARGET = 300  # MiB that the large tasks may take more than the small ones, at the largest; 40 of them are 40 MB
 SETTLED = 8.0  # s after the last status: two resyncs
 PATIENCE = 120.0  # s
-_ITEMS = 4000  # of one value, each 3 bytes as JSON and 64 in Python; the API server takes no more than 4,096
+_ITEMS = 4000  # of one value, each 9 bytes as JSON and 64 in Python; the API server takes no more than 4,096
 
 
 def large(namespace: str, number: int, size: int) -> dict[str, Any]:
     """A task with `size` bytes of free data, in an instance of its own."""
     made = task(namespace, f"t{number}")
-    values = {f"x{index}": [[]] * _ITEMS for index in range(size // (3 * _ITEMS))}
+    values = {f"x{index}": [f"v{item:05}" for item in range(_ITEMS)] for index in range(size // (9 * _ITEMS))}
     time = "2026-01-01T00:00:00Z"
     event = {"id": f"e{number}", "rule": "r", "action": "a", "subject": "s", "onsetTime": time, "startTime": time}
     return {**made, "spec": {**made["spec"], "event": {**event, "values": values}}}

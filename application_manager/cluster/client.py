@@ -31,15 +31,14 @@ Object = dict[str, Any]
 """A Kubernetes object, as JSON."""
 
 FIELD_MANAGER = "wayside"
-PAGE = 50
-"""Objects that a list brings at a time: each may have 1.5 MB."""
-
 _APPLY = "application/apply-patch+yaml"
 _MERGE = "application/merge-patch+json"
 _JSON = "application/json"
 _TIMEOUT = 15.0  # s for one request
 _CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
 _PATIENCE = 30.0  # s in which a request is asked again that the API server did not look at
+_FIRST, _MOST = 10, 100  # objects of a list's first page, and of any: each may have 1.5 MB
+_PAGE_BYTES = 4 * 1024 * 1024
 _RESTARTS = 3  # of a list whose rest is not there any more
 _NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
 _BAD_MANIFEST = "failed to create typed patch object"
@@ -173,25 +172,28 @@ class Client:
             raise
 
     async def pages(
-        self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", size: int = PAGE
+        self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", size: int = _FIRST
     ) -> AsyncIterator[tuple[Iterator[Object], str]]:
-        """The objects and the version of `list`, `size` at a time.
+        """The objects and the version of `list`, page by page: `size` at first, then as many as make some 4 MiB.
 
         Each object is decoded when it is reached: Python needs up to twenty times the size of the text. Should the
         rest not be there any more (410), the list begins anew, and objects may come twice.
         """
         kind = {"apiVersion": resource.api_version, "kind": resource.kind}
-        query = {"labelSelector": labels, "fieldSelector": fields, "limit": str(size)}
+        query = {"labelSelector": labels, "fieldSelector": fields}
         rest, restarts = "", 0
         while True:
-            asked = {key: value for key, value in {**query, "continue": rest}.items() if value}
+            asked = {key: value for key, value in {**query, "limit": str(size), "continue": rest}.items() if value}
             try:
-                answer = _DECODE_PAGE(await self._asked("GET", resource.path(namespace), asked))
+                text = await self._asked("GET", resource.path(namespace), asked)
             except ApiError as error:
                 if error.code != 410 or not rest or restarts == _RESTARTS:
                     raise
                 rest, restarts = "", restarts + 1
                 continue
+            answer = _DECODE_PAGE(text)
+            size = max(1, min(_MOST, _PAGE_BYTES * len(answer.items or ()) // len(text)))
+            del text
             yield ({**kind, **self._decode(item)} for item in answer.items or ()), answer.metadata.resource_version
             rest = answer.metadata.rest
             if not rest:
@@ -206,7 +208,7 @@ class Client:
         """
         found: list[Object] = []
         version = ""
-        async for page, as_of in self.pages(resource, namespace, labels=labels, fields=fields, size=limit or PAGE):
+        async for page, as_of in self.pages(resource, namespace, labels=labels, fields=fields, size=limit or _FIRST):
             found += page
             version = as_of
             if limit:

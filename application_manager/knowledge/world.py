@@ -23,6 +23,7 @@ from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.policy import KindKey, Policy
 from application_manager.core.statuses.status import Service
 from application_manager.knowledge.claimbook import ClaimBook
+from application_manager.knowledge.overlapbook import OverlapBook
 from application_manager.knowledge.placebook import PlaceBook
 from application_manager.knowledge.podbook import PodBook
 from application_manager.knowledge.turnbook import TurnBook
@@ -96,6 +97,7 @@ class World:
     records: dict[Name, Record] = field(default_factory=dict)
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
     turns: TurnBook = field(default_factory=TurnBook)
+    overlap: OverlapBook = field(default_factory=OverlapBook)
     places: PlaceBook = field(init=False)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
     exceeded: dict[Name, dict[Name, str]] = field(default_factory=dict)
@@ -281,6 +283,7 @@ class World:
         """Drop what was found of a template."""
         self._findings.pop(name, None)
         self.exceeded.pop(name, None)
+        self.overlap.forget(name)
 
 
 def _version(template: ApplicationTemplate) -> tuple[str, int]:

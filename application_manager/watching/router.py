@@ -6,6 +6,7 @@ News are watch events, answers to our own writes, and lists; all take the same w
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from application_manager.core.objects.suspension import pods_left
 from application_manager.knowledge.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, POD, TASK, TEMPLATE, World
 from application_manager.work.rulework import RuleKey
 from wayside.api import ApplicationInstance
+from wayside.api.applicationtemplate import ApplicationTemplateStatus
 from wayside.leases import holder_of
 
 Ask = Callable[[Name], None]
@@ -142,6 +144,8 @@ class Router:
             self.instance(name)
 
     def _template(self, name: Name, old: Entry | None, entry: Entry) -> None:
+        status = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
+        self.world.overlap.note(name, status.manager, time.time())
         self.template(name)
         self.world.note_limits(name)
         if old is None or old.uid != entry.uid or _written(old)[:2] != _written(entry)[:2]:

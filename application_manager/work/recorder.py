@@ -76,6 +76,7 @@ class Reason(StrEnum):
     QUOTA_EXCEEDED = "QuotaExceeded"
     ADMISSION_REFUSED = "AdmissionRefused"
     NOT_INJECTED = "NotInjected"
+    MANAGERS_OVERLAP = "ManagersOverlap"
 
 
 _OF_CONDITION = {
@@ -105,6 +106,7 @@ _OWN_REASONS = frozenset(
         Reason.HOLDER_LOST,
         Reason.TEMPLATE_INVALID,
         Reason.NOT_INJECTED,
+        Reason.MANAGERS_OVERLAP,
     }
     | _TROUBLES
 )

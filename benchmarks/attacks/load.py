@@ -26,6 +26,7 @@ from typing import Any
 from application_manager.cluster.client import Client
 from application_manager.cluster.connection import load_configuration
 from application_manager.core.claims.claims import instance_name
+from benchmarks.manager_memory import large
 from benchmarks.task_to_deployment import (
     PATIENCE,
     TASKS,
@@ -73,13 +74,6 @@ async def bombing(client: Client, namespace: str, number: int) -> None:
         raw = await client.create(TASKS, made)
         await asyncio.sleep(2.0)
         await client.delete(TASKS, namespace, made["metadata"]["name"], raw["metadata"]["uid"])
-
-
-def large(namespace: str, number: int) -> dict[str, Any]:
-    """A task with as much free data as an object may have."""
-    made = task(namespace, f"large{number}")
-    event = {"rule": "r", "episode": f"e{number}", "startTime": "2026-01-01T00:00:00Z", "values": {"x": "x" * LARGE}}
-    return {**made, "spec": {**made["spec"], "event": event}}
 
 
 class Measured:

@@ -12,11 +12,11 @@ from tests.cluster.managed_world import condition, start_manager, task, template
 from tests.cluster.processes import Process, Processes
 
 MIB = 1024 * 1024
-MANY, VALUES, ITEMS = 10, 83, 4000
+MANY, VALUES, ITEMS = 20, 28, 4000
 """Tasks, their values and the items of each: the API server takes no more than 4,096 in one."""
 
-GROWTH = 100 * MIB
-"""Memory that these tasks of 1 MB may take. With all their values in memory they take 200 MiB."""
+GROWTH = 70 * MIB
+"""Memory that these tasks of 1 MB may take. With all their values in memory they take 140 MiB at the least."""
 
 
 def event(values: dict[str, Any]) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def test_tasks_of_a_megabyte_take_little_memory(api: Api, manager: Process) -> N
     wait_settled(api)
     before = manager.resident_bytes()
     for number in range(MANY):
-        values = {f"x{index}": [[]] * ITEMS for index in range(VALUES)}
+        values = {f"x{index}": [f"v{item:05}" for item in range(ITEMS)] for index in range(VALUES)}
         api.create(with_spec(task(f"large-{number}"), event=event(values)))
     wait_settled(api)
     assert manager.resident_bytes() - before < GROWTH
