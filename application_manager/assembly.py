@@ -18,6 +18,7 @@ from application_manager.cluster.nodes import NodeLook
 from application_manager.cluster.store import Name
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey
+from application_manager.headroom import Headroom
 from application_manager.knowledge.detectorbook import DetectorBook
 from application_manager.knowledge.world import DETECTOR, INSTANCE, TASK, TEMPLATE, World
 from application_manager.measures import Measures
@@ -74,7 +75,9 @@ class Assembly:
         measures: Measures,
         traced: Tracing | None,
     ) -> None:
-        self.world = World(options.policy, options.max_instances)
+        headroom = Headroom(options.memory_limit)
+        measures.registry.register(headroom)
+        self.world = World(options.policy, options.max_instances, headroom.tight, options.tasks)
         self._traces = None if traced is None else TaskTraces(traced, self.world)
         if traced is not None:
             measures.registry.register(LostSpans(traced))
@@ -104,7 +107,8 @@ class Assembly:
             lambda name: self._rules.add((DETECTOR, name)),
             SidecarNews(self.world, self.book, self.recorder),
         )
-        self.detectors: WorkQueue[Name] = WorkQueue("detector", detectors.reconcile, 1, self._instances, measures)
+        self._detector_work = detectors
+        self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measures)
         queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
         measures.registry.register(Overview(self.world, lambda: [(each.name, *each.depth) for each in queues]))
         self.publisher = Publisher(options.zenoh)
@@ -129,6 +133,9 @@ class Assembly:
             self._configurations.add,
         )
         self.world.claims.settled = self.router.settled
+        self.world.claims.moved = self.router.claimed
+        self.world.overlap.every = options.resync
+        self.world.overlap.resumed = lambda _: self.router.everything()
         self._status_work = InstanceStatusWork(
             world=self.world,
             client=client,
@@ -185,6 +192,7 @@ class Assembly:
             templates=resources[TEMPLATE],
             observe=self.router.observe,
             pool=self.pool,
+            again=self._templates.add_at,
         )
         self._rule_work = RuleWork(
             world=self.world,
@@ -223,22 +231,31 @@ class Assembly:
             self._configurations.add(name)
 
     async def _reconcile_instance(self, name: Name) -> None:
+        if self.world.overlap.yields(name[0]):
+            return
         if self._traces is None:
             await self._instance_work.reconcile(name)
         else:
             await self._traces.reconciling(name, self._instance_work.reconcile)
 
     async def _say_instance(self, name: Name) -> None:
-        await self._status_work.reconcile(name)
+        if not self.world.overlap.yields(name[0]):
+            await self._status_work.reconcile(name)
 
     async def _reconcile_task(self, name: Name) -> None:
-        await self._task_work.reconcile(name)
+        if not self.world.overlap.yields(name[0]):
+            await self._task_work.reconcile(name)
 
     async def _reconcile_template(self, name: Name) -> None:
         await self._template_work.reconcile(name)
 
+    async def _reconcile_detector(self, name: Name) -> None:
+        if not self.world.overlap.yields(name[0]):
+            await self._detector_work.reconcile(name)
+
     async def _reconcile_rule(self, key: RuleKey) -> None:
-        await self._rule_work.reconcile(key)
+        if not self.world.overlap.yields(key[1][0]):
+            await self._rule_work.reconcile(key)
 
     def _judge(self, key: RuleKey) -> None:
         """Ask for a rule or Detector to be judged, soon; a Detector's objects are looked after before."""

@@ -24,6 +24,7 @@ from wayside.inputerror import InputError
 if TYPE_CHECKING:
     from application_manager.admission.reviewing import Serving
     from application_manager.cluster.leadership import LeaseKey
+    from application_manager.core.holders.policies import TaskPolicy
     from application_manager.core.objects.poddefaults import PodDefaults
     from application_manager.core.objects.policy import Policy
 
@@ -86,6 +87,15 @@ def _seconds(option: str, written: str) -> float:
         raise typer.BadParameter(str(error), param_hint=option) from None
 
 
+def _bytes(option: str, written: str) -> int:
+    from wayside.api.base import PositiveQuantity
+
+    try:
+        return PositiveQuantity.parse(written).bytes
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from None
+
+
 def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
     from application_manager.core.objects.policy import Policy
 
@@ -93,6 +103,15 @@ def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
         return Policy.parse(kinds, accounts)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
+
+
+def _tasks(most: int | None, holders: list[str] | None) -> TaskPolicy:
+    from application_manager.core.holders.policies import HolderPolicy, TaskPolicy
+
+    try:
+        return TaskPolicy(most, tuple(HolderPolicy.parse(each) for each in holders or ()))
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--holder-policy") from None
 
 
 def _serving(port: int | None, certificates: Path | None) -> Serving | None:
@@ -138,6 +157,18 @@ def run(
         list[str] | None, typer.Option(help="A namespace to look after; repeatable. Default: all.")
     ] = None,
     max_instances: MaxInstances = None,
+    max_tasks: Annotated[
+        int | None,
+        typer.Option(min=1, help="How many unfinished tasks a namespace may have. Default: any number."),
+    ] = None,
+    holder_policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAMESPACE/HOLDER:LIMITS",
+            help="What the tasks of holders may ask for, e.g. town/*:max-tasks=100,max-priority=10,operations=Deploy. "
+            "Repeatable; the first that matches a holder counts. Default: anything.",
+        ),
+    ] = None,
     resync: Annotated[str, typer.Option(metavar="DURATION", help="How often to list everything again.")] = "60s",
     ttl_after_finished: Annotated[
         str, typer.Option(metavar="DURATION", help="How long finished tasks are kept.")
@@ -172,6 +203,14 @@ def run(
             "own.",
         ),
     ] = "3s",
+    memory_limit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="QUANTITY",
+            help="Memory of this manager and its worker processes, e.g. 1Gi: near it, new tasks are not taken in. "
+            "Default: the container's limit.",
+        ),
+    ] = None,
     lease: Annotated[
         str | None,
         typer.Option(
@@ -223,6 +262,7 @@ def run(
 
         from application_manager.charts.chartcache import default_folder
         from application_manager.charts.helm import Helm
+        from application_manager.headroom import container_limit
         from application_manager.options import Options
         from application_manager.service import serve
         from application_manager.work.publishing import settings
@@ -231,11 +271,13 @@ def run(
         policy=_policy(allowed_kinds, service_accounts),
         namespaces=tuple(namespace or ()),
         max_instances=max_instances,
+        tasks=_tasks(max_tasks, holder_policy),
         resync=_seconds("--resync", resync),
         ttl_after_finished=_seconds("--ttl-after-finished", ttl_after_finished),
         stalled_after=_seconds("--stalled-after", stalled_after),
         watch_timeout=_seconds("--watch-timeout", watch_timeout),
         metrics_port=metrics_port,
+        memory_limit=_bytes("--memory-limit", memory_limit) if memory_limit else container_limit(),
         cpu_time=_seconds("--expression-cpu-time", expression_cpu_time),
         zenoh=settings(zenoh) if zenoh else None,
         helm=Helm(helm),

@@ -11,6 +11,7 @@ from application_manager.admission.reviewing import Serving
 from application_manager.charts.chartcache import default_folder
 from application_manager.charts.helm import Helm
 from application_manager.cluster.leadership import LeaseKey
+from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Policy
 from application_manager.observability.pages import STALLED_AFTER
@@ -25,6 +26,7 @@ class Options:
         policy: what templates may create.
         namespaces: those to look at; empty: all.
         max_instances: how many instances a namespace may have; None: any number.
+        tasks: what limits tasks.
         resync: seconds between two full resyncs.
         ttl_after_finished: seconds that finished tasks are kept.
         metrics_port: where metrics and health are served; None: nowhere.
@@ -37,12 +39,14 @@ class Options:
         stalled_after: seconds after which the watchdog ends a manager whose work has stalled.
         watch_timeout: seconds without an event or a bookmark after which a watch is restarted.
         detectors: what holds for the pods of detectors; None: no detector is run.
+        memory_limit: bytes that the manager and its worker processes may have together; None: any number.
         cpu_time: seconds of CPU time that one evaluation of a template's or rule's expressions may take.
     """
 
     policy: Policy = field(default_factory=Policy)
     namespaces: tuple[str, ...] = ()
     max_instances: int | None = None
+    tasks: TaskPolicy = field(default_factory=TaskPolicy)
     resync: float = 60.0
     ttl_after_finished: float = 3600.0
     metrics_port: int | None = None
@@ -55,4 +59,5 @@ class Options:
     stalled_after: float = STALLED_AFTER
     watch_timeout: float = 90.0
     detectors: PodDefaults | None = None
+    memory_limit: int | None = None
     cpu_time: float = CPU_TIME

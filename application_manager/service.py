@@ -13,6 +13,7 @@ import signal
 from collections.abc import Coroutine
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import kopf
 
@@ -38,6 +39,7 @@ from application_manager.watching.listing import Listing
 from application_manager.watching.operator import watch
 from application_manager.watching.pulse import Pulse
 from application_manager.work.acting import acting, ended
+from wayside.api.applicationtemplate import TemplateManager
 from wayside.tracing import Tracing, tracing
 
 log = logging.getLogger(__name__)
@@ -104,6 +106,7 @@ class Manager:
             every=options.resync,
             measures=measures,
         )
+        work.world.overlap.own = self._own_lease
         self._pulse = Pulse(options.watch_timeout, lambda: work.world.healthy.elapsed)
         measures.registry.register(self._pulse)
         self._detector_watch = DetectorWatch(work.world, client, work.book, options.namespaces, work.detectors.add)
@@ -215,11 +218,19 @@ class Manager:
             self._listing.children,
             observe=self._work.router.observe,
             vanished=self._work.router.vanished,
+            relist=self._relist,
             connect=self._connection,
             namespaces=self._options.namespaces,
             ready=watching,
             pulse=self._pulse,
         )
+
+    def _own_lease(self) -> TemplateManager | None:
+        found = self._leadership.lease
+        return TemplateManager(lease=found[0], since=found[1]) if found is not None else None
+
+    async def _relist(self, resource: Any, namespace: str | None) -> None:
+        await self._listing.again(resource.group, resource.plural, namespace)
 
     async def _connection(self) -> kopf.ConnectionInfo:
         configuration = self._client.configuration

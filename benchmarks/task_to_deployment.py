@@ -44,7 +44,7 @@ DEPLOYMENTS = Resource("apps/v1", "Deployment", "deployments")
 NAMESPACES = Resource("v1", "Namespace", "namespaces", namespaced=False)
 AT_ONCE = 16
 BURSTS = 2  # of each kind; either kind begins as often as the other
-TARGET = 1.5  # the most that a task may take in the middle, as a multiple of the raw calls
+TARGET = 1.3  # the most that a task may take in the middle, as a multiple of the raw calls
 PATIENCE = 300.0  # s
 SETTLING = 0.5  # s after each, so that neither is measured amid what the other has set off: ReplicaSets, statuses
 

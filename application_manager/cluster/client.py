@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 from urllib.parse import urlencode
@@ -37,6 +37,9 @@ _JSON = "application/json"
 _TIMEOUT = 15.0  # s for one request
 _CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
 _PATIENCE = 30.0  # s in which a request is asked again that the API server did not look at
+_FIRST, _MOST = 10, 100  # objects of a list's first page, and of any: each may have 1.5 MB
+_PAGE_BYTES = 4 * 1024 * 1024
+_RESTARTS = 3  # of a list whose rest is not there any more
 _NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
 _BAD_MANIFEST = "failed to create typed patch object"
 
@@ -113,6 +116,19 @@ LEASES = Resource("coordination.k8s.io/v1", "Lease", "leases")
 EVENTS = Resource("events.k8s.io/v1", "Event", "events")
 
 
+class _ListMetadata(msgspec.Struct):
+    resource_version: str = msgspec.field(name="resourceVersion")
+    rest: str = msgspec.field(name="continue", default="")
+
+
+class _Page(msgspec.Struct):
+    metadata: _ListMetadata
+    items: list[msgspec.Raw] | None = None
+
+
+_DECODE_PAGE = msgspec.json.Decoder(_Page).decode
+
+
 class Client:
     """The verbs. Each raises ApiError where the API server refuses, and Unreachable where it does not answer.
 
@@ -155,16 +171,49 @@ class Client:
                 return None
             raise
 
+    async def pages(
+        self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", size: int = _FIRST
+    ) -> AsyncIterator[tuple[Iterator[Object], str]]:
+        """The objects and the version of `list`, page by page: `size` at first, then as many as make some 4 MiB.
+
+        Each object is decoded when it is reached: Python needs up to twenty times the size of the text. Should the
+        rest not be there any more (410), the list begins anew, and objects may come twice.
+        """
+        kind = {"apiVersion": resource.api_version, "kind": resource.kind}
+        query = {"labelSelector": labels, "fieldSelector": fields}
+        rest, restarts = "", 0
+        while True:
+            asked = {key: value for key, value in {**query, "limit": str(size), "continue": rest}.items() if value}
+            try:
+                text = await self._asked("GET", resource.path(namespace), asked)
+            except ApiError as error:
+                if error.code != 410 or not rest or restarts == _RESTARTS:
+                    raise
+                rest, restarts = "", restarts + 1
+                continue
+            answer = _DECODE_PAGE(text)
+            size = max(1, min(_MOST, _PAGE_BYTES * len(answer.items or ()) // len(text)))
+            del text
+            yield ({**kind, **self._decode(item)} for item in answer.items or ()), answer.metadata.resource_version
+            rest = answer.metadata.rest
+            if not rest:
+                return
+
     async def list(
         self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", limit: int = 0
     ) -> tuple[list[Object], str]:
-        """The objects, with apiVersion and kind, and the resourceVersion of the list; read from the storage itself."""
-        query = {"labelSelector": labels, "fieldSelector": fields, "limit": str(limit) if limit else ""}
-        answer = await self._request(
-            "GET", resource.path(namespace), {key: value for key, value in query.items() if value}
-        )
-        kind = {"apiVersion": resource.api_version, "kind": resource.kind}
-        return [{**kind, **item} for item in answer["items"]], answer["metadata"]["resourceVersion"]
+        """The objects, with apiVersion and kind, and the resourceVersion of the list; read from the storage itself.
+
+        `limit`: so many at most; 0: all of them.
+        """
+        found: list[Object] = []
+        version = ""
+        async for page, as_of in self.pages(resource, namespace, labels=labels, fields=fields, size=limit or _FIRST):
+            found += page
+            version = as_of
+            if limit:
+                break
+        return found, version
 
     async def apply(self, resource: Resource, manifest: Object) -> Object:
         """Server-side apply, as the one field manager that we are."""
@@ -187,6 +236,16 @@ class Client:
         body = {"metadata": {"uid": uid, "annotations": dict(annotations)}}
         query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
         return await self._request("PATCH", resource.path(namespace, name), query, body, _MERGE)
+
+    async def merge(self, resource: Resource, namespace: str, name: str, body: Object) -> bool:
+        """Merge into the object; whether it was there."""
+        try:
+            await self._request("PATCH", resource.path(namespace, name), {"fieldManager": FIELD_MANAGER}, body, _MERGE)
+        except ApiError as error:
+            if error.code == 404:
+                return False
+            raise
+        return True
 
     async def scale(self, resource: Resource, namespace: str, name: str, version: str, replicas: int) -> Object:
         """Set the replicas of the object by its subresource `scale`, if it is still of this resourceVersion."""
@@ -252,6 +311,18 @@ class Client:
         *,
         writes: bool | None = None,
     ) -> Object:
+        return cast("Object", self._decode(await self._asked(method, path, query, body, content_type, writes=writes)))
+
+    async def _asked(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None = None,
+        body: Object | None = None,
+        content_type: str = _JSON,
+        *,
+        writes: bool | None = None,
+    ) -> bytes:
         """Ask, and ask again what the API server did not look at, as long as it keeps to a reasonable time."""
         deadline = time.monotonic() + _PATIENCE
         changes = method != "GET" if writes is None else writes
@@ -268,7 +339,7 @@ class Client:
 
     async def _ask(
         self, method: str, path: str, query: dict[str, str], body: Object | None, content_type: str, writes: bool
-    ) -> Object:
+    ) -> bytes:
         headers = {"Accept": _JSON, "Content-Type": content_type, "User-Agent": "wayside-application-manager"}
         token = await self.configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
         if token:
@@ -297,7 +368,7 @@ class Client:
             self._measures.asked(method, time.monotonic() - began, code)
         if response.status >= 400:
             raise self._error(response.status, raw, response.headers.get("Retry-After"))
-        return cast("Object", self._decode(raw))
+        return cast("bytes", raw)
 
     def _error(self, code: int, raw: bytes, retry_after: str | None) -> ApiError:
         seconds = float(retry_after) if retry_after and retry_after.isdigit() else None

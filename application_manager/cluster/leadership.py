@@ -94,6 +94,12 @@ class Leadership:
         return self.remaining() > 0
 
     @property
+    def lease(self) -> tuple[str, str] | None:
+        """The Lease's namespace and name, and when it was created; None while it was not seen."""
+        created = self._candidate.created
+        return (str(self._key), created) if created else None
+
+    @property
     def role(self) -> str:
         """What this manager is, in words; empty for the active one."""
         if self.active:

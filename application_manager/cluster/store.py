@@ -7,11 +7,15 @@ newer one, and what was seen deleted does not come back from a list that is olde
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass
 from typing import Any
 
+from application_manager.cluster.client import FIELD_MANAGER
+from application_manager.core.claims.parameters import size_problem
+from application_manager.core.objects import trimming
 from application_manager.core.objects.policy import KindKey
+from wayside.api import ApplicationTask
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
 
@@ -25,7 +29,11 @@ _TOMBSTONES = 10_000  # uids of deleted objects that are remembered; the oldest 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An object as it was seen: raw, and for our own kinds as a model, or why it is none."""
+    """An object as it was seen, without what nobody reads (see `trimming`): raw, and for our own kinds as a model.
+
+    Attributes:
+        problem: why it is no model, or has a part that is too large: then the model is without that part.
+    """
 
     raw: Object
     model: Kind | None = None
@@ -43,11 +51,22 @@ class Entry:
 
 
 class Store:
-    """Objects by kind, then by namespace and name."""
+    """Objects by kind, then by namespace and name.
 
-    def __init__(self, modelled: Iterable[KindKey]) -> None:
-        """`modelled`: the kinds that are ours and have a model."""
+    Attributes:
+        shed: the uids of tasks that were not taken in for want of memory.
+    """
+
+    def __init__(self, modelled: Iterable[KindKey], full: Callable[[], bool] = lambda: False) -> None:
+        """Make an empty one.
+
+        Args:
+            modelled: the kinds that are ours and have a model.
+            full: whether there is no memory for further tasks; those that were served before are always taken in.
+        """
         self._modelled = frozenset(modelled)
+        self._full = full
+        self.shed: dict[Name, str] = {}
         self._objects: dict[KindKey, dict[Name, Entry]] = {}
         self._deleted: OrderedDict[str, None] = OrderedDict()
 
@@ -68,6 +87,11 @@ class Store:
             return None
         if known is not None and known.version >= int(raw["metadata"]["resourceVersion"]):
             return None
+        if known is None and kind[1] == ApplicationTask.__name__:
+            if not _was_served(raw) and self._full():
+                self.shed[name] = uid
+                return None
+            self.shed.pop(name, None)
         entry = self._entry(kind, raw)
         self._objects.setdefault(kind, {})[name] = entry
         return entry
@@ -78,14 +102,15 @@ class Store:
         self._deleted[uid] = None
         if len(self._deleted) > _TOMBSTONES:
             self._deleted.popitem(last=False)
+        if self.shed.get(name_of(raw)) == uid:
+            del self.shed[name_of(raw)]
         known = self.get(kind_of(raw), name_of(raw))
         if known is None or known.uid != uid:
             return None
         return self._objects[kind_of(raw)].pop(name_of(raw))
 
-    def missing(self, kind: KindKey, listed: Iterable[Object], version: str, scope: str | None) -> list[Entry]:
-        """The entries that a list (of the namespace `scope`, None for all) shows to be gone, since it has them not."""
-        present = {name_of(raw) for raw in listed}
+    def missing(self, kind: KindKey, present: Set[Name], version: str, scope: str | None) -> list[Entry]:
+        """The entries that are gone, since a list (of the namespace `scope`, None for all) has only those `present`."""
         return [
             entry
             for name, entry in self.all(kind)
@@ -94,11 +119,23 @@ class Store:
 
     def _entry(self, kind: KindKey, raw: Object) -> Entry:
         if kind not in self._modelled:
-            return Entry(raw)
+            return Entry(trimming.others(raw, FIELD_MANAGER))
+        lean = trimming.own(raw)
         try:
-            return Entry(raw, parse_object(raw))
-        except ValueError as error:  # an object older than its CRD: it is said in the object's status
-            return Entry(raw, problem=str(error))
+            model = parse_object(lean)
+        except ValueError as error:  # too large, or older than its CRD: its status gives the reason
+            return Entry({**lean, "spec": {}}, problem=str(error))
+        problem = ""
+        if isinstance(model, ApplicationTask):
+            problem = size_problem(model.spec.parameters, "spec.parameters")
+            if problem:
+                model = model.model_copy(update={"spec": model.spec.model_copy(update={"parameters": {}})})
+        return Entry(trimming.beside_model(lean), model, problem)
+
+
+def _was_served(raw: Object) -> bool:
+    """Whether the task has, or had, an instance: without the task, that would be released."""
+    return bool((raw.get("status") or {}).get("instance"))
 
 
 def kind_of(raw: Object) -> KindKey:

@@ -11,12 +11,17 @@ from dataclasses import replace
 from application_manager.cluster.store import Entry, Name
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, all_instances, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict
-from application_manager.core.demand.demand import claim_or_verdict
+from application_manager.core.demand.demand import claim_or_verdict, finished
 from application_manager.core.holders.leases import HolderKey
+from application_manager.core.holders.policies import TaskPolicy
+from application_manager.knowledge.budgetbook import BudgetBook
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 Claims = Callable[[ApplicationTemplate | InvalidTemplate | None, ApplicationTask], Claim | Verdict | None]
 """What a task claims of a template, or its verdict; None while that is being worked out."""
+
+
+_ANY = TaskPolicy()
 
 
 class ClaimBook:
@@ -29,10 +34,14 @@ class ClaimBook:
     Attributes:
         claim_of: what a task claims.
         settled: called with a template that is unsettled no more.
+        moved: called with a task that is within its budgets, or beyond them, since another one came or ended.
     """
 
-    def __init__(self, claim: Claims = claim_or_verdict) -> None:
+    def __init__(self, claim: Claims = claim_or_verdict, policy: TaskPolicy = _ANY) -> None:
         self.claim_of = claim
+        self.moved: Callable[[Name], None] = lambda _: None
+        self._policy = policy
+        self._budgets = BudgetBook(policy)
         self.settled: Callable[[Name], None] = lambda _: None
         self._pending: dict[Name, set[Name]] = {}  # template → tasks
         self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that were there at the beginning
@@ -44,11 +53,22 @@ class ClaimBook:
 
     def note(self, name: Name, entry: Entry, template: ApplicationTemplate | InvalidTemplate | None) -> set[Name]:
         """Note a task as it is now; returns the instances that it claimed or claims, none while that is worked out."""
+        task = entry.model
+        if isinstance(task, ApplicationTask) and finished(task) is None and self._policy.refusal(task) is None:
+            moved = self._budgets.enter(task)
+        else:
+            moved = self._budgets.leave(name)
+        touched = self._note(name, entry, template)
+        for each in moved:
+            self.moved(each)
+        return touched
+
+    def _note(self, name: Name, entry: Entry, template: ApplicationTemplate | InvalidTemplate | None) -> set[Name]:
         before = self._claims.get(name)
         task = entry.model
         claimed: Claim | Verdict | None = None
         if isinstance(task, ApplicationTask):
-            claimed = self.claim_of(template, task)
+            claimed = self._beforehand(entry, task) or self.claim_of(template, task)
             if claimed is None:
                 return self._wait(name, task, before)
         touched = self._drop(name)
@@ -69,6 +89,15 @@ class ClaimBook:
         self._claims[name] = claimed
         self._by_instance.setdefault(instance, {})[name] = claimed
         return touched | {instance}
+
+    def _beforehand(self, entry: Entry, task: ApplicationTask) -> Verdict | None:
+        """The verdict of a task that asks for too much, whatever its template says; None where there is none."""
+        over = finished(task)
+        if over is not None:
+            return over
+        if entry.problem:
+            return Verdict(Standing.REFUSED, Refused.INVALID_PARAMETERS, entry.problem)
+        return self._policy.refusal(task) or self._budgets.verdict((task.namespace, task.name))
 
     def _wait(self, name: Name, task: ApplicationTask, before: Claim | None) -> set[Name]:
         """Note that a task's claim is being worked out: until then, a task that had one keeps it."""
@@ -108,7 +137,10 @@ class ClaimBook:
     def forget(self, name: Name) -> set[Name]:
         """Forget a task; returns the instances that it claimed."""
         self._resolve(name, None)
-        return self._drop(name)
+        touched = self._drop(name)
+        for each in self._budgets.leave(name):
+            self.moved(each)
+        return touched
 
     def _drop(self, name: Name) -> set[Name]:
         self._verdicts.pop(name, None)

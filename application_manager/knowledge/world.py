@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import InitVar, dataclass, field, replace
 from typing import Final, TypeVar
 
 from application_manager.cluster.apply import Applied
@@ -19,9 +19,11 @@ from application_manager.core.demand.places import Candidate, Limits
 from application_manager.core.demand.placing import candidate, limits, placed
 from application_manager.core.findings.findings import Findings
 from application_manager.core.holders.leases import HealthyTime, LeaseBook, LeaseView
+from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.policy import KindKey, Policy
 from application_manager.core.statuses.status import Service
 from application_manager.knowledge.claimbook import ClaimBook
+from application_manager.knowledge.overlapbook import OverlapBook
 from application_manager.knowledge.placebook import PlaceBook
 from application_manager.knowledge.podbook import PodBook
 from application_manager.knowledge.turnbook import TurnBook
@@ -57,12 +59,14 @@ class Record:
         decision: what was wanted.
         applied: what came of it.
         digest: of the rendering that was last applied in full.
+        since: when the instance was first worked on by this process, in seconds since 1970.
     """
 
     uid: str
     decision: Decision
     applied: Applied
     digest: str | None
+    since: float
 
 
 @dataclass
@@ -75,13 +79,17 @@ class World:
         deadlines: by instance, its uid and the release time last decided; ahead of its status as well, since a status
             may be written long after what it says was decided.
         limit: how many instances a namespace may have; None: any number.
+        full: whether there is no memory for further tasks.
+        tasks: what limits tasks; None: nothing.
         exceeded: by template, the instances whose rendering exceeds its limit, and the message.
     """
 
     policy: Policy
     limit: int | None = None
-    store: Store = field(default_factory=lambda: Store(OWN_KINDS))
-    claims: ClaimBook = field(default_factory=ClaimBook)
+    full: InitVar[Callable[[], bool]] = lambda: False
+    tasks: InitVar[TaskPolicy | None] = None
+    store: Store = field(init=False)
+    claims: ClaimBook = field(init=False)
     pods: PodBook = field(default_factory=PodBook)
     leases: LeaseBook = field(default_factory=LeaseBook)
     healthy: HealthyTime = field(default_factory=HealthyTime)
@@ -89,12 +97,15 @@ class World:
     records: dict[Name, Record] = field(default_factory=dict)
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
     turns: TurnBook = field(default_factory=TurnBook)
+    overlap: OverlapBook = field(default_factory=OverlapBook)
     places: PlaceBook = field(init=False)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
     exceeded: dict[Name, dict[Name, str]] = field(default_factory=dict)
     _findings: dict[Name, tuple[tuple[str, int], Findings]] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, full: Callable[[], bool], tasks: TaskPolicy | None) -> None:
+        self.store = Store(OWN_KINDS, full)
+        self.claims = ClaimBook(policy=tasks or TaskPolicy())
         self.places = PlaceBook(self._alone_and_candidate, self._known_instances)
 
     def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:
@@ -272,6 +283,7 @@ class World:
         """Drop what was found of a template."""
         self._findings.pop(name, None)
         self.exceeded.pop(name, None)
+        self.overlap.forget(name)
 
 
 def _version(template: ApplicationTemplate) -> tuple[str, int]:

@@ -44,6 +44,12 @@ class Overview(Collector):
             later.add_metric((name,), timed)
         yield from (depth, later)
         yield self._leases()
+        shed = GaugeMetricFamily(f"{PREFIX}tasks_shed", "ApplicationTasks that were not taken in for want of memory")
+        shed.add_metric((), len(self._world.store.shed))
+        yield shed
+        yielded = GaugeMetricFamily(f"{PREFIX}namespaces_yielded", "Namespaces in which an older manager acts")
+        yielded.add_metric((), self._world.overlap.count)
+        yield yielded
         reached = GaugeMetricFamily(f"{PREFIX}api_reached", "1 while the API server answers")
         reached.add_metric((), float(self._world.healthy.reached))
         yield reached

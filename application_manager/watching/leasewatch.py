@@ -60,7 +60,7 @@ class LeaseWatch:
 
     async def _reached(self) -> bool:
         try:
-            await self.client.list(self.probe, next(iter(self.namespaces), None), limit=1)
+            await anext(self.client.pages(self.probe, next(iter(self.namespaces), None), size=1))
         except Unreachable:
             return False
         except ApiError as error:

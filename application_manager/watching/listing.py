@@ -8,14 +8,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from application_manager.cluster.client import ApiError, Client, Resource, Unreachable
+from application_manager.cluster.client import LEASES, ApiError, Client, Resource, Unreachable
 from application_manager.cluster.starting import until_answered
+from application_manager.cluster.store import Name, name_of
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.knowledge.world import World
 from application_manager.measures import Measures
 from application_manager.watching.router import Router
-
-FIRST_RESYNC = 3.0  # s after the watches began: what vanished between our first list and theirs
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +51,7 @@ class Listing:
     async def resync(self, watching: asyncio.Event) -> None:
         """List everything again and again, once the watches have begun, until cancelled."""
         await watching.wait()
-        await asyncio.sleep(min(FIRST_RESYNC, self.every))
+        await asyncio.sleep(self.every)
         while True:
             began = time.monotonic()
             try:
@@ -65,17 +64,29 @@ class Listing:
             self.world.leases.forget_except(self.world.claims.holders())
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
+    async def again(self, group: str, plural: str, namespace: str | None) -> None:
+        """List a kind again, in a namespace, or for None in all: what is there and what is gone.
+
+        Raises ApiError or Unreachable.
+        """
+        for resource in (LEASES, *self.own, *self.children):
+            if (resource.group, resource.plural) == (group, plural):
+                await self._list(resource, INSTANCE_LABEL if resource in self.children else "", (namespace,))
+
     async def _everything(self) -> None:
         for resource in self.own:
-            await self._list(resource, "")
-        await asyncio.gather(*(self._list(resource, INSTANCE_LABEL) for resource in self.children))
+            await self._list(resource, "", self.namespaces)
+        await asyncio.gather(*(self._list(resource, INSTANCE_LABEL, self.namespaces) for resource in self.children))
         self.router.everything()
 
-    async def _list(self, resource: Resource, labels: str) -> None:
-        for namespace in self.namespaces or (None,):
-            listed, version = await self.client.list(resource, namespace, labels=labels)
-            for raw in listed:
-                self.router.observe(raw)
+    async def _list(self, resource: Resource, labels: str, namespaces: Sequence[str | None]) -> None:
+        for namespace in namespaces or (None,):
+            present, version = set[Name](), "0"
+            async for page, as_of in self.client.pages(resource, namespace, labels=labels):
+                version = as_of
+                for raw in page:
+                    present.add(name_of(raw))
+                    self.router.observe(raw)
             kind = (resource.api_version, resource.kind)
-            for entry in self.world.store.missing(kind, listed, version, namespace):
+            for entry in self.world.store.missing(kind, present, version, namespace):
                 self.router.vanished(entry.raw)

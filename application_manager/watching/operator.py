@@ -1,7 +1,7 @@
-"""The registrations with kopf, and nothing else: every event is handed on, nothing is handled here.
+"""The registrations with kopf, and nothing else: every event is handed on (see `relay`), nothing is handled here.
 
-Only `on.event`, which neither adds finalizers nor writes to objects. Handlers return None, and kopf's own Events,
-peering and progress storage are off. Leases are filtered by name, an instance's objects by label, on the server.
+Only `on.event`, which neither adds finalizers nor writes to objects. kopf's own Events, peering and progress storage
+are off. An instance's objects are filtered by label, on the server.
 """
 
 from __future__ import annotations
@@ -13,12 +13,10 @@ from typing import Any
 
 import kopf
 
-from application_manager.cluster.client import LEASES, Object, Resource
+from application_manager.cluster.client import LEASES, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
-from wayside.leases import holder_of
-
-News = Callable[[Object], None]
+from application_manager.watching.relay import News, Relist, relaying
 
 _PAUSES = (0.1, 0.2, 0.5)  # s, between attempts to reach the API server; then the last again and again
 _LONG_PAUSE = 1.0  # s
@@ -39,6 +37,7 @@ async def watch(
     *,
     observe: News,
     vanished: News,
+    relist: Relist,
     connect: Callable[[], Awaitable[kopf.ConnectionInfo]],
     namespaces: Collection[str],
     ready: asyncio.Event,
@@ -46,7 +45,8 @@ async def watch(
 ) -> None:
     """Hand on the news of our own kinds, of Leases, and of what bears an instance's label, until cancelled.
 
-    `namespaces` empty: all. `pulse` takes each watch's signs of life. `ready` is set once kopf has started. `connect`
+    `namespaces` empty: all. `pulse` takes each watch's signs of life. `relist` hands on
+    all that there is of a kind. `ready` is set once kopf has started. `connect`
     is asked for credentials at the start, and again when the API server no longer takes them.
     """
     logging.getLogger("kopf").setLevel(logging.WARNING)
@@ -58,32 +58,26 @@ async def watch(
     settings.networking.request_timeout = 15
     settings.networking.connect_timeout = 5
     settings.watching.inactivity_timeout = NEVER  # see pulse
+    settings.watching.chunk_size = 1  # its list is for the version alone, see relay
     settings.process.ultimate_exiting_timeout = None
     settings.queueing.exit_timeout = 0.1  # s; what is lost by stopping at once is seen again at the next start
 
     async def login(**_: Any) -> kopf.ConnectionInfo:
         return await connect()
 
-    async def handle(event: Any, **_: Any) -> None:
-        raw = dict(event["object"])
-        if event["type"] == "DELETED":
-            vanished(raw)
-        else:
-            observe(raw)
-
-    def is_holders(name: str, **_: Any) -> bool:
-        return holder_of(name) is not None
+    async def handled(**_: Any) -> None:
+        """What makes kopf watch a kind; the relay takes the events."""
 
     kopf.on.login(registry=registry)(login)
     for resource in own:
-        kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handle)
-    kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=registry, when=is_holders)(handle)
+        kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)
+    kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=registry)(handled)
     for resource in children:
-        kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handle)
+        kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)
         settings.watching.label_selectors[resource.group, resource.version, resource.plural] = INSTANCE_LABEL
 
     identity: Any = "application-manager"  # else kopf asks for the user's name, and a container's may have none
-    with pulsing(pulse):
+    with pulsing(pulse), relaying(observe, vanished, relist):
         await kopf.operator(
             registry=registry,
             settings=settings,

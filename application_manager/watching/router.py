@@ -6,6 +6,7 @@ News are watch events, answers to our own writes, and lists; all take the same w
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from application_manager.core.objects.suspension import pods_left
 from application_manager.knowledge.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, POD, TASK, TEMPLATE, World
 from application_manager.work.rulework import RuleKey
 from wayside.api import ApplicationInstance
+from wayside.api.applicationtemplate import ApplicationTemplateStatus
 from wayside.leases import holder_of
 
 Ask = Callable[[Name], None]
@@ -54,6 +56,8 @@ class Router:
         old = self.world.store.get(kind, name)
         entry = self.world.store.put(raw)
         if entry is None:
+            if kind == TASK and name in self.world.store.shed:
+                self.task(name)
             return
         if old is not None and old.uid != entry.uid:
             self.applier.forget(old.raw)
@@ -67,7 +71,7 @@ class Router:
             if old is None or _written(old) != _written(entry):
                 self._rules(name[0])
         else:
-            self._child(old, entry)
+            self._child(raw, old, entry)
 
     def vanished(self, raw: Object) -> None:
         """Take the news that an object is gone."""
@@ -140,9 +144,11 @@ class Router:
             self.instance(name)
 
     def _template(self, name: Name, old: Entry | None, entry: Entry) -> None:
+        status = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
+        self.world.overlap.note(name, status.manager, time.time())
         self.template(name)
         self.world.note_limits(name)
-        if old is None or old.uid != entry.uid or old.raw["spec"] != entry.raw["spec"]:
+        if old is None or old.uid != entry.uid or _written(old)[:2] != _written(entry)[:2]:
             self._claim_again(name)
             self._rules(name[0])
 
@@ -162,9 +168,9 @@ class Router:
         if (old is None or old.uid != entry.uid) and isinstance(entry.model, ApplicationInstance):
             self.template((name[0], entry.model.spec.template))
 
-    def _child(self, old: Entry | None, entry: Entry) -> None:
-        if kind_of(entry.raw) == POD:
-            if self.world.pods.note(entry.raw):
+    def _child(self, raw: Object, old: Entry | None, entry: Entry) -> None:
+        if kind_of(raw) == POD:
+            if self.world.pods.note(raw):
                 self._ask_for_owner(entry.raw)
             if _is_a_workloads(entry.raw):
                 return  # that its pods are ready, a workload says itself
@@ -233,9 +239,9 @@ def _instance_of(raw: Object) -> Name | None:
     return (raw["metadata"]["namespace"], owner) if owner else None
 
 
-def _written(entry: Entry) -> tuple[object, object]:
-    """What people write of a rule or a detector."""
-    return entry.raw["spec"], entry.raw["metadata"].get("labels")
+def _written(entry: Entry) -> tuple[object, ...]:
+    """What people write of a rule or a detector, or what is wrong with that."""
+    return entry.raw["spec"], entry.problem, entry.raw["metadata"].get("labels")
 
 
 def _is_a_workloads(pod: Object) -> bool:

@@ -232,7 +232,9 @@ class InstanceWork:
     ) -> None:
         if decision.too_large and applied.aspect.holds:  # what it has is applied, and not what is demanded
             applied = replace(applied, aspect=Aspect("Applied", False, TOO_LARGE, decision.too_large))
-        self.world.records[name] = Record(instance.metadata.uid, decision, applied, digest)
+        uid, before = instance.metadata.uid, self.world.records.get(name)
+        since = before.since if before is not None and before.uid == uid else time.time()
+        self.world.records[name] = Record(uid, decision, applied, digest, since)
         self.done(name)
 
     async def _released(self, name: Name) -> bool:
@@ -242,9 +244,9 @@ class InstanceWork:
             return False
         # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
         fields = f"spec.template={instance.spec.template}"
-        listed, _ = await self.client.list(self.tasks, name[0], fields=fields)
-        for raw in listed:
-            self.observe(raw)
+        async for page, _ in self.client.pages(self.tasks, name[0], fields=fields):
+            for raw in page:
+                self.observe(raw)
         over = self._over(name)
         if over is None:
             return False

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from application_manager.cluster.apply import Applied, Applier, ObjectKey
@@ -22,15 +22,16 @@ from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.fallback import READY_TIMEOUT
 from application_manager.core.health.placement import is_placed, misplaced
 from application_manager.core.health.pods import Trouble, summary
-from application_manager.core.health.readiness import not_ready
+from application_manager.core.health.readiness import is_unseen, not_ready
 from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
 from application_manager.core.statuses.status import Service, difference, instance_status, suspension_aspect
-from application_manager.knowledge.world import Served, World
+from application_manager.knowledge.world import Record, Served, World
 from application_manager.work.recorder import Reason, Recorder
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus
 
 _TROUBLES_SHOWN = 3
+_SETTLING = 2.0  # s
 _AGAIN = 5.0  # s until nodes and Events are looked at again for what is not ready for their sake
 
 log = logging.getLogger(__name__)
@@ -76,6 +77,7 @@ class InstanceStatusWork:
         old = instance.status or ApplicationInstanceStatus()
         applied = record.applied
         live = self._live(instance, applied)
+        until = _settles(instance, record, live.values())
         troubles = self._troubles(name, live, looked_up)
         suspended = suspension_aspect(instance, record.decision, live.values())
         ready = _overdue(self._ready(instance, applied.aspect, live, troubles), record.decision)
@@ -83,7 +85,9 @@ class InstanceStatusWork:
             instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now, suspended
         )
         patch = difference(old.to_json() if instance.status else {}, new.to_json())
-        if patch:
+        if patch and until > now:
+            self.again(name, until)
+        elif patch:
             uid = instance.metadata.uid
             try:
                 self.observe(await self.client.patch_status(self.instances, name[0], name[1], uid, patch))
@@ -200,6 +204,17 @@ class InstanceStatusWork:
             others = [each for each in troubles if each not in refused]  # which the words of the workload tell already
             return Aspect("Ready", False, reason, ": ".join(filter(None, ("; ".join(missing), _text(others)))))
         return Aspect("Ready", True, "Ready", "all workloads are ready")
+
+
+def _settles(instance: ApplicationInstance, record: Record, live: Iterable[Object | None]) -> float:
+    """Until when the first status of an instance waits, in seconds since 1970, since its objects are about to change.
+
+    Their controllers look at new objects within a moment; without the wait, two statuses follow each other.
+    """
+    known = instance.status is not None and instance.status.spec_hash is not None
+    if known or not record.applied.aspect.holds or not any(each is not None and is_unseen(each) for each in live):
+        return 0.0
+    return record.since + _SETTLING
 
 
 def _overdue(ready: Aspect, decision: Decision) -> Aspect:

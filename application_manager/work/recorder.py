@@ -1,7 +1,8 @@
 """Kubernetes Events: what happened to a task or an instance, for `kubectl describe` and `kubectl get events`.
 
 The reasons are a fixed list. An Event follows from a change of a condition, which is stored in the cluster, so neither
-a restart nor a resync tells the same again.
+a restart nor a resync tells the same again. What is repeated is one Event with a series, as events.k8s.io has it.
+Namespaces take turns, and each has room for its own.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ import os
 import socket
 import time
 import uuid
+from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -24,11 +27,15 @@ from application_manager.core.health.pods import TroubleReason
 from application_manager.core.statuses.allowance import Allowance
 from application_manager.core.statuses.conclusions import READY, STALLED
 from application_manager.measures import Measures
+from application_manager.work.turns import Turns
 from wayside.api.base import Condition, Kind
 from wayside.times import format_seconds
 
 COMPONENT = "wayside.dev/application-manager"
-_WAITING = 1000  # Events that may wait; further ones are dropped and counted, since work goes before words
+_WAITING = 1000  # Events of a namespace that may wait; further ones are dropped and counted
+_SERIES = 360.0  # s after which a repetition is an Event of its own: as client-go has it
+_REFRESHED = 60.0  # s between two changes of a series
+_KEPT = 4096  # Events that are remembered, since they may be repeated
 _REPORT_EVERY = 60.0  # s between two lines in the log about Events that were dropped
 _NAME_LENGTH = 236  # characters of the object's name, for a pod's may have as many as the Event's
 _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
@@ -69,6 +76,7 @@ class Reason(StrEnum):
     QUOTA_EXCEEDED = "QuotaExceeded"
     ADMISSION_REFUSED = "AdmissionRefused"
     NOT_INJECTED = "NotInjected"
+    MANAGERS_OVERLAP = "ManagersOverlap"
 
 
 _OF_CONDITION = {
@@ -98,6 +106,7 @@ _OWN_REASONS = frozenset(
         Reason.HOLDER_LOST,
         Reason.TEMPLATE_INVALID,
         Reason.NOT_INJECTED,
+        Reason.MANAGERS_OVERLAP,
     }
     | _TROUBLES
 )
@@ -112,8 +121,23 @@ class _Said:
     regarding: Kind
     reason: Reason
     note: str
-    when: str
+    now: float
     once: bool = False
+
+    @property
+    def what(self) -> tuple[str, str, str]:
+        """What is equal in repetitions."""
+        return self.regarding.metadata.uid, self.reason.value, self.note
+
+
+@dataclass(slots=True)
+class _Series:
+    """An Event that was posted: its name, how often it was said, and when last, in seconds since 1970."""
+
+    name: str
+    count: int
+    last: float
+    written: float
 
 
 @dataclass(slots=True)
@@ -148,10 +172,12 @@ class Recorder:
         self._client = client
         self._measures = measures or Measures()
         self._allowance = Allowance()
-        self._waiting: asyncio.Queue[_Said | None] = asyncio.Queue(_WAITING)
+        self._waiting: Turns[_Said] = Turns()
+        self._wake = asyncio.Event()
         self._ending = False
         self._instance = f"{socket.gethostname()}-{os.getpid()}"[:128]
         self._drops = _Drops()
+        self._series: OrderedDict[tuple[str, str, str], _Series] = OrderedDict()
 
     def say(self, regarding: Kind, reason: Reason, note: str, now: float, *, once: bool = False) -> None:
         """Post an Event about the object, unless there were too many of it.
@@ -163,25 +189,45 @@ class Recorder:
             now: seconds since 1970.
             once: not if there is the same already, also of an earlier run: for what follows from no change of a status.
         """
+        said = _Said(regarding, reason, note, now, once)
+        if self._repeats(said):
+            return
         if not self._allowance.takes(regarding.metadata.uid, now):
             self._measures.unposted("limited")
-            return
-        try:
-            self._waiting.put_nowait(_Said(regarding, reason, note, format_seconds(now), once))
-        except asyncio.QueueFull:
+        elif self._waiting.count(regarding.namespace) >= _WAITING:
             self._measures.unposted("full")
             self._drops.note("more than could be posted")
+        else:
+            self._waiting.add(regarding.namespace, said)
+            self._wake.set()
+
+    def _repeats(self, said: _Said) -> bool:
+        """Whether the Event was posted a short while ago, and nothing is to be written about its repetition yet."""
+        known = self._series.get(said.what)
+        if known is None:
+            return False
+        if said.now - known.last > _SERIES:
+            del self._series[said.what]
+            return False
+        known.count += 1
+        known.last = said.now
+        return said.now - known.written < _REFRESHED and known.count > 2
 
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
         """Post an Event for each condition that changed, if it is worth one: not yet being ready is none.
 
-        Nor is what follows from another condition: Stalled, and Ready of what is not applied or not accepted.
+        Nor is what follows from another condition: Stalled, Ready of what is not applied or not accepted, Applied of
+        what is ready at once. That a task is accepted at once is in its status, and what follows has its own Event.
         """
         was_true = {each.type for each in old if each.status == "True"}
         is_false = {each.type for each in new if each.status == "False"}
         concludes = not is_false.isdisjoint(("Applied",)) or any(each.type == "Accepted" for each in new)
-        for each in changed(old, new):
-            if each.type == STALLED or (each.type == READY and concludes):
+        news = changed(old, new)
+        at_once = {each.type for each in news if each.status == "True"} >= {"Applied", READY}
+        for each in news:
+            if each.type == STALLED or (each.type == READY and concludes) or (each.type == "Applied" and at_once):
+                continue
+            if (regarding.kind, each.reason) == ("ApplicationTask", Reason.ACCEPTED) and not old:
                 continue
             reason = _OF_CONDITION.get((each.type, each.status))
             if each.reason in _OWN_REASONS:
@@ -195,36 +241,58 @@ class Recorder:
     def finish(self) -> None:
         """Let `run` return once what waits is posted."""
         self._ending = True
-        if not self._waiting.full():
-            self._waiting.put_nowait(None)  # to wake it
+        self._wake.set()
 
     async def run(self) -> None:
         """Post until cancelled, or told to finish. An Event that cannot be posted is dropped."""
-        while not (self._ending and self._waiting.empty()):
-            try:
-                async with asyncio.timeout(self._drops.due_in(time.monotonic())):
-                    said = await self._waiting.get()
-            except TimeoutError:
-                self._drops.report(time.monotonic())
-                continue
-            if said is None:
-                continue
-            try:
-                await self._client.create(EVENTS, self._manifest(said))
-                self._measures.posted(said.reason.value)
-            except ApiError as error:
-                if said.once and error.code == 409:
-                    continue
-                self._measures.unposted("failed")
-                if not error.terminating:
-                    self._drops.note(f"{said.reason} about {said.regarding.name}: {error}")
-            except Unreachable as error:
-                self._measures.unposted("failed")
-                self._drops.note(str(error))
+        while True:
+            said = self._waiting.next()
+            if said is not None:
+                await self._post(said)
+            elif self._ending:
+                break
+            else:
+                await self._wait()
             if self._drops.due_in(now := time.monotonic()) == 0:
                 self._drops.report(now)
         if self._drops.count:
             self._drops.report(time.monotonic())
+
+    async def _wait(self) -> None:
+        """Wait for an Event, or until dropped ones are to be reported."""
+        self._wake.clear()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(self._drops.due_in(time.monotonic())):
+                await self._wake.wait()
+
+    async def _post(self, said: _Said) -> None:
+        try:
+            await self._write(said)
+            self._measures.posted(said.reason.value)
+        except ApiError as error:
+            if said.once and error.code == 409:
+                return
+            self._measures.unposted("failed")
+            if not error.terminating:
+                self._drops.note(f"{said.reason} about {said.regarding.name}: {error}")
+        except Unreachable as error:
+            self._measures.unposted("failed")
+            self._drops.note(str(error))
+
+    async def _write(self, said: _Said) -> None:
+        """Post the Event, or bring the series of the one that it repeats up to date."""
+        known = self._series.get(said.what)
+        if known is not None and known.count > 1:
+            known.written = said.now
+            series = {"count": known.count, "lastObservedTime": _microseconds(known.last)}
+            if await self._client.merge(EVENTS, said.regarding.namespace, known.name, {"series": series}):
+                return
+        manifest = self._manifest(said)
+        await self._client.create(EVENTS, manifest)
+        self._series.pop(said.what, None)
+        self._series[said.what] = _Series(manifest["metadata"]["name"], 1, said.now, said.now)
+        if len(self._series) > _KEPT:
+            self._series.popitem(last=False)
 
     def _manifest(self, said: _Said) -> dict[str, Any]:
         regarding = said.regarding
@@ -237,7 +305,7 @@ class Recorder:
                 "name": f"{regarding.name[:_NAME_LENGTH].rstrip('-.')}.{ending[:16]}",
                 "namespace": regarding.namespace,
             },
-            "eventTime": said.when.replace("Z", "000Z"),  # the API wants microseconds
+            "eventTime": _microseconds(said.now),
             "reportingController": COMPONENT,
             "reportingInstance": self._instance,
             "action": "Reconcile",
@@ -252,3 +320,8 @@ class Recorder:
                 "uid": regarding.metadata.uid,
             },
         }
+
+
+def _microseconds(seconds: float) -> str:
+    """A time since 1970 as the API wants it, with microseconds."""
+    return format_seconds(seconds).replace("Z", "000Z")

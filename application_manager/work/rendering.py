@@ -1,4 +1,4 @@
-"""The objects of instances, worked out in the worker processes.
+"""The objects of instances, worked out in the worker processes; those of small templates that only read, here.
 
 What is not there yet is asked for, and the instance asked again once it is. A rendering that takes too much is a
 problem of its template, whose status gives it; what runs of the instance stays as it is.
@@ -20,9 +20,11 @@ from application_manager.core.objects.rendering import Rendering
 from application_manager.knowledge.world import World
 from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.jobs import Problem, RenderJob
+from application_manager.workers.plain import objects_are_plain, values_are_small
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
 _PICKLED = 64  # templates that are kept as bytes
+_JUDGED = 1024  # templates of which is known whether they are plain
 
 
 class Renderings:
@@ -51,6 +53,7 @@ class Renderings:
         self._again = again
         self._template_changed = template_changed
         self._pickled: OrderedDict[tuple[str, int], bytes] = OrderedDict()
+        self._plain: OrderedDict[tuple[str, int], bool] = OrderedDict()
 
     def objects(self, wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
         """The instance's objects, or why it has none, as the condition Applied gives it; None: it is asked again."""
@@ -89,15 +92,27 @@ class Renderings:
         name = (wanted.namespace, wanted.name)
         metadata = template.metadata
         bare = wanted.model_copy(update={"status": None})
+
+        def job() -> RenderJob:
+            return RenderJob(metadata.uid, metadata.generation, self._bytes(template), self._world.policy, bare, chart)
+
+        if self._is_plain(template) and values_are_small(bare):
+            return job().run()
         return self._answers.answer(
             key=(kind, *name),
             question=(metadata.uid, metadata.generation, wanted.spec, chart),
             namespace=wanted.namespace,
-            job=lambda: RenderJob(
-                metadata.uid, metadata.generation, self._bytes(template), self._world.policy, bare, chart
-            ),
+            job=job,
             done=partial(self._done, name),
         )
+
+    def _is_plain(self, template: ApplicationTemplate) -> bool:
+        key = (template.metadata.uid, template.metadata.generation)
+        if key not in self._plain:
+            self._plain[key] = objects_are_plain(template)
+            while len(self._plain) > _JUDGED:
+                self._plain.popitem(last=False)
+        return self._plain[key]
 
     def _done(self, name: Name) -> None:
         self._again(name, time.time())

@@ -12,7 +12,9 @@ from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict, gathered
 from application_manager.core.conditions import changed
+from application_manager.core.demand.demand import finished
 from application_manager.core.demand.fallback import FALLEN_BACK, turned
+from application_manager.core.objects import trimming
 from application_manager.core.statuses.status import Service, difference, finished_since, task_status, together
 from application_manager.knowledge.world import World
 from application_manager.measures import Measures
@@ -20,8 +22,15 @@ from application_manager.observability.tracing import TaskTraces
 from application_manager.work.recorder import Recorder
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import ApplicationTaskStatus
+from wayside.api.documents import parse_object
 from wayside.times import parse_seconds
 
+_SHED = Verdict(
+    Standing.WAITING,
+    "ManagerOverloaded",
+    "the application manager is near its memory limit and takes in no further tasks: it takes this one in once there "
+    "is room; end tasks, or raise the limit",
+)
 _OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, whose Events tell of them
 
 log = logging.getLogger(__name__)
@@ -57,6 +66,9 @@ class TaskWork:
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
+        if name in self.world.store.shed:
+            await self._tell_shed(name)
+            return
         task = self.world.task(name)
         known = self._verdict(name)
         if task is None or known is None or task.metadata.deletion_timestamp is not None:
@@ -64,6 +76,19 @@ class TaskWork:
         verdict, service = known
         if verdict.reason == Refused.TEMPLATE_NOT_FOUND and await self._has_template(name[0], task.spec.template):
             return  # the watch of templates was behind that of tasks; the template's news bring us back
+        await self._tell(name, task, verdict, service)
+
+    async def _tell_shed(self, name: Name) -> None:
+        """Say of a task that it is not taken in; it is read for that alone."""
+        raw = await self.client.get(self.tasks, *name)
+        try:
+            task = parse_object(trimming.own(raw)) if raw is not None else None
+        except ValueError:
+            return
+        if isinstance(task, ApplicationTask):
+            await self._tell(name, task, finished(task) or _SHED, None)
+
+    async def _tell(self, name: Name, task: ApplicationTask, verdict: Verdict, service: Service | None) -> None:
         now = time.time()
         old = task.status or ApplicationTaskStatus()
         new = task_status(task, verdict, service, now)

@@ -11,11 +11,12 @@ from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
 from application_manager.core.statuses.status import difference, template_status
+from application_manager.knowledge.overlapbook import Turn
 from application_manager.knowledge.world import TEMPLATE, World
-from application_manager.work.recorder import Recorder
+from application_manager.work.recorder import Reason, Recorder
 from application_manager.workers.jobs import TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
-from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.api.applicationtemplate import ApplicationTemplateStatus, TemplateManager
 from wayside.api.base import Kind, Metadata
 
 
@@ -27,6 +28,7 @@ class TemplateWork:
         templates: where ApplicationTemplates live.
         observe: takes an object that was read.
         pool: where templates are judged.
+        again: asks for a template at a time, in seconds since 1970.
     """
 
     world: World
@@ -35,6 +37,7 @@ class TemplateWork:
     templates: Resource
     observe: Callable[[Object], None]
     pool: Runs
+    again: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
         """Write the template's status if it is news.
@@ -47,19 +50,38 @@ class TemplateWork:
         metadata = Metadata.model_validate(entry.raw["metadata"])
         now = time.time()
         old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
+        own = self.world.overlap.own()
+        turn, when = self.world.overlap.turn(name, now)
+        if turn is not Turn.ACT:
+            self.again(name, when)
+            if turn is Turn.CHALLENGE and own is not None:
+                await self._challenge(name, metadata, own, now)
+            return
         findings = await self._findings(name)
-        new = template_status(old, metadata.generation, findings, len(self.world.instances_of(name)), now)
+        new = template_status(old, metadata.generation, findings, len(self.world.instances_of(name)), now, own)
         patch = difference(old.to_json() if entry.raw.get("status") else {}, new.to_json())
         if not patch:
             return
+        if await self._write(name, metadata, patch):
+            about = Kind(kind=self.templates.kind, metadata=metadata)
+            self.recorder.transitions(about, old.conditions, new.conditions, now)
+
+    async def _challenge(self, name: Name, metadata: Metadata, own: TemplateManager, now: float) -> None:
+        """See by the template's status whether the manager is alive that looks after the namespace as well."""
+        about, other = Kind(kind=self.templates.kind, metadata=metadata), self.world.overlap.waits_for(name[0])
+        note = f"the managers of the Leases {other} and {own.lease} look after this namespace: the second one waits"
+        self.recorder.say(about, Reason.MANAGERS_OVERLAP, note, now, once=True)
+        await self._write(name, metadata, {"manager": own.to_json()})
+
+    async def _write(self, name: Name, metadata: Metadata, patch: Object) -> bool:
+        """Write the status; whether the template was there."""
         try:
             self.observe(await self.client.patch_status(self.templates, name[0], name[1], metadata.uid, patch))
         except ApiError as error:
             if error.terminating or error.code == 404:
-                return
+                return False
             raise
-        about = Kind(kind=self.templates.kind, metadata=metadata)
-        self.recorder.transitions(about, old.conditions, new.conditions, now)
+        return True
 
     async def _findings(self, name: Name) -> Findings:
         template = self.world.template(name)

@@ -11,20 +11,24 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import random
 import time
-from collections import Counter, OrderedDict, deque
+from collections import Counter
 from collections.abc import Awaitable, Callable, Hashable
+from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 from application_manager.cluster.client import ApiError, Unreachable
 from application_manager.measures import Measures
+from application_manager.work.turns import Turns
 
 Key = TypeVar("Key", bound=Hashable)
 
 FIRST_PAUSE = 0.2  # s, doubled with every failure of the key
 LONGEST_PAUSE = 10.0  # s
-_TURN, _TURNS = 0.05, 20  # s, and how many of them a queue waits for the one before it
+_TURN = 0.05  # s until it is looked again whether the queue before this one has keys of a namespace
+_YIELDING = 0.25  # s that a worker waits for the keys of a namespace in the queue before this one
 _SHORTEST_DELAY = 0.1  # s, so that a time that is nearly there does not spin
 
 log = logging.getLogger(__name__)
@@ -33,7 +37,8 @@ log = logging.getLogger(__name__)
 class WorkQueue(Generic[Key]):
     """Runs `work(key)` for every key asked for, on `concurrency` workers.
 
-    While the queue `after` has keys that wait, this one is slowed down to one key a second and worker.
+    While keys of a namespace wait in the queue `after`, those of the namespace in this one are slowed down to four a
+    second and worker.
     """
 
     def __init__(
@@ -61,7 +66,7 @@ class WorkQueue(Generic[Key]):
         self._work = work
         self._concurrency = concurrency
         self._share = share
-        self._waiting: OrderedDict[str, deque[Key]] = OrderedDict()  # by namespace; the first has the next turn
+        self._waiting: Turns[Key] = Turns()
         self._at_work: Counter[str] = Counter()  # keys by namespace
         self._queued: set[Key] = set()
         self._running: dict[Key, float] = {}  # and since when, on the monotonic clock
@@ -75,11 +80,6 @@ class WorkQueue(Generic[Key]):
     def depth(self) -> tuple[int, int]:
         """How many keys wait for a worker, and how many for their time."""
         return len(self._queued), len(self._timers)
-
-    @property
-    def busy(self) -> bool:
-        """Whether keys wait for a worker."""
-        return bool(self._waiting)
 
     def stuck(self, limit: float) -> str | None:
         """The key that a worker is at for longer than so many seconds, in words; any thread may ask."""
@@ -95,7 +95,7 @@ class WorkQueue(Generic[Key]):
             self._again.add(key)
         elif key not in self._queued:
             self._queued.add(key)
-            self._waiting.setdefault(_namespace(key), deque()).append(key)
+            self._waiting.add(_namespace(key), key)
             self._wake.set()
 
     def add_at(self, key: Key, when: float) -> None:
@@ -133,11 +133,8 @@ class WorkQueue(Generic[Key]):
 
     async def _worker(self) -> None:
         while not self._ending:
-            await self._let_others_go_first()
-            while (key := self._next()) is None and not self._ending:
-                self._wake.clear()
-                await self._wake.wait()
-            if self._ending or key is None:
+            key = await self._take()
+            if key is None:
                 return
             self._queued.discard(key)
             self._running[key] = time.monotonic()
@@ -157,25 +154,30 @@ class WorkQueue(Generic[Key]):
                 self.add(key)
             _heed_cancellation()
 
-    def _next(self) -> Key | None:
-        """The key whose turn it is, out of those that wait; None where there is none, or none that may begin."""
-        if self._ending:
-            return None
-        for namespace, keys in self._waiting.items():
-            if self._share is None or self._at_work[namespace] < self._share:
-                key = keys.popleft()
-                if keys:
-                    self._waiting.move_to_end(namespace)
-                else:
-                    del self._waiting[namespace]
+    async def _take(self) -> Key | None:
+        """Wait for the key whose turn it is; None at the end."""
+        yields_until = math.inf
+        while not self._ending:
+            key = self._waiting.next(lambda namespace: self._may(namespace) and not self._yields(namespace))
+            if key is None and time.monotonic() > yields_until:
+                key = self._waiting.next(self._may)
+            if key is not None:
                 return key
+            yielding = self._after is not None and bool(self._waiting)
+            yields_until = min(yields_until, time.monotonic() + _YIELDING) if yielding else math.inf
+            self._wake.clear()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_TURN if yielding else None):
+                    await self._wake.wait()
         return None
 
-    async def _let_others_go_first(self) -> None:
-        for _ in range(_TURNS):
-            if self._ending or self._after is None or not self._after.busy:
-                return
-            await asyncio.sleep(_TURN)
+    def _may(self, namespace: str) -> bool:
+        """Whether the namespace has not its share of the workers yet."""
+        return self._share is None or self._at_work[namespace] < self._share
+
+    def _yields(self, namespace: str) -> bool:
+        """Whether keys of the namespace wait in the queue before this one."""
+        return self._after is not None and namespace in self._after._waiting
 
     async def _once(self, key: Key) -> None:
         began, failed = time.monotonic(), True

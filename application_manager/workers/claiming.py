@@ -6,7 +6,6 @@ more than to write it down.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -17,12 +16,11 @@ from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished, refused
 from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.jobs import ClaimJob
+from application_manager.workers.plain import claims_are_plain
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 Name = tuple[str, str]
 """Namespace and name."""
-
-_PLAIN = re.compile(r"\$\{\s*parameters(?:\.[A-Za-z_]\w*)+\s*\}")
 
 
 class Claiming:
@@ -37,7 +35,7 @@ class Claiming:
         self, template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask
     ) -> Claim | Verdict | None:
         """What the task claims, or its verdict where it claims nothing; None while that is being worked out."""
-        if not isinstance(template, ApplicationTemplate) or _is_plain(template):
+        if not isinstance(template, ApplicationTemplate) or claims_are_plain(template):
             return claim_or_verdict(template, task)
         over = finished(task)
         if over is not None:
@@ -64,12 +62,6 @@ class Claiming:
     def forget(self, name: Name) -> None:
         """Drop what is known of a task that is gone."""
         self._answers.forget(("claim", *name))
-
-
-def _is_plain(template: ApplicationTemplate) -> bool:
-    """Whether what a task of the template claims takes no expression but plain reads of parameters."""
-    key = template.spec.key or ""
-    return "${" not in _PLAIN.sub("", key) and all(each.pattern is None for each in template.spec.parameters.values())
 
 
 def _without_objects(template: ApplicationTemplate) -> ApplicationTemplate:

@@ -2,7 +2,8 @@
 
 The attack, all from one namespace: templates whose expressions take too long, whose values change all the time; a flood
 of tasks; and large tasks. Prints the 95th percentile from a task to its Deployment and to its status, alone and under
-attack, and the manager's largest resident set. Exits with 1 where one of the targets is missed.
+attack, beside that of three raw calls, which the API server alone makes slower; and the manager's largest resident set.
+Exits with 1 where one of the targets is missed.
 
     python -m benchmarks.attacks.load [--tasks 30] [--bombs 8] [--flood 10000] [--large 40]
 
@@ -23,9 +24,10 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from application_manager.cluster.client import Client
+from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import load_configuration
 from application_manager.core.claims.claims import instance_name
+from benchmarks.manager_memory import large as small
 from benchmarks.task_to_deployment import (
     PATIENCE,
     TASKS,
@@ -40,10 +42,12 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
 from tests.worker_jobs import TEXT
 
+CONFIG_MAPS = Resource("v1", "ConfigMap", "configmaps")
 SLOWER = 2.0  # times that a task may take under attack, 95th percentile
 STATUS = 5.0  # s to its status, 95th percentile
 MEMORY = 1024  # MiB: the chart's limit
 LARGE = 1_000_000  # bytes of a large task
+TEXT_LENGTH = 60_000  # of each of its values: the API server takes no more than 65,536
 PAUSE = 0.3  # s between two tasks that are measured
 _LOOK = 0.02  # s between two looks for a status
 
@@ -76,10 +80,10 @@ async def bombing(client: Client, namespace: str, number: int) -> None:
 
 
 def large(namespace: str, number: int) -> dict[str, Any]:
-    """A task with as much free data as an object may have."""
-    made = task(namespace, f"large{number}")
-    event = {"rule": "r", "episode": f"e{number}", "startTime": "2026-01-01T00:00:00Z", "values": {"x": "x" * LARGE}}
-    return {**made, "spec": {**made["spec"], "event": event}}
+    """A task with about a megabyte of text."""
+    made = small(namespace, number, 0)
+    values = {f"x{index}": "x" * TEXT_LENGTH for index in range(LARGE // TEXT_LENGTH)}
+    return {**made, "spec": {**made["spec"], "event": {**made["spec"]["event"], "values": values}}}
 
 
 class Measured:
@@ -90,10 +94,11 @@ class Measured:
         self._namespace = namespace
         self._seen = seen
 
-    async def p95(self, prefix: str, count: int) -> tuple[float, float]:
-        """The 95th percentiles of both, over as many tasks, one after the other."""
+    async def p95(self, prefix: str, count: int) -> tuple[float, float, float]:
+        """The 95th percentiles of both, over as many tasks, one after the other; and of three raw calls in between."""
         deployed: list[float] = []
         told: list[float] = []
+        raw: list[float] = []
         for index in range(count):
             name = f"{prefix}{index}"
             began = time.perf_counter()
@@ -103,7 +108,17 @@ class Measured:
             deployed.append(self._seen.at[instance_name("app", name)] - began)
             told.append(await status - began)
             await asyncio.sleep(PAUSE)
-        return statistics.quantiles(deployed, n=20)[18], statistics.quantiles(told, n=20)[18]
+            raw.append(await self._raw(name))
+            await asyncio.sleep(PAUSE)
+        return _p95(deployed), _p95(told), _p95(raw)
+
+    async def _raw(self, name: str) -> float:
+        """Seconds of three calls that make an object each, which no manager looks at: what the API server takes."""
+        began = time.perf_counter()
+        for index in range(3):
+            metadata = {"name": f"{name}-{index}", "namespace": self._namespace}
+            await self._client.create(CONFIG_MAPS, {"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata})
+        return time.perf_counter() - began
 
     async def _status(self, name: str) -> float:
         async with asyncio.timeout(PATIENCE):
@@ -112,6 +127,10 @@ class Measured:
             ):
                 await asyncio.sleep(_LOOK)
         return time.perf_counter()
+
+
+def _p95(values: list[float]) -> float:
+    return statistics.quantiles(values, n=20)[18]
 
 
 def largest(pid: int) -> float:
@@ -131,14 +150,14 @@ async def measure(options: argparse.Namespace, pid: int, namespaces: tuple[str, 
     try:
         async with seen.watching(client, quiet):
             await measured.p95("warm", 5)
-            alone, status_alone = await measured.p95("alone", options.tasks)
+            alone, status_alone, raw_alone = await measured.p95("alone", options.tasks)
             for number in range(options.bombs):
                 await attacker.create(TEMPLATES, bomb(loud, number))
                 attacks.append(asyncio.create_task(bombing(attacker, loud, number)))
             flood = [attacker.create(TASKS, task(loud, f"flood{index}")) for index in range(options.flood)]
             flood += [attacker.create(TASKS, large(loud, index)) for index in range(options.large)]
             attacks.append(asyncio.create_task(at_once(flood)))
-            attacked, status = await measured.p95("attacked", options.tasks)
+            attacked, status, raw = await measured.p95("attacked", options.tasks)
     finally:
         for attack in attacks:
             attack.cancel()
@@ -146,9 +165,13 @@ async def measure(options: argparse.Namespace, pid: int, namespaces: tuple[str, 
         await client.close()
         await attacker.close()
     memory = largest(pid)
-    for what, before, after in (("Deployment", alone, attacked), ("status", status_alone, status)):
+    for what, before, after in (
+        ("Deployment", alone, attacked),
+        ("status", status_alone, status),
+        ("raw calls", raw_alone, raw),
+    ):
         times = f"alone {before * 1e3:7.1f} ms   under attack {after * 1e3:7.1f} ms"
-        print(f"task → {what:10}, p95  {times}   {after / before:.2f} times")
+        print(f"{what:10}, p95  {times}   {after / before:.2f} times")
     print(f"targets: the Deployment within {SLOWER:g} times, the status within {STATUS:g} s")
     print(f"the manager's memory     {memory:.0f} MiB at most, of {MEMORY}")
     found = {"the time": attacked > SLOWER * alone, "the status": status > STATUS, "the memory": memory > MEMORY}

@@ -93,6 +93,10 @@ class Process:
         assert found is not None
         return found
 
+    def resident_bytes(self) -> int:
+        """Return the memory that the present run holds now."""
+        return self._child.resident_bytes()
+
     def tail(self, lines: int = 40) -> str:
         """Return the last lines of the log under a heading, for messages."""
         return self._child.tail(lines)

@@ -71,7 +71,7 @@ def changed(container: Object) -> Object:
             ["spec.parameters.region: 7", "not of type string", "give a value of type string"],
         ),
         (
-            {"template": "good", "parameters": {"region": "x" * 70_000}},
+            {"template": "good", "parameters": {"region": "x" * 35_000, "more": "x" * 35_000}},
             "InvalidParameters",
             ["spec.parameters: takes", "65536"],
         ),

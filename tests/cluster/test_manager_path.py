@@ -184,7 +184,6 @@ def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
 
     expected = [
         ("ApplicationInstance", NORTH, "Applied"),
-        ("ApplicationTask", "north", "Accepted"),
         ("ApplicationTask", "wrong", "Refused"),
         ("ApplicationTemplate", "app", "Accepted"),
     ]

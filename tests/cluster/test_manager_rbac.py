@@ -163,6 +163,15 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
         api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 0, what="it is suspended")
         end(api, "stop")
         api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is resumed")
+        for value, status in (("anna", "True"), (None, "False"), ("anna", "True")):  # what is repeated is a series
+            api.patch("ApplicationInstance", NORTH, {"metadata": {"annotations": {"wayside.dev/pause": value}}})
+            api.wait_for(
+                "ApplicationInstance",
+                NORTH,
+                lambda raw, status=status: condition(raw, "Paused").get("status") == status,  # type: ignore[misc]
+                what="it is paused, or not",
+            )
+        api.patch("ApplicationInstance", NORTH, {"metadata": {"annotations": {"wayside.dev/pause": None}}})
         api.patch("ApplicationTemplate", "app", {"spec": {"configuration": {"app.json": {"x": "new"}}}})
         wait_until(
             lambda: [each["metadata"].get("annotations", {}) for each in api.list("Pod")],
@@ -182,7 +191,7 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
         api.wait_list("ApplicationTask", lambda found: not found, what="finished tasks are deleted")
         wait_until(
             lambda: set(used(proxy.seen, namespace)),
-            lambda found: ("events.k8s.io", "events", "create") in found,
+            lambda found: {("events.k8s.io", "events", each) for each in ("create", "patch")} <= found,
             what="what happened is told",
         )
         assert manager.terminate() == 0

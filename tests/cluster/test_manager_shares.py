@@ -9,11 +9,12 @@ from __future__ import annotations
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import config, start_manager, task, template
+from tests.cluster.managed_world import condition, config, end, start_manager, task, template
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Processes
 
 MANY = 150
+LIMITED = "*/det:max-tasks=1,max-priority=10,operations=Deploy+Reconfigure"
 AHEAD = MANY // 2
 """Maximum number of the many that may be written before the last one; without turns it would be all."""
 
@@ -49,6 +50,54 @@ def test_a_flood_in_one_namespace_delays_neither_what_another_applies_nor_its_st
         each for each in others if each["metadata"]["name"].startswith("refused") and _version(each) < _version(told)
     ]
     assert len(ahead) < AHEAD
+
+
+def test_tasks_beyond_the_budget_of_their_namespace_wait_until_older_ones_end(
+    api: Api, namespace: str, processes: Processes
+) -> None:
+    start_manager(processes, namespace, "--max-tasks", "2")
+    api.create(template())
+    for name in ("a", "b", "c"):
+        api.create(task(name))
+        _wait_accepted(api, name, ("LimitReached" if name == "c" else "Accepted"))
+    waiting = api.get("ApplicationTask", "c")["status"]
+    assert waiting["phase"] == "Waiting"
+    assert "may have 2 unfinished tasks" in waiting["message"]
+    assert api.find("Deployment", instance_name("app", "c")) is None
+    end(api, "a")
+    api.wait_for("Deployment", instance_name("app", "c"), lambda _: True, what="the next one is served")
+    _wait_accepted(api, "c", "Accepted")
+
+
+def test_a_holder_gets_what_the_administrator_allows_it_and_people_are_not_bound(
+    api: Api, namespace: str, processes: Processes
+) -> None:
+    start_manager(processes, namespace, "--holder-policy", LIMITED)
+    api.create(template())
+    urgent, stopping = task("urgent", holder="det"), task("stopping", holder="det", region="first")
+    api.create({**urgent, "spec": {**urgent["spec"], "priority": 11}})
+    api.create({**stopping, "spec": {**stopping["spec"], "operation": "Suspend"}})
+    for name, told in (("urgent", "spec.priority: 11 is above 10"), ("stopping", "spec.operation: Suspend")):
+        _wait_accepted(api, name, "NotAllowed")
+        assert told in api.get("ApplicationTask", name)["status"]["message"]
+    api.create(task("first", holder="det"))  # what is refused takes nothing of the budget
+    _wait_accepted(api, "first", "Accepted")
+    api.create(task("second", holder="det"))
+    _wait_accepted(api, "second", "LimitReached")
+    api.create(task("other", holder="another"))
+    _wait_accepted(api, "other", "Accepted")
+    person = task("person", region="first")
+    api.create({**person, "spec": {**person["spec"], "operation": "Suspend", "priority": 1000}})
+    deployment = instance_name("app", "first")
+    api.wait_for("Deployment", deployment, lambda raw: raw["spec"]["replicas"] == 0, what="a person suspends it")
+    api.delete("ApplicationTask", "first")
+    _wait_accepted(api, "second", "Accepted")
+
+
+def _wait_accepted(api: Api, name: str, reason: str) -> None:
+    api.wait_for(
+        "ApplicationTask", name, lambda raw: condition(raw, "Accepted").get("reason") == reason, what=f"it is {reason}"
+    )
 
 
 def _version(raw: dict[str, dict[str, str]]) -> int:

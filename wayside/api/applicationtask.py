@@ -24,6 +24,12 @@ from wayside.api.operation import MEANING, Operation
 MAXIMUM_PARAMETER_BYTES = 64 * 1024
 """The most that a task's parameters may take as JSON; the manager refuses more."""
 
+Value = Annotated[
+    JsonValue,
+    Field(json_schema_extra={"maxLength": MAXIMUM_PARAMETER_BYTES, "maxItems": 4096, "maxProperties": 1024}),
+]
+"""A JSON value that the API server bounds on its first level: what is deeper inside, no schema of a CRD can."""
+
 HOLDER_LABEL = "wayside.dev/holder"
 RULE_DIGEST_ANNOTATION = "wayside.dev/rule-digest"
 """Digest of the rule's semantics (see `EventRule.semantics`) under which the episode started."""
@@ -60,7 +66,7 @@ class TaskEvent(Model):
     onset_time: Time = Field(description="When the rule's condition began to hold.")
     start_time: Time = Field(description="When the episode started.")
     classification: Classification | None = Field(default=None, description="The rule's classification.")
-    values: dict[str, JsonValue] = Field(
+    values: dict[str, Value] = Field(
         default_factory=dict, max_length=256, description="The values of the rule's variables at the start."
     )
 
@@ -71,7 +77,7 @@ class ApplicationTaskSpec(Model):
     template: TemplateName = Field(description="The ApplicationTemplate, in the task's namespace.")
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
     priority: int = Field(default=0, ge=-1_000_000, le=1_000_000, description="Tasks of higher priority come first.")
-    parameters: dict[Identifier, JsonValue] = Field(
+    parameters: dict[Identifier, Value] = Field(
         default_factory=dict,
         max_length=64,
         description="Values for the template's parameters; at most 64 KiB in all. May change while the task lives.",

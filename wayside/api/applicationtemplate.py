@@ -17,6 +17,7 @@ from wayside.api.base import (
     Model,
     PositiveDuration,
     TemplateName,
+    Time,
     conditions_field,
     validations,
 )
@@ -192,11 +193,21 @@ class ApplicationTemplateSpec(Model):
         return manifests
 
 
+class TemplateManager(Model):
+    """An application manager, by its Lease."""
+
+    lease: str = Field(max_length=320, description="Namespace and name of its Lease.")
+    since: Time = Field(description="When the Lease was created: of two managers, the one with the older Lease acts.")
+
+
 class ApplicationTemplateStatus(Model):
     """What the application manager says of the template."""
 
     observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
     instances: int = Field(default=0, description="How many instances there are.")
+    manager: TemplateManager | None = Field(
+        default=None, description="The application manager that looks after the namespace."
+    )
     conditions: list[Condition] = conditions_field(
         "Accepted, Ready: whether the template can be rendered. Stalled: it has to be corrected."
     )

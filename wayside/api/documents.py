@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,11 @@ _MEANINGFUL = frozenset("\"'![]{}&*%@`|>#,?")
 _DEEPEST = 100
 _MOST_FIELDS = 200_000
 """No object comes near; aliases that multiply themselves do."""
+
+MAXIMUM_BYTES = 256 * 1024
+"""The most that the spec of a template, rule or detector may take as JSON: the manager keeps them in memory."""
+
+_BOUNDED = ("ApplicationTemplate", "Detector", "EventRule")  # tasks and instances have bounds for their parameters
 
 _TOO_DEEP = f"is nested more than {_DEEPEST} deep: an alias may hold itself"
 
@@ -114,9 +120,16 @@ def parse_object(raw: dict[str, Any]) -> Kind:
     """An object from the API server as its kind.
 
     Raises:
-        ValueError: it is of none of our kinds, or its fields do not fit; the text names each field.
+        ValueError: it is of none of our kinds, too large, or its fields do not fit; the text names each field.
     """
     kind = _kind_of(raw)
+    if kind.__name__ in _BOUNDED:
+        size = len(json.dumps(raw.get("spec"), ensure_ascii=False, separators=(",", ":"), default=str).encode())
+        if size > MAXIMUM_BYTES:
+            raise ValueError(
+                f"spec: takes {size} bytes as JSON, more than the {MAXIMUM_BYTES} that an object of kind "
+                f"{kind.__name__} may: move data into files, ConfigMaps or charts of your own"
+            )
     try:
         return kind.model_validate(raw)
     except ValidationError as error:

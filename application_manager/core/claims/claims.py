@@ -41,6 +41,7 @@ class Refused(StrEnum):
     INSTANCE_NOT_MANAGED = "InstanceNotManaged"
     INVALID_TASK = "InvalidTask"
     EXPRESSION_LIMIT = "ExpressionLimit"
+    NOT_ALLOWED = "NotAllowed"
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,17 @@ def with_defaults(declared: Mapping[str, Parameter], parameters: Parameters) -> 
     return dict(sorted((defaults | given(parameters)).items()))
 
 
+def size_problem(parameters: Parameters, where: str) -> str:
+    """Why the parameters of one task are too large; empty where they are not."""
+    size = len(json.dumps(dict(parameters), ensure_ascii=False, separators=(",", ":")).encode())
+    if size <= MAXIMUM_PARAMETER_BYTES:
+        return ""
+    return (
+        f"{where}: takes {size} bytes as JSON, more than the {MAXIMUM_PARAMETER_BYTES} allowed: "
+        "pass a reference to the data instead"
+    )
+
+
 def problems(
     declared: Mapping[str, Parameter], parameters: Parameters, template: str, where: str, *, whole: bool = True
 ) -> list[str]:
@@ -37,12 +48,9 @@ def problems(
 
     Required ones may be missing where the parameters are not meant to be the `whole`.
     """
-    size = len(json.dumps(dict(parameters), ensure_ascii=False, separators=(",", ":")).encode())
-    if size > MAXIMUM_PARAMETER_BYTES:
-        return [
-            f"{where}: takes {size} bytes as JSON, more than the {MAXIMUM_PARAMETER_BYTES} allowed: "
-            "pass a reference to the data instead"
-        ]
+    too_large = size_problem(parameters, where)
+    if too_large:
+        return [too_large]
     found = []
     present = given(parameters)
     for name, value in present.items():

@@ -11,6 +11,7 @@ from typing import Any
 
 from application_manager.core.health.refusals import without_names
 
+_OBSERVED = frozenset({"Deployment", "StatefulSet", "DaemonSet"})
 _LOAD_BALANCER = "LoadBalancer"
 
 
@@ -40,6 +41,12 @@ def not_ready(live: Mapping[str, Any]) -> str | None:
             pending = spec.get("type") == _LOAD_BALANCER and not (status.get("loadBalancer") or {}).get("ingress")
             return "has no address from the load balancer yet" if pending else None
     return _by_conditions(live, status)
+
+
+def is_unseen(live: Mapping[str, Any]) -> bool:
+    """Whether the object is a workload whose controller has not looked at its present spec yet."""
+    status = live.get("status") or {}
+    return live.get("kind") in _OBSERVED and _stale(live, status) is not None
 
 
 def _stale(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:

@@ -52,6 +52,11 @@ class Candidate:
         """For how many seconds it may act; none or less: it may not."""
         return self.until - now
 
+    @property
+    def created(self) -> str:
+        """When the Lease was created, as the API server says; empty while there is none."""
+        return str(self._metadata().get("creationTimestamp", ""))
+
     def observe(self, lease: Mapping[str, Any] | None, now: float) -> None:
         """Note the Lease as it was read, None where there is none."""
         if _version(lease) != _version(self._seen):

@@ -121,7 +121,7 @@ def _own() -> Iterator[Right]:
     for plural in ("applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"):
         yield Right(_GROUP, f"{plural}/status", ("patch",), "nobody learns how they are")
     yield Right(_LEASES, "leases", ("get", *_LOOKING), "holders that are lost are not noticed", vital=True)
-    yield Right("events.k8s.io", "events", ("create",), "no Kubernetes Events are posted")
+    yield Right("events.k8s.io", "events", ("create", "patch"), "no Kubernetes Events are posted")
 
 
 def _running_detectors() -> Iterator[Right]:

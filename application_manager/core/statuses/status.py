@@ -20,7 +20,7 @@ from application_manager.core.statuses.conclusions import STALLED, concluded
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
 from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase
-from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.api.applicationtemplate import ApplicationTemplateStatus, TemplateManager
 from wayside.api.base import Condition
 from wayside.api.operation import Operation
 from wayside.times import format_seconds, parse_seconds
@@ -283,7 +283,12 @@ def demands(decision: Decision) -> Demands:
 
 
 def template_status(
-    old: ApplicationTemplateStatus, generation: int, findings: Findings, instances: int, now: float
+    old: ApplicationTemplateStatus,
+    generation: int,
+    findings: Findings,
+    instances: int,
+    now: float,
+    manager: TemplateManager | None = None,
 ) -> ApplicationTemplateStatus:
     """The template's status, with why it cannot be rendered, if it cannot."""
     if findings.problems:
@@ -294,6 +299,7 @@ def template_status(
     return ApplicationTemplateStatus(
         observed_generation=generation,
         instances=instances,
+        manager=manager,
         conditions=list(concluded(old.conditions, [accepted], generation, now, stalled=(TEMPLATE_INVALID,))),
     )
 

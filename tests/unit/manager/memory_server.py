@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from copy import deepcopy
 from typing import cast
 
@@ -45,6 +46,9 @@ class MemoryServer:
 
     async def list(self, resource: Resource, *_: object, **__: object) -> tuple[list[Object], str]:
         return [deepcopy(each) for (kind, _), each in self.objects.items() if kind == resource.kind], str(self._number)
+
+    async def pages(self, resource: Resource, *_: object, **__: object) -> AsyncIterator[tuple[list[Object], str]]:
+        yield await self.list(resource)
 
     async def apply(self, resource: Resource, body: Object) -> Object:
         name = body["metadata"]["name"]

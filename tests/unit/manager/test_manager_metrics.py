@@ -15,6 +15,7 @@ from application_manager.cluster.client import ApiError
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
+from application_manager.headroom import Headroom
 from application_manager.knowledge.world import World
 from application_manager.measures import PREFIX, Measures
 from application_manager.observability.overview import Overview
@@ -150,6 +151,7 @@ def test_the_guide_describes_every_metric() -> None:
     measures.registry.register(Overview(World(Policy()), list))
     measures.registry.register(LostSpans(cast("Tracing", SimpleNamespace(dropped=0, failed=0))))
     measures.registry.register(Pulse(90, lambda: 0.0))
+    measures.registry.register(Headroom(1))
     names = {each.name + ("_total" if each.type == "counter" else "") for each in measures.registry.collect()}
     own = {each.removeprefix(PREFIX) for each in names if each.startswith(PREFIX)}
     assert len(own) > 12

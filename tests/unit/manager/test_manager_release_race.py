@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
 from typing import Any
 
 from application_manager.cluster.client import Resource
@@ -22,11 +23,11 @@ class GoingServer:
         self.world = world
         self.written: list[Any] = []
 
-    async def list(self, *_: object, **__: object) -> tuple[list[Any], str]:
+    async def pages(self, *_: object, **__: object) -> AsyncIterator[tuple[list[Any], str]]:
         entry = self.world.store.get(INSTANCE, NAME)
         assert entry is not None
         self.world.store.remove(entry.raw)
-        return [], "9"
+        yield [], "9"
 
     async def apply(self, resource: Resource, body: Any) -> Any:
         self.written.append(body)

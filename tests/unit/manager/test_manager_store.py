@@ -53,7 +53,7 @@ def test_a_list_shows_what_is_gone_but_nothing_that_is_newer_than_itself() -> No
     store = Store([])
     for each in (raw(1, "a", "gone"), raw(2, "b", "kept"), raw(9, "c", "newer"), raw(1, "d", "other", "elsewhere")):
         store.put(each)
-    missing = store.missing(KIND, [raw(2, "b", "kept")], "5", "site")
+    missing = store.missing(KIND, {("site", "kept")}, "5", "site")
     assert [entry.raw["metadata"]["name"] for entry in missing] == ["gone"]
 
 

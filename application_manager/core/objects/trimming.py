@@ -1,0 +1,84 @@
+"""What of an object the cache keeps: the fields that decisions read, and none that people may fill at will. Pure.
+
+An object may have 1.5 MB, and Python needs several times that. So neither the texts of ConfigMaps and Secrets are kept
+nor containers, managed fields of others, foreign annotations and the values of a task's event.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
+from application_manager.core.objects.labelling import INSTANCE_LABEL
+from wayside.api.base import GROUP
+
+Object = dict[str, Any]
+
+_CONTAINERS = frozenset({"containers", "initContainers", "ephemeralContainers", "volumes"})
+_SPEC_IS_READ = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod", "Service"})
+_CONTENT = frozenset({"data", "binaryData", "stringData"})
+_OF_TASKS = ("template",)  # fields of a task's spec that are read beside its model
+
+
+def own(raw: Object) -> Object:
+    """An object of our kinds without what nobody reads, for its model to be made of."""
+    lean = {**raw, "metadata": _metadata(raw, managers=())}
+    spec = raw.get("spec")
+    if raw.get("kind") == "ApplicationTask" and isinstance(spec, dict) and isinstance(spec.get("event"), dict):
+        lean["spec"] = {**spec, "event": {key: value for key, value in spec["event"].items() if key != "values"}}
+    return lean
+
+
+def beside_model(lean: Object) -> Object:
+    """What is kept of an object of our kinds whose model is kept as well; tasks and instances are many."""
+    if lean["kind"] not in ("ApplicationTask", "ApplicationInstance"):
+        return lean
+    spec, status = lean.get("spec") or {}, lean.get("status") or {}
+    kept = {"phase": status["phase"]} if "phase" in status else {}
+    names = ("name", "namespace", "uid", "resourceVersion", "labels", "ownerReferences", "deletionTimestamp")
+    return {
+        "apiVersion": lean["apiVersion"],
+        "kind": lean["kind"],
+        "metadata": {key: lean["metadata"][key] for key in names if key in lean["metadata"]},
+        "spec": {key: spec[key] for key in _OF_TASKS if key in spec},
+        "status": kept,
+    }
+
+
+def others(raw: Object, manager: str) -> Object:
+    """What is kept of an object of another kind; of its managed fields those of `manager`, by which it drifts."""
+    kept = {key: value for key, value in raw.items() if key not in _CONTENT and key != "spec"}
+    kept["metadata"] = _metadata(raw, managers=(manager,))
+    if raw["kind"] in _SPEC_IS_READ and "spec" in raw:
+        kept["spec"] = _without_containers(raw["spec"])
+    if "data" in raw and _is_configuration(raw):
+        kept["data"] = raw["data"]
+    return kept
+
+
+def _is_configuration(raw: Object) -> bool:
+    """Whether the object is the ConfigMap of an instance's files, which are published."""
+    owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
+    return (raw["apiVersion"], raw["kind"]) == CONFIG_MAP and raw["metadata"]["name"] == config_map_name(str(owner))
+
+
+def _metadata(raw: Object, managers: tuple[str, ...]) -> Object:
+    metadata = raw["metadata"]
+    kept = {key: value for key, value in metadata.items() if key not in ("managedFields", "annotations")}
+    fields = [each for each in metadata.get("managedFields") or () if each.get("manager") in managers]
+    annotations = {
+        key: value for key, value in (metadata.get("annotations") or {}).items() if key.startswith(f"{GROUP}/")
+    }
+    return kept | ({"managedFields": fields} if fields else {}) | ({"annotations": annotations} if annotations else {})
+
+
+def _without_containers(spec: Any) -> Any:
+    """The spec without what its pods are made of; where they may run stays."""
+    if not isinstance(spec, Mapping):
+        return spec
+    kept = {key: value for key, value in spec.items() if key not in _CONTAINERS}
+    for path in ("template", "jobTemplate", "spec"):
+        if isinstance(kept.get(path), Mapping):
+            kept[path] = _without_containers(kept[path])
+    return kept

@@ -1,0 +1,102 @@
+"""How near the manager is to its memory limit, and whether it may take in more.
+
+Beyond a limit the kernel ends the process, and with it the work for all namespaces. So beyond 85 % of it, tasks that
+were never served are not taken in: their statuses give the reason, and a resync takes them in once there is room again.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from application_manager.measures import PREFIX
+
+_FULL, _ROOM = 0.85, 0.75  # of the limit: beyond the first it is tight, until it is below the second
+_LOOK_EVERY = 0.5  # s
+_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+_UNLIMITED = 1 << 60  # bytes: what version 1 of cgroups has in place of `max`
+
+log = logging.getLogger(__name__)
+
+
+def container_limit() -> int | None:
+    """The memory limit of the container, in bytes; None where there is none."""
+    for each in _LIMITS:
+        try:
+            found = each.read_text().strip()
+        except OSError:
+            continue
+        return int(found) if found.isdigit() and int(found) < _UNLIMITED else None
+    return None
+
+
+class Headroom(Collector):
+    """Compares what the manager and its worker processes have in memory with the limit; also as metrics."""
+
+    def __init__(self, limit: int | None) -> None:
+        """`limit`: bytes; None: nothing is ever tight."""
+        self.limit = limit
+        self._tight = False
+        self._looked = 0.0  # on the monotonic clock
+
+    def tight(self) -> bool:
+        """Whether nothing more should be taken in."""
+        now = time.monotonic()
+        if self.limit is not None and now - self._looked > _LOOK_EVERY:
+            self._looked = now
+            self._look(self.limit)
+        return self._tight
+
+    def collect(self) -> Iterator[Metric]:
+        """The metrics as of now."""
+        used = GaugeMetricFamily(f"{PREFIX}memory_bytes", "Resident memory of the manager and its worker processes")
+        used.add_metric((), _resident())
+        tight = GaugeMetricFamily(f"{PREFIX}memory_tight", "1 while new tasks are not taken in for want of memory")
+        tight.add_metric((), float(self.tight()))
+        yield from (used, tight)
+        if self.limit is not None:
+            limit = GaugeMetricFamily(f"{PREFIX}memory_limit_bytes", "Memory that they may have together")
+            limit.add_metric((), self.limit)
+            yield limit
+
+    def _look(self, limit: int) -> None:
+        used = _resident()
+        if used > _ROOM * limit:
+            _return_free_memory()
+            used = _resident()
+        tight = used > (_ROOM if self._tight else _FULL) * limit
+        if tight != self._tight:
+            what = "new tasks are not taken in" if tight else "new tasks are taken in again"
+            log.warning("memory: %d of %d MiB are in use: %s", used >> 20, limit >> 20, what)
+        self._tight = tight
+
+
+def _resident() -> int:
+    """Bytes that this process and its children have in memory; what they share counts for each of them."""
+    children = Path(f"/proc/self/task/{os.getpid()}/children")
+    try:
+        pids = ["self", *children.read_text().split()]
+    except OSError:  # a kernel that does not list them
+        pids = ["self"]
+    return sum(map(_resident_of, pids))
+
+
+def _resident_of(pid: str) -> int:
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:  # it has just ended
+        return 0
+
+
+def _return_free_memory() -> None:
+    """Have the allocator give back what is free: it keeps it else, and it would count as in use."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc alone
+    if trim is not None:
+        trim(0)

@@ -1,0 +1,138 @@
+"""Other managers that look after the same namespaces, by what they write into the statuses of templates.
+
+Managers with one Lease take turns by that. Two releases have a Lease each, and none may read the other's. So each
+writes its Lease, and when that was created, into the status of every template. Of two, the one with the older Lease
+acts in a namespace and the other one waits there. By an attempt, the younger one learns whether the older one is alive:
+it writes itself into one template, and the older one then writes itself back.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from application_manager.cluster.store import Name
+from wayside.api.applicationtemplate import TemplateManager
+
+ANSWER = 5.0
+"""Seconds in which a manager that is alive answers such an attempt."""
+
+log = logging.getLogger(__name__)
+
+
+class Turn(Enum):
+    """What a manager may do in a namespace."""
+
+    ACT = "act"
+    WAIT = "wait"
+    CHALLENGE = "write itself into the template's status, and nothing else"
+
+
+@dataclass(slots=True)
+class _Yielded:
+    """A namespace in which the manager waits.
+
+    Attributes:
+        template: by whose status it tries.
+        until: when it tries, or where it has tried, when no answer means that the other one is gone; since 1970.
+    """
+
+    rival: TemplateManager
+    template: Name
+    until: float
+    tried: bool = False
+
+
+class OverlapBook:
+    """Namespaces that others look after as well.
+
+    Attributes:
+        own: what this manager writes; None while its Lease is not known.
+        every: seconds between two attempts.
+        resumed: called with a namespace in which the manager acts again.
+    """
+
+    def __init__(self) -> None:
+        self.own: Callable[[], TemplateManager | None] = lambda: None
+        self.every = 60.0
+        self.resumed: Callable[[str], None] = lambda _: None
+        self._written: dict[Name, str] = {}  # the Lease in a template's status
+        self._yielded: dict[str, _Yielded] = {}
+        self._younger: set[tuple[str, str]] = set()  # namespaces and Leases that were reported
+
+    def yields(self, namespace: str) -> bool:
+        """Whether the manager does nothing in the namespace."""
+        return namespace in self._yielded
+
+    @property
+    def count(self) -> int:
+        """In how many namespaces it waits."""
+        return len(self._yielded)
+
+    def note(self, template: Name, written: TemplateManager | None, now: float) -> None:
+        """Note what a template's status says; `now` in seconds since 1970."""
+        own, namespace = self.own(), template[0]
+        if own is None or written is None:
+            return
+        before = self._written.get(template)
+        self._written[template] = written.lease
+        if written.lease == own.lease:
+            return
+        if (own.since, own.lease) < (written.since, written.lease):
+            self._report_younger(namespace, written)
+        elif before == own.lease:  # it has answered, or has come back
+            self._yield(_Yielded(written, template, now + self.every))
+        elif namespace not in self._yielded:  # it may be gone
+            self._yield(_Yielded(written, template, now))
+
+    def turn(self, template: Name, now: float) -> tuple[Turn, float]:
+        """What may be done about a template as of `now`, and when that changes, both in seconds since 1970."""
+        state = self._yielded.get(template[0])
+        if state is None:
+            return Turn.ACT, now
+        if state.template != template or now < state.until:
+            return Turn.WAIT, max(state.until, now + 1.0)
+        if not state.tried:
+            state.tried, state.until = True, now + ANSWER
+            return Turn.CHALLENGE, state.until
+        self._resume(template[0], f"the manager of the Lease {state.rival.lease} does not answer")
+        return Turn.ACT, now
+
+    def waits_for(self, namespace: str) -> str:
+        """The Lease of the manager for which this one waits in the namespace."""
+        state = self._yielded.get(namespace)
+        return state.rival.lease if state is not None else ""
+
+    def forget(self, template: Name) -> None:
+        """Note that a template is gone."""
+        self._written.pop(template, None)
+        state = self._yielded.get(template[0])
+        if state is not None and state.template == template:
+            self._resume(template[0], f"template {template[1]} is gone")
+
+    def _yield(self, state: _Yielded) -> None:
+        namespace = state.template[0]
+        if namespace not in self._yielded:
+            log.warning(
+                "namespace %s is also looked after by the manager of the Lease %s, older than ours: this one waits. "
+                "Give each its own namespaces, or one Lease to both",
+                namespace,
+                state.rival.lease,
+            )
+        self._yielded[namespace] = state
+
+    def _resume(self, namespace: str, why: str) -> None:
+        del self._yielded[namespace]
+        log.warning("namespace %s: %s: this manager acts there", namespace, why)
+        self.resumed(namespace)
+
+    def _report_younger(self, namespace: str, rival: TemplateManager) -> None:
+        if (namespace, rival.lease) not in self._younger:
+            self._younger.add((namespace, rival.lease))
+            log.warning(
+                "namespace %s is also looked after by the manager of the Lease %s, which is younger and should wait",
+                namespace,
+                rival.lease,
+            )

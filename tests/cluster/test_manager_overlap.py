@@ -1,0 +1,62 @@
+"""Two releases with a Lease each look after one namespace: one of them acts, and the other one waits."""
+
+from __future__ import annotations
+
+from application_manager.core.claims.claims import instance_name
+from tests.cluster.api import Api
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.faulty_proxy import Proxy, faulty_proxy
+from tests.cluster.managed_world import condition, start_manager, task, template, wait_settled
+from tests.cluster.processes import Processes
+
+OTHER = ("--lease", "other", "--allowed-kinds", "v1/ConfigMap")
+"""Of the second release: to it, a template with a Deployment is invalid."""
+
+WAITS = r"also looked after by the manager of the Lease \S+/application-manager, older than ours: this one waits"
+ATTEMPTS = 10
+"""Writes of the second one that may be seen while a task is served: attempts, one in five seconds here."""
+
+
+def statuses(proxy: Proxy) -> int:
+    return sum("/applicationtemplates/app/status" in each.path for each in proxy.seen)
+
+
+def test_the_younger_one_waits_until_the_older_one_is_gone(
+    api: Api, control_plane: ControlPlane, processes: Processes, namespace: str
+) -> None:
+    with (
+        faulty_proxy(control_plane.kubeconfig) as (first, one),
+        faulty_proxy(control_plane.kubeconfig) as (second, two),
+    ):
+        older = start_manager(processes, namespace, kubeconfig=one)
+        older.wait_for_output("active: holds the Lease")
+        api.wait_for("Lease", "application-manager", lambda _: True, what="the first Lease is there")
+        younger = start_manager(processes, namespace, *OTHER, kubeconfig=two)
+        younger.wait_for_output("active: holds the Lease")
+        api.create(template())
+        younger.wait_for_output(WAITS)
+        for number in range(3):
+            api.create(task(f"t{number}"))
+            name = instance_name("app", f"t{number}")
+            api.wait_for("Deployment", name, lambda _: True, what="the first one serves the task")
+        wait_settled(api)
+        told = api.wait_for(
+            "ApplicationTemplate",
+            "app",
+            lambda raw: raw["status"].get("manager", {}).get("lease", "").endswith("/application-manager"),
+            what="its status names the older one",
+        )
+        assert condition(told, "Accepted")["status"] == "True"
+        assert statuses(second) <= ATTEMPTS
+        assert statuses(first) <= 2 * ATTEMPTS
+        assert not [each for each in second.writes() if "/applicationinstances" in each.path]
+
+        older.terminate()
+        younger.wait_for_output("does not answer: this manager acts there")
+        api.wait_for(
+            "ApplicationTemplate",
+            "app",
+            lambda raw: condition(raw, "Accepted")["status"] == "False",
+            what="the second one judges the template",
+        )
+        assert api.find("Deployment", instance_name("app", "t0")) is not None, "what runs stays"

@@ -1,0 +1,76 @@
+"""How much the manager asks of the API server: counted by a proxy between the two."""
+
+from __future__ import annotations
+
+from application_manager.core.claims.claims import instance_name
+from tests.cluster.api import Api
+from tests.cluster.controlplane import ControlPlane
+from tests.cluster.faulty_proxy import Proxy, Seen, faulty_proxy
+from tests.cluster.managed_world import condition, start_manager, task, template, wait_settled
+from tests.cluster.processes import Processes
+from tests.cluster.waiting import wait_until
+
+MANY = 10
+BESIDE = 4
+"""Requests for a task with an instance of its own, beside the two applies: look, two statuses, an Event."""
+
+LISTS_AND_LEASES = ("watch=true", "limit=", "/leases", "/selfsubjectaccessreviews")
+
+
+def about_tasks(proxy: Proxy, since: int) -> list[Seen]:
+    """The requests that are neither lists, which come with time and not with tasks, nor about Leases."""
+    return [each for each in proxy.seen[since:] if not any(part in each.path for part in LISTS_AND_LEASES)]
+
+
+def applies(seen: list[Seen]) -> list[Seen]:
+    return [each for each in seen if each.method == "PATCH" and "force=true" in each.path]
+
+
+def test_a_task_with_an_instance_of_its_own_takes_two_applies_and_four_other_requests(
+    api: Api, control_plane: ControlPlane, processes: Processes, namespace: str
+) -> None:
+    with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
+        start_manager(processes, namespace, kubeconfig=kubeconfig)
+        api.create(template())
+        api.wait_for("ApplicationTemplate", "app", lambda raw: bool(condition(raw, "Accepted")), what="it is known")
+        api.create(task("warm"))
+        wait_settled(api)
+        wait_until(lambda: api.get("ApplicationTemplate", "app"), lambda raw: raw["status"]["instances"] == 1, what="1")
+        since = len(proxy.seen)
+        for number in range(MANY):
+            api.create(task(f"t{number}"))
+            name = instance_name("app", f"t{number}")
+            api.wait_for(
+                "ApplicationInstance", name, lambda raw: bool(condition(raw, "Ready")), what="the instance has it"
+            )
+            api.wait_for(
+                "ApplicationTask", f"t{number}", lambda raw: bool(condition(raw, "Ready")), what="so does the task"
+            )
+        wait_settled(api)
+        seen = [each for each in about_tasks(proxy, since) if "/applicationtemplates/" not in each.path]
+        assert len(applies(seen)) == 2 * MANY
+        others = [(each.method, each.path) for each in seen if each not in applies(seen)]
+        assert len(others) <= BESIDE * MANY, "\n".join(map(" ".join, others))
+
+
+def test_what_is_repeated_is_one_event_with_a_series(api: Api, processes: Processes, namespace: str) -> None:
+    start_manager(processes, namespace)
+    api.create(template())
+    api.create(task("north"))
+    wait_settled(api)
+    north = instance_name("app", "north")
+    for times in range(1, 4):
+        for value, status in (("anna", "True"), (None, "False")):
+            api.patch("ApplicationInstance", north, {"metadata": {"annotations": {"wayside.dev/pause": value}}})
+            api.wait_for(
+                "ApplicationInstance",
+                north,
+                lambda raw, status=status: condition(raw, "Paused").get("status") == status,
+                what=f"it is paused or not, for the {times}. time",
+            )
+
+    def paused() -> list[int]:
+        events = [each for each in api.list("Event.events.k8s.io") if each["reason"] == "Paused"]
+        return [each.get("series", {}).get("count", 1) for each in events]
+
+    wait_until(paused, lambda found: found == [2], what="one Event, whose series was begun by the first repetition")
