@@ -1,7 +1,7 @@
 """The registrations with kopf, and nothing else: every event is handed on, nothing is handled here.
 
 Only `on.event`, which neither adds finalizers nor writes to objects. Handlers return None, and kopf's own Events,
-peering and progress storage are off. Leases are filtered by name, an instance's objects by label, on the server.
+peering and progress storage are off. The API server selects holders' Leases and instances' objects by their labels.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import kopf
 from application_manager.cluster.client import LEASES, Object, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
-from wayside.leases import holder_of
+from wayside.leases import HOLDER_LEASE_LABEL
 
 News = Callable[[Object], None]
 
@@ -44,7 +44,7 @@ async def watch(
     ready: asyncio.Event,
     pulse: Pulse,
 ) -> None:
-    """Hand on the news of our own kinds, of Leases, and of what bears an instance's label, until cancelled.
+    """Hand on the news of our own kinds, of holders' Leases, and of what has an instance's label, until cancelled.
 
     `namespaces` empty: all. `pulse` takes each watch's signs of life. `ready` is set once kopf has started. `connect`
     is asked for credentials at the start, and again when the API server no longer takes them.
@@ -71,16 +71,12 @@ async def watch(
         else:
             observe(raw)
 
-    def is_holders(name: str, **_: Any) -> bool:
-        return holder_of(name) is not None
-
     kopf.on.login(registry=registry)(login)
     for resource in own:
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handle)
-    kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=registry, when=is_holders)(handle)
-    for resource in children:
+    for resource, label in ((LEASES, HOLDER_LEASE_LABEL), *((each, INSTANCE_LABEL) for each in children)):
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handle)
-        settings.watching.label_selectors[resource.group, resource.version, resource.plural] = INSTANCE_LABEL
+        settings.watching.label_selectors[resource.group, resource.version, resource.plural] = label
 
     identity: Any = "application-manager"  # else kopf asks for the user's name, and a container's may have none
     with pulsing(pulse):

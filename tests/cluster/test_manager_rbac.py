@@ -9,7 +9,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import pytest
 import yaml
@@ -28,6 +28,7 @@ from tests.cluster.managed_world import condition, config, deployment, end, star
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
+from wayside.leases import HOLDER_LEASE_LABEL
 
 KINDS = ("apps/v1/Deployment", "v1/ConfigMap")
 ALLOWED = [word for each in KINDS for word in ("--allowed-kinds", each)]
@@ -188,6 +189,9 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
         assert manager.terminate() == 0
     assert "orbidden" not in manager.output()
     assert "may not" not in manager.output()
+    watches = [each.path for each in proxy.seen if "/leases?" in each.path and "watch=true" in each.path]
+    assert watches
+    assert all(f"labelSelector={quote(HOLDER_LEASE_LABEL, safe='')}" in each for each in watches)
     asked = set(used(proxy.seen, namespace))
     for group, resource, verb in [*asked]:
         if verb == "patch" and resource in ("applicationinstances", "deployments", "configmaps"):
