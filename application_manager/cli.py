@@ -86,11 +86,15 @@ def _seconds(option: str, written: str) -> float:
         raise typer.BadParameter(str(error), param_hint=option) from None
 
 
-def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
+def _policy(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
+    """The policy; `everywhere`: of a manager that looks after all namespaces."""
     from application_manager.core.objects.policy import Policy
 
     try:
-        return Policy.parse(kinds, accounts)
+        policy = Policy.parse(kinds, accounts)
+        if everywhere:
+            policy.check_everywhere()
+        return policy
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
 
@@ -228,7 +232,7 @@ def run(
         from application_manager.work.publishing import settings
 
     options = Options(
-        policy=_policy(allowed_kinds, service_accounts),
+        policy=_policy(allowed_kinds, service_accounts, everywhere=not namespace),
         namespaces=tuple(namespace or ()),
         max_instances=max_instances,
         resync=_seconds("--resync", resync),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from application_manager.core.objects.policy import DEFAULT_PLURALS, KindKey, kind_text
+from application_manager.core.objects.policy import DEFAULT_KINDS, PLURALS, KindKey, kind_text
 from application_manager.core.objects.rights import lease_rights, merged, node_rights, rights
 from wayside.api.__main__ import crd_files
 from wayside.manifests import to_yaml
@@ -36,7 +36,8 @@ def _rights() -> dict[str, Any]:
         "withoutPods": merged(each for each in without_pods if each not in pods),
         "detectors": merged(each for each in rights({}, detectors=True) if each not in without_pods),
         "cluster": merged(node_rights()),
-        "kinds": {kind_text(kind): _added(kind, plural) for kind, plural in sorted(DEFAULT_PLURALS.items())},
+        "kinds": {kind_text(kind): _added(kind, plural) for kind, plural in sorted(PLURALS.items())},
+        "defaultKinds": sorted(map(kind_text, DEFAULT_KINDS)),
         "otherKindVerbs": _added(_ANY, "examples")[0]["verbs"],
         "lease": merged(lease_rights(LEASE)),
     }

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 from urllib.parse import urlencode
@@ -38,6 +38,7 @@ _TIMEOUT = 15.0  # s for one request
 _CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
 _PATIENCE = 30.0  # s in which a request is asked again that the API server did not look at
 _NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
+_NAMESPACE = re.compile(r"/namespaces/([^/]+)/")
 _BAD_MANIFEST = "failed to create typed patch object"
 
 
@@ -50,6 +51,13 @@ class NotActive(Unreachable):
 
     def __init__(self) -> None:
         super().__init__("this manager is not the active one and writes nothing")
+
+
+class NotGranted(Unreachable):
+    """The account may not write in this namespace: nothing is written there, and nothing needs to be tried again."""
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__(f"namespace {namespace} is not granted to this manager, which writes nothing there")
 
 
 class ApiError(Exception):
@@ -118,6 +126,7 @@ class Client:
 
     Attributes:
         may_act: for how many seconds we may write; none or less: not at all, and each write raises NotActive.
+        may_write: whether we may write in a namespace; where not, each write raises NotGranted. None: as it comes.
         open_until: until when, on the monotonic clock, a write may yet be done that was sent and not answered.
     """
 
@@ -133,6 +142,7 @@ class Client:
         """`timeout`: seconds in which a request must be answered."""
         self.configuration = configuration
         self.may_act = may_act
+        self.may_write: Callable[[str], Awaitable[bool]] | None = None
         self.open_until = 0.0
         self._measures = measures or Measures()
         self._pacing = pacing or Pacing()
@@ -255,6 +265,9 @@ class Client:
         """Ask, and ask again what the API server did not look at, as long as it keeps to a reasonable time."""
         deadline = time.monotonic() + _PATIENCE
         changes = method != "GET" if writes is None else writes
+        where = _NAMESPACE.search(path) if changes and self.may_write is not None else None
+        if where is not None and self.may_write is not None and not await self.may_write(where[1]):
+            raise NotGranted(where[1])
         while True:
             try:
                 async with self._pacing.turn():

@@ -65,7 +65,15 @@ def rbac(
     namespace: Annotated[
         list[str] | None,
         typer.Option(
-            help="As of `run`: a namespace to look after, which gets a Role; repeatable. Default: a ClusterRole."
+            help="As of `run`: a namespace to look after, which gets a Role; repeatable. Default: a ClusterRole that "
+            "reads in all of them."
+        ),
+    ] = None,
+    grant: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAMESPACE",
+            help="Without --namespace: a namespace in which the manager may write, by a RoleBinding; repeatable.",
         ),
     ] = None,
     account: Annotated[
@@ -88,7 +96,7 @@ def rbac(
     with importing():
         from application_manager.commands.rbac import print_rbac
 
-    print_rbac(allowed_kinds, namespace or (), account, lease, name, detectors=detectors)
+    print_rbac(allowed_kinds, namespace or (), account, lease, name, detectors=detectors, grant=grant or ())
 
 
 def detector_rbac(

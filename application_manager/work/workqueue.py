@@ -17,7 +17,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Hashable
 from typing import Any, Generic, TypeVar
 
-from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.cluster.client import ApiError, NotGranted, Unreachable
 from application_manager.measures import Measures
 
 Key = TypeVar("Key", bound=Hashable)
@@ -181,6 +181,8 @@ class WorkQueue(Generic[Key]):
         began, failed = time.monotonic(), True
         try:
             await self._work(key)
+        except NotGranted:
+            self._failures.pop(key, None)  # once the namespace is granted, all its keys are asked for again
         except (ApiError, Unreachable) as error:
             pause = self._pause(key, error.retry_after if isinstance(error, ApiError) else None)
             log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
