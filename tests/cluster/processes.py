@@ -45,6 +45,10 @@ class Process:
         """The exit code of the present run, negative for a signal; None while it goes on."""
         return self._child.returncode
 
+    def resident_bytes(self) -> int:
+        """The memory that the present run holds now; 0 where the system does not report it."""
+        return self._child.resident_bytes()
+
     def terminate(self, patience: float = 60) -> int:
         """Send SIGTERM, wait for the end, return the exit code; TimeoutError (and SIGKILL) after `patience` seconds."""
         return self._child.terminate(patience)
