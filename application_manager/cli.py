@@ -99,14 +99,21 @@ def _policy(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: 
         raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
 
 
-def _serving(port: int | None, certificates: Path | None) -> Serving | None:
-    if port is None and certificates is None:
+def _serving(port: int | None, certificates: Path | None, service: str | None, webhooks: str) -> Serving | None:
+    if port is None and certificates is None and service is None:
         return None
     from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
+    from application_manager.core.findings.webhooks import certificate_secret
 
     if port is None or certificates is None:
         commandline.refuse(f"{PORT_OPTION} and {FOLDER_OPTION} go together: give both, or none")
-    return Serving(port, certificates)
+    if service is None:
+        return Serving(port, certificates)
+    try:
+        certificate_secret(service)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--admission-service") from None
+    return Serving(port, certificates, service, webhooks)
 
 
 def _lease(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
@@ -220,6 +227,20 @@ def run(
         Path | None,
         typer.Option(help="With --admission-port: a folder with tls.crt and tls.key, which may change while it runs."),
     ] = None,
+    admission_service: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMESPACE/NAME",
+            help="Make the certificate for this Service, keep it in the Secret NAME-certificates of its namespace, "
+            "which must exist, renew it in time, and write the files into --admission-certificates.",
+        ),
+    ] = None,
+    admission_webhooks: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="With --admission-service: the webhook configurations that get the authority."
+        ),
+    ] = "wayside",
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
     with importing():
@@ -245,7 +266,7 @@ def run(
         helm=Helm(helm),
         chart_cache=chart_cache or default_folder(),
         chart_folder=chart_folder,
-        admission=_serving(admission_port, admission_certificates),
+        admission=_serving(admission_port, admission_certificates, admission_service, admission_webhooks),
         lease=_lease(lease, tuple(namespace or ())),
         detectors=_detectors(detector_image, detector_pull_policy, detector_pull_secret, detector_env),
     )

@@ -18,6 +18,7 @@ import kopf
 
 from application_manager.admission.admission import Admission
 from application_manager.admission.injecting import Injecting
+from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import Desk, webhook
 from application_manager.assembly import Assembly
 from application_manager.cluster.client import ApiError, Client, Resource
@@ -63,7 +64,8 @@ async def serve(options: Options) -> None:
         await entitled(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
         await selectable(client, resources, options.namespaces)
         helm = replace(options.helm, kube_version=version)
-        await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
+        async with issuing(renewals, options.admission):
+            await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
     except ApiError as error:
         raise ConfigurationError(
             f"the API server refuses what the manager needs: {error}; check the account and its rights"

@@ -10,13 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from application_manager.core.objects.policy import DEFAULT_KINDS, PLURALS, KindKey, kind_text
-from application_manager.core.objects.rights import lease_rights, merged, node_rights, rights
+from application_manager.core.objects.rights import certificate_rights, lease_rights, merged, node_rights, rights
 from wayside.api.__main__ import crd_files
 from wayside.manifests import to_yaml
 
 FILES = Path(__file__).parent / "wayside" / "files"
 LEASE = "NAME-OF-THE-LEASE"
 """What stands for the name of the managers' Lease."""
+SECRET_NAME = "NAME-OF-THE-SECRET"  # noqa: S105  stands for the name of one
+WEBHOOKS = "NAME-OF-THE-WEBHOOKS"
 
 _POD = ("v1", "Pod")
 _ANY: KindKey = ("example.com/v1", "Example")
@@ -30,6 +32,7 @@ def chart_files() -> dict[str, str]:
 
 def _rights() -> dict[str, Any]:
     """Rules as roles have them: those that are always needed, and what each kind and running detectors bring."""
+    secret, webhooks = certificate_rights(SECRET_NAME, WEBHOOKS)
     without_pods, pods = rights({}), rights({_POD: "pods"})
     return {
         "always": merged(each for each in without_pods if each in pods),
@@ -40,6 +43,8 @@ def _rights() -> dict[str, Any]:
         "defaultKinds": sorted(map(kind_text, DEFAULT_KINDS)),
         "otherKindVerbs": _added(_ANY, "examples")[0]["verbs"],
         "lease": merged(lease_rights(LEASE)),
+        "secret": merged(secret),
+        "webhooks": merged(webhooks),
     }
 
 

@@ -33,6 +33,7 @@ Object = dict[str, Any]
 FIELD_MANAGER = "wayside"
 _APPLY = "application/apply-patch+yaml"
 _MERGE = "application/merge-patch+json"
+_STRATEGIC = "application/strategic-merge-patch+json"
 _JSON = "application/json"
 _TIMEOUT = 15.0  # s for one request
 _CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
@@ -197,6 +198,12 @@ class Client:
         body = {"metadata": {"uid": uid, "annotations": dict(annotations)}}
         query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
         return await self._request("PATCH", resource.path(namespace, name), query, body, _MERGE)
+
+    async def merge(self, resource: Resource, name: str, body: Object) -> Object:
+        """Merge into an object of the cluster, lists by their members' names."""
+        return await self._request(
+            "PATCH", resource.path(None, name), {"fieldManager": FIELD_MANAGER}, body, _STRATEGIC
+        )
 
     async def scale(self, resource: Resource, namespace: str, name: str, version: str, replicas: int) -> Object:
         """Set the replicas of the object by its subresource `scale`, if it is still of this resourceVersion."""

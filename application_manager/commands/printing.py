@@ -88,6 +88,11 @@ def rbac(
     name: Annotated[
         str, typer.Option(help="Of the roles and bindings; managers of different namespaces need different ones.")
     ] = "wayside-application-manager",
+    admission_service: Annotated[
+        str | None,
+        typer.Option(metavar="NAMESPACE/NAME", help="As of `run`: a manager that makes its certificate."),
+    ] = None,
+    admission_webhooks: Annotated[str, typer.Option(metavar="NAME", help="As of `run`.")] = "wayside",
 ) -> None:
     """Print the roles that the manager's account needs for the kinds that templates may create, and no more.
 
@@ -96,7 +101,17 @@ def rbac(
     with importing():
         from application_manager.commands.rbac import print_rbac
 
-    print_rbac(allowed_kinds, namespace or (), account, lease, name, detectors=detectors, grant=grant or ())
+    print_rbac(
+        allowed_kinds,
+        namespace or (),
+        account,
+        lease,
+        name,
+        detectors=detectors,
+        grant=grant or (),
+        service=admission_service,
+        webhooks=admission_webhooks,
+    )
 
 
 def detector_rbac(

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from application_manager.cluster.client import ApiError, Client, Unreachable
 from application_manager.cluster.connection import ConfigurationError, load_configuration
 from application_manager.cluster.leadership import LEASE_NAME, lease_key
+from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.core.objects.detectors import detector_roles, sidecar_roles
 from application_manager.core.objects.policy import PLURALS, KindKey, Policy, kind_text
 from application_manager.core.objects.rights import roles
@@ -28,6 +29,8 @@ def print_rbac(
     *,
     detectors: bool,
     grant: Sequence[str],
+    service: str | None,
+    webhooks: str,
 ) -> None:
     """Print the roles and bindings as YAML.
 
@@ -39,6 +42,8 @@ def print_rbac(
         name: of the roles and bindings.
         detectors: whether the manager runs detectors too.
         grant: without `namespaces`: those in which the manager may write.
+        service: of the webhook, as NAMESPACE/NAME, where the manager makes its certificate.
+        webhooks: the name of the webhook configurations.
 
     Raises:
         ConfigurationError: a kind has to be looked up and cannot be.
@@ -62,7 +67,16 @@ def print_rbac(
         raise typer.BadParameter(str(error), param_hint="--lease") from None
     found = plurals(policy)
     lease_place = (key.namespace, key.name)
-    made = roles(found, namespaces, lease_place, (where, who), name, detectors=detectors, granted=grant)
+    made = roles(
+        found,
+        namespaces,
+        lease_place,
+        (where, who),
+        name,
+        detectors=detectors,
+        granted=grant,
+        certificates=(certificate_secret(service), webhooks) if service else None,
+    )
     sys.stdout.write(to_yaml(made))
 
 

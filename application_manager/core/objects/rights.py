@@ -127,6 +127,22 @@ def lease_rights(name: str) -> list[Right]:
     ]
 
 
+def certificate_rights(secret: str, webhooks: str) -> tuple[list[Right], list[Right]]:
+    """What a manager needs that makes its webhook's certificate: in the Secret's namespace, and in the cluster.
+
+    Args:
+        secret: its name.
+        webhooks: the name of the webhook configurations.
+    """
+    purpose = "the webhook has no certificate that the API server trusts"
+    group = "admissionregistration.k8s.io"
+    plurals = ("validatingwebhookconfigurations", "mutatingwebhookconfigurations")
+    return (
+        [Right("", "secrets", ("get", "update"), purpose, vital=True, name=secret)],
+        [Right(group, each, ("get", "patch"), purpose, vital=True, name=webhooks) for each in plurals],
+    )
+
+
 def node_rights() -> list[Right]:
     """What is of use for the whole cluster, and can be done without: nodes belong to no namespace."""
     return [Right("", "nodes", ("list",), "that no node is as a template requires is left to the scheduler to say")]
@@ -188,6 +204,7 @@ def roles(
     *,
     detectors: bool = False,
     granted: Iterable[str] = (),
+    certificates: tuple[tuple[str, str], str] | None = None,
 ) -> list[dict[str, Any]]:
     """The roles and their bindings, as manifests.
 
@@ -199,10 +216,12 @@ def roles(
         namespaces: those that are looked after; empty: all.
         lease: namespace and name of the managers' Lease.
         account: namespace and name of the manager's service account.
-        name: of all roles and bindings; those of the Lease end with `-lease`, the ClusterRole that writes with
-            `-writer`.
+        name: of all roles and bindings; those of the Lease end with `-lease`, of the webhook's certificate
+            with `-certificates`, the ClusterRole that writes with `-writer`.
         detectors: whether the manager runs detectors too.
         granted: without `namespaces`: those in which the manager may write.
+        certificates: namespace and name of the Secret, and the name of the webhook configurations, where the manager
+            makes its webhook's certificate.
     """
     where = list(dict.fromkeys(namespaces))
     needed = rights(plurals, detectors=detectors)
@@ -213,6 +232,11 @@ def roles(
         found += bound(name, None, merged([*reading(needed), *node_rights()]), account)
         found.append(_role(f"{name}-writer", None, merged(writing(needed))))
         found += [_binding(name, each, ("ClusterRole", f"{name}-writer"), account) for each in dict.fromkeys(granted)]
+    if certificates is not None:
+        (namespace, secret), webhooks = certificates
+        there, everywhere = certificate_rights(secret, webhooks)
+        found += bound(f"{name}-certificates", namespace, merged(there), account)
+        found += bound(f"{name}-certificates", None, merged(everywhere), account)
     return [*found, *bound(f"{name}-lease", lease[0], merged(lease_rights(lease[1])), account)]
 
 
