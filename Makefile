@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests that wait on other processes: three a core keep it busy.
 WAITING := $(BIN)/python -m pytest -n 6 --dist loadgroup
 
-.PHONY: help demo demo-cluster tutorial examples test unit process cluster e2e lint bench load mutants soak requirements crds clean
+.PHONY: help demo demo-cluster tutorial examples test unit process cluster compat e2e lint bench load mutants soak requirements wheels crds clean
 
 help: ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -67,6 +67,12 @@ cluster: $(BIN)/.installed-dev ## the tests against a real control plane; builds
 	@$(BIN)/python -m tests.kstatus
 	@$(WAITING) tests/cluster
 
+compat: $(BIN)/.installed-dev ## the tests of the cluster on the oldest Kubernetes that is supported; builds it first where it is missing
+	@WAYSIDE_TEST_KUBERNETES=oldest $(BIN)/python -m tests.cluster.binaries
+	@$(BIN)/python -m tests.helm
+	@$(BIN)/python -m tests.kstatus
+	@WAYSIDE_TEST_KUBERNETES=oldest $(WAITING) tests/cluster
+
 e2e: $(BIN)/.installed-dev ## the tests on a real node with containers, as root; builds it first where it is missing
 	@$(BIN)/python -m tests.cluster.binaries
 	@$(BIN)/python -m tests.helm
@@ -93,6 +99,12 @@ requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by th
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra etsi --extra mqtt --extra otel --upgrade \
 	  --generate-hashes --universal --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements.txt
+	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra etsi --extra mqtt --extra otel --extra onnx \
+	  --extra protobuf --extra results --constraint docker/requirements.txt --generate-hashes --universal \
+	  --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements-full.txt
+
+wheels: $(BIN)/.installed-dev ## whether the images' packages are there as wheels for both architectures, and how large they are
+	@$(BIN)/python docker/wheels.py
 
 clean: ## remove what was made here; the caches outside the tree stay
 	rm -rf $(VENV) out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache benchmarks/peers/*/target

@@ -96,11 +96,15 @@ def _bytes(option: str, written: str) -> int:
         raise typer.BadParameter(str(error), param_hint=option) from None
 
 
-def _policy(kinds: list[str] | None, accounts: list[str] | None) -> Policy:
+def _policy(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
+    """The policy; `everywhere`: of a manager that looks after all namespaces."""
     from application_manager.core.objects.policy import Policy
 
     try:
-        return Policy.parse(kinds, accounts)
+        policy = Policy.parse(kinds, accounts)
+        if everywhere:
+            policy.check_everywhere()
+        return policy
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
 
@@ -114,14 +118,21 @@ def _tasks(most: int | None, holders: list[str] | None) -> TaskPolicy:
         raise typer.BadParameter(str(error), param_hint="--holder-policy") from None
 
 
-def _serving(port: int | None, certificates: Path | None) -> Serving | None:
-    if port is None and certificates is None:
+def _serving(port: int | None, certificates: Path | None, service: str | None, webhooks: str) -> Serving | None:
+    if port is None and certificates is None and service is None:
         return None
     from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
+    from application_manager.core.findings.webhooks import certificate_secret
 
     if port is None or certificates is None:
         commandline.refuse(f"{PORT_OPTION} and {FOLDER_OPTION} go together: give both, or none")
-    return Serving(port, certificates)
+    if service is None:
+        return Serving(port, certificates)
+    try:
+        certificate_secret(service)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--admission-service") from None
+    return Serving(port, certificates, service, webhooks)
 
 
 def _lease(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
@@ -255,6 +266,20 @@ def run(
         Path | None,
         typer.Option(help="With --admission-port: a folder with tls.crt and tls.key, which may change while it runs."),
     ] = None,
+    admission_service: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMESPACE/NAME",
+            help="Make the certificate for this Service, keep it in the Secret NAME-certificates of its namespace, "
+            "which must exist, renew it in time, and write the files into --admission-certificates.",
+        ),
+    ] = None,
+    admission_webhooks: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="With --admission-service: the webhook configurations that get the authority."
+        ),
+    ] = "wayside",
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
     with importing():
@@ -268,7 +293,7 @@ def run(
         from application_manager.work.publishing import settings
 
     options = Options(
-        policy=_policy(allowed_kinds, service_accounts),
+        policy=_policy(allowed_kinds, service_accounts, everywhere=not namespace),
         namespaces=tuple(namespace or ()),
         max_instances=max_instances,
         tasks=_tasks(max_tasks, holder_policy),
@@ -283,7 +308,7 @@ def run(
         helm=Helm(helm),
         chart_cache=chart_cache or default_folder(),
         chart_folder=chart_folder,
-        admission=_serving(admission_port, admission_certificates),
+        admission=_serving(admission_port, admission_certificates, admission_service, admission_webhooks),
         lease=_lease(lease, tuple(namespace or ())),
         detectors=_detectors(detector_image, detector_pull_policy, detector_pull_secret, detector_env),
     )

@@ -13,7 +13,7 @@ from application_manager.cluster.entitlement import judge, lacking
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.cluster.starting import until_answered
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
-from application_manager.core.objects.rights import lease_rights, rights
+from application_manager.core.objects.rights import lease_rights, reading, rights
 from application_manager.knowledge.world import OWN_KINDS, POD, TASK
 
 log = logging.getLogger(__name__)
@@ -82,11 +82,13 @@ async def entitled(
 ) -> None:
     """Look whether the account has the rights that it needs, and say what lacks.
 
+    Of all namespaces it needs to read: in which ones it may write, is asked when something is to be written there.
     `detectors`: whether the manager runs detectors too. Raises ConfigurationError where nothing works without.
     """
     plurals = {kind: resources[kind].plural for kind in policy.kinds if kind in resources}
+    needed_there = rights(plurals, detectors=detectors)
     for needed, where in (
-        (rights(plurals, detectors=detectors), namespaces),
+        (needed_there if namespaces else reading(needed_there), namespaces),
         (lease_rights(lease.name), (lease.namespace,)),
     ):
         judge(await until_answered(partial(lacking, client, needed, where)))

@@ -19,10 +19,12 @@ import kopf
 
 from application_manager.admission.admission import Admission
 from application_manager.admission.injecting import Injecting
+from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import Desk, webhook
 from application_manager.assembly import Assembly
 from application_manager.cluster.client import ApiError, Client, Resource
 from application_manager.cluster.connection import ConfigurationError, load_configuration
+from application_manager.cluster.grants import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
 from application_manager.cluster.starting import until_answered
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
@@ -64,7 +66,8 @@ async def serve(options: Options) -> None:
         await entitled(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
         await selectable(client, resources, options.namespaces)
         helm = replace(options.helm, kube_version=version)
-        await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
+        async with issuing(renewals, options.admission):
+            await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
     except ApiError as error:
         raise ConfigurationError(
             f"the API server refuses what the manager needs: {error}; check the account and its rights"
@@ -110,6 +113,9 @@ class Manager:
         self._pulse = Pulse(options.watch_timeout, lambda: work.world.healthy.elapsed)
         measures.registry.register(self._pulse)
         self._detector_watch = DetectorWatch(work.world, client, work.book, options.namespaces, work.detectors.add)
+        self._grants = Grants(client, work.router.everything)
+        if not options.namespaces:
+            client.may_write = self._grants.may_write
         self._leases = LeaseWatch(work.world, client, own[0], options.namespaces, work.router.look_at)
         self._admission = Admission(
             world=work.world,
@@ -175,6 +181,7 @@ class Manager:
             asyncio.create_task(self._listing.resync(watching), name="resync"),
             asyncio.create_task(self._detector_watch.run(), name="detectors"),
             asyncio.create_task(self._leadership.run(), name="leadership"),
+            asyncio.create_task(self._grants.run(), name="grants"),
             asyncio.create_task(self._act(stop), name="acting"),
             asyncio.create_task(self._announce(watching, stop), name="signals"),
         ]

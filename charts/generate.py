@@ -9,14 +9,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from application_manager.core.objects.policy import DEFAULT_PLURALS, KindKey, kind_text
-from application_manager.core.objects.rights import lease_rights, merged, node_rights, rights
+from application_manager.core.objects.policy import DEFAULT_KINDS, PLURALS, KindKey, kind_text
+from application_manager.core.objects.rights import certificate_rights, lease_rights, merged, node_rights, rights
 from wayside.api.__main__ import crd_files
 from wayside.manifests import to_yaml
 
 FILES = Path(__file__).parent / "wayside" / "files"
 LEASE = "NAME-OF-THE-LEASE"
 """What stands for the name of the managers' Lease."""
+SECRET_NAME = "NAME-OF-THE-SECRET"  # noqa: S105  stands for the name of one
+WEBHOOKS = "NAME-OF-THE-WEBHOOKS"
 
 _POD = ("v1", "Pod")
 _ANY: KindKey = ("example.com/v1", "Example")
@@ -30,15 +32,19 @@ def chart_files() -> dict[str, str]:
 
 def _rights() -> dict[str, Any]:
     """Rules as roles have them: those that are always needed, and what each kind and running detectors bring."""
+    secret, webhooks = certificate_rights(SECRET_NAME, WEBHOOKS)
     without_pods, pods = rights({}), rights({_POD: "pods"})
     return {
         "always": merged(each for each in without_pods if each in pods),
         "withoutPods": merged(each for each in without_pods if each not in pods),
         "detectors": merged(each for each in rights({}, detectors=True) if each not in without_pods),
         "cluster": merged(node_rights()),
-        "kinds": {kind_text(kind): _added(kind, plural) for kind, plural in sorted(DEFAULT_PLURALS.items())},
+        "kinds": {kind_text(kind): _added(kind, plural) for kind, plural in sorted(PLURALS.items())},
+        "defaultKinds": sorted(map(kind_text, DEFAULT_KINDS)),
         "otherKindVerbs": _added(_ANY, "examples")[0]["verbs"],
         "lease": merged(lease_rights(LEASE)),
+        "secret": merged(secret),
+        "webhooks": merged(webhooks),
     }
 
 

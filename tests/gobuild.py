@@ -23,14 +23,21 @@ from rich.console import Console
 from tests.cluster.toolchain import GoUnavailableError, find_go
 
 STRIPPED = "-s -w"
-KUBERNETES = " ".join(  # a plain `go build` calls itself v0.0.0, which clients and CRD conversion then believe
-    (
-        STRIPPED,
-        "-X k8s.io/component-base/version.gitVersion=v1.36.3",
-        "-X k8s.io/component-base/version.gitMajor=1",
-        "-X k8s.io/component-base/version.gitMinor=36",
-    )
-)
+
+
+def kubernetes(version: str) -> str:
+    """What the linker gets for this version, e.g. 1.36.3.
+
+    A plain `go build` calls itself v0.0.0, which clients and CRD conversion then believe.
+    """
+    major, minor, _ = version.split(".")
+    package = "k8s.io/component-base/version"
+    values = {"gitVersion": f"v{version}", "gitMajor": major, "gitMinor": minor}
+    return " ".join((STRIPPED, *(f"-X {package}.{name}={value}" for name, value in values.items())))
+
+
+KUBERNETES = kubernetes("1.36.3")
+OLDEST_KUBERNETES = kubernetes("1.31.0")
 
 
 class BuildError(Exception):

@@ -5,6 +5,9 @@ from __future__ import annotations
 PREFIX = "wayside-"
 """What the names of all holders' Leases begin with."""
 
+HOLDER_LEASE_LABEL = "wayside.dev/holder-lease"
+"""On all holders' Leases, with the value `true`: the manager watches these alone, and not those of every node."""
+
 DEFAULT_DURATION = 15.0
 """Seconds that a renewal holds, where the Lease does not say."""
 

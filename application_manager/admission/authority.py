@@ -1,4 +1,4 @@
-"""Certificates of our own making, for trying the webhook where there is no cert-manager.
+"""Certificates of our own making, for the webhook where there is no cert-manager.
 
 A new authority signs one certificate and is forgotten: its key is kept nowhere, so nothing else can be signed with it.
 """
@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
-from collections.abc import Sequence
+import secrets
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cryptography import x509
@@ -28,10 +29,18 @@ def make_certificates(folder: Path, hosts: Sequence[str]) -> bytes:
 
     Raises ConfigurationError where the folder cannot be written to.
     """
-    files = _made(hosts)
+    files = issued(hosts)
+    written(folder, files)
+    return files[AUTHORITY]
+
+
+def written(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write the files whole or not at all. Raises ConfigurationError where the folder cannot be written to."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
+            if (folder / name).is_file() and (folder / name).read_bytes() == content:
+                continue
             new = folder / f".{name}"
             new.unlink(missing_ok=True)
             new.touch(mode=0o600)
@@ -40,20 +49,20 @@ def make_certificates(folder: Path, hosts: Sequence[str]) -> bytes:
     except OSError as error:
         reason = error.strerror or error
         raise ConfigurationError(f"{folder}: {reason}: give a folder that can be written to") from error
-    return files[AUTHORITY]
 
 
-def _made(hosts: Sequence[str]) -> dict[str, bytes]:
-    """The files' contents, by name."""
+def issued(hosts: Sequence[str], valid: datetime.timedelta = VALID) -> dict[str, bytes]:
+    """A new authority's certificate, and one that it signed for the hosts, with its key: contents, by file name."""
     authority, key = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
-    issuer = _named("wayside-admission-authority")
+    # Of two authorities with the same name, OpenSSL tries one alone.
+    issuer = _named(f"wayside-admission-authority-{secrets.token_hex(4)}")
     root = (
-        _begun(issuer, authority.public_key(), issuer)
+        _begun(issuer, authority.public_key(), issuer, valid)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .sign(authority, hashes.SHA256())
     )
     certificate = (
-        _begun(_named("wayside-admission"), key.public_key(), issuer)
+        _begun(_named("wayside-admission"), key.public_key(), issuer, valid)
         .add_extension(x509.SubjectAlternativeName([_host(each) for each in hosts]), critical=False)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .sign(authority, hashes.SHA256())
@@ -66,7 +75,9 @@ def _made(hosts: Sequence[str]) -> dict[str, bytes]:
     }
 
 
-def _begun(subject: x509.Name, key: ec.EllipticCurvePublicKey, issuer: x509.Name) -> x509.CertificateBuilder:
+def _begun(
+    subject: x509.Name, key: ec.EllipticCurvePublicKey, issuer: x509.Name, valid: datetime.timedelta
+) -> x509.CertificateBuilder:
     now = datetime.datetime.now(datetime.UTC)
     return (
         x509.CertificateBuilder()
@@ -75,7 +86,7 @@ def _begun(subject: x509.Name, key: ec.EllipticCurvePublicKey, issuer: x509.Name
         .public_key(key)
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - _CLOCKS)
-        .not_valid_after(now + VALID)
+        .not_valid_after(now + valid)
     )
 
 

@@ -21,6 +21,7 @@ from aiohttp import web
 from application_manager.admission.certificate import ServingCertificate
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.reviews import ReviewError
+from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.measures import Measures
 
 AT_ONCE = 32
@@ -38,10 +39,21 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """Where the webhook is served, and the folder with its certificate and key."""
+    """Where the webhook is served, and the folder with its certificate and key.
+
+    `service` and `webhooks`: where this manager makes the certificate itself, the Service for which it does, as
+    NAMESPACE/NAME, and the name of the webhook configurations.
+    """
 
     port: int
     certificates: Path
+    service: str = ""
+    webhooks: str = ""
+
+    @property
+    def secret(self) -> tuple[str, str]:
+        """Namespace and name of the Secret with the certificate that this manager makes."""
+        return certificate_secret(self.service)
 
 
 class Desk:

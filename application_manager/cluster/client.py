@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 from urllib.parse import urlencode
@@ -33,6 +33,7 @@ Object = dict[str, Any]
 FIELD_MANAGER = "wayside"
 _APPLY = "application/apply-patch+yaml"
 _MERGE = "application/merge-patch+json"
+_STRATEGIC = "application/strategic-merge-patch+json"
 _JSON = "application/json"
 _TIMEOUT = 15.0  # s for one request
 _CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
@@ -41,6 +42,7 @@ _FIRST, _MOST = 10, 100  # objects of a list's first page, and of any: each may 
 _PAGE_BYTES = 4 * 1024 * 1024
 _RESTARTS = 3  # of a list whose rest is not there any more
 _NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
+_NAMESPACE = re.compile(r"/namespaces/([^/]+)/")
 _BAD_MANIFEST = "failed to create typed patch object"
 
 
@@ -53,6 +55,13 @@ class NotActive(Unreachable):
 
     def __init__(self) -> None:
         super().__init__("this manager is not the active one and writes nothing")
+
+
+class NotGranted(Unreachable):
+    """The account may not write in this namespace: nothing is written there, and nothing needs to be tried again."""
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__(f"namespace {namespace} is not granted to this manager, which writes nothing there")
 
 
 class ApiError(Exception):
@@ -134,6 +143,7 @@ class Client:
 
     Attributes:
         may_act: for how many seconds we may write; none or less: not at all, and each write raises NotActive.
+        may_write: whether we may write in a namespace; where not, each write raises NotGranted. None: as it comes.
         open_until: until when, on the monotonic clock, a write may yet be done that was sent and not answered.
     """
 
@@ -149,6 +159,7 @@ class Client:
         """`timeout`: seconds in which a request must be answered."""
         self.configuration = configuration
         self.may_act = may_act
+        self.may_write: Callable[[str], Awaitable[bool]] | None = None
         self.open_until = 0.0
         self._measures = measures or Measures()
         self._pacing = pacing or Pacing()
@@ -247,6 +258,12 @@ class Client:
             raise
         return True
 
+    async def merge_members(self, resource: Resource, name: str, body: Object) -> Object:
+        """Merge into an object of the cluster, lists by their members' names."""
+        return await self._request(
+            "PATCH", resource.path(None, name), {"fieldManager": FIELD_MANAGER}, body, _STRATEGIC
+        )
+
     async def scale(self, resource: Resource, namespace: str, name: str, version: str, replicas: int) -> Object:
         """Set the replicas of the object by its subresource `scale`, if it is still of this resourceVersion."""
         body = {"metadata": {"resourceVersion": version}, "spec": {"replicas": replicas}}
@@ -326,6 +343,9 @@ class Client:
         """Ask, and ask again what the API server did not look at, as long as it keeps to a reasonable time."""
         deadline = time.monotonic() + _PATIENCE
         changes = method != "GET" if writes is None else writes
+        where = _NAMESPACE.search(path) if changes and self.may_write is not None else None
+        if where is not None and self.may_write is not None and not await self.may_write(where[1]):
+            raise NotGranted(where[1])
         while True:
             try:
                 async with self._pacing.turn():

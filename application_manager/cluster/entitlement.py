@@ -25,7 +25,7 @@ async def lacking(client: Client, needed: Iterable[Right], namespaces: Collectio
     Raises ApiError or Unreachable where the API server does not tell.
     """
     asked = [(right, verb, where) for where in namespaces or (None,) for right in needed for verb in right.verbs]
-    allowed = await asyncio.gather(*(_may(client, *each) for each in asked))
+    allowed = await asyncio.gather(*(may(client, *each) for each in asked))
     return [each for each, may in zip(asked, allowed, strict=True) if not may]
 
 
@@ -47,7 +47,8 @@ def _text(lack: Lack) -> str:
     return right.lack(verb, f"in namespace {namespace}" if namespace else "in all namespaces")
 
 
-async def _may(client: Client, right: Right, verb: str, namespace: str | None) -> bool:
+async def may(client: Client, right: Right, verb: str, namespace: str | None) -> bool:
+    """Whether the account has this verb of the right; `namespace` None: in all namespaces together."""
     resource, _, subresource = right.resource.partition("/")
     attributes = {
         "group": right.group,

@@ -65,7 +65,15 @@ def rbac(
     namespace: Annotated[
         list[str] | None,
         typer.Option(
-            help="As of `run`: a namespace to look after, which gets a Role; repeatable. Default: a ClusterRole."
+            help="As of `run`: a namespace to look after, which gets a Role; repeatable. Default: a ClusterRole that "
+            "reads in all of them."
+        ),
+    ] = None,
+    grant: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAMESPACE",
+            help="Without --namespace: a namespace in which the manager may write, by a RoleBinding; repeatable.",
         ),
     ] = None,
     account: Annotated[
@@ -80,6 +88,11 @@ def rbac(
     name: Annotated[
         str, typer.Option(help="Of the roles and bindings; managers of different namespaces need different ones.")
     ] = "wayside-application-manager",
+    admission_service: Annotated[
+        str | None,
+        typer.Option(metavar="NAMESPACE/NAME", help="As of `run`: a manager that makes its certificate."),
+    ] = None,
+    admission_webhooks: Annotated[str, typer.Option(metavar="NAME", help="As of `run`.")] = "wayside",
 ) -> None:
     """Print the roles that the manager's account needs for the kinds that templates may create, and no more.
 
@@ -88,7 +101,17 @@ def rbac(
     with importing():
         from application_manager.commands.rbac import print_rbac
 
-    print_rbac(allowed_kinds, namespace or (), account, lease, name, detectors=detectors)
+    print_rbac(
+        allowed_kinds,
+        namespace or (),
+        account,
+        lease,
+        name,
+        detectors=detectors,
+        grant=grant or (),
+        service=admission_service,
+        webhooks=admission_webhooks,
+    )
 
 
 def detector_rbac(

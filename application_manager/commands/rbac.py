@@ -12,8 +12,9 @@ from pydantic import TypeAdapter, ValidationError
 from application_manager.cluster.client import ApiError, Client, Unreachable
 from application_manager.cluster.connection import ConfigurationError, load_configuration
 from application_manager.cluster.leadership import LEASE_NAME, lease_key
+from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.core.objects.detectors import detector_roles, sidecar_roles
-from application_manager.core.objects.policy import DEFAULT_PLURALS, KindKey, Policy, kind_text
+from application_manager.core.objects.policy import PLURALS, KindKey, Policy, kind_text
 from application_manager.core.objects.rights import roles
 from wayside.api.base import ObjectName
 from wayside.manifests import to_yaml
@@ -27,16 +28,22 @@ def print_rbac(
     name: str,
     *,
     detectors: bool,
+    grant: Sequence[str],
+    service: str | None,
+    webhooks: str,
 ) -> None:
     """Print the roles and bindings as YAML.
 
     Args:
         allowed_kinds: that templates may create; None: the default ones.
-        namespaces: that get a Role each; empty: one ClusterRole.
+        namespaces: that get a Role each; empty: one ClusterRole that reads all of them.
         account: as NAMESPACE/NAME.
         lease: of the managers, as [NAMESPACE/]NAME; None: the default one, in the account's namespace.
         name: of the roles and bindings.
         detectors: whether the manager runs detectors too.
+        grant: without `namespaces`: those in which the manager may write.
+        service: of the webhook, as NAMESPACE/NAME, where the manager makes its certificate.
+        webhooks: the name of the webhook configurations.
 
     Raises:
         ConfigurationError: a kind has to be looked up and cannot be.
@@ -44,8 +51,14 @@ def print_rbac(
     where, _, who = account.partition("/")
     if not where or not who:
         raise typer.BadParameter(f"{account!r} is no account: write NAMESPACE/NAME", param_hint="--account")
+    if grant and namespaces:
+        raise typer.BadParameter(
+            "goes without --namespace, where each namespace has a Role that also allows writing", param_hint="--grant"
+        )
     try:
         policy = Policy.parse(allowed_kinds, None)
+        if not namespaces:
+            policy.check_everywhere()
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
     try:
@@ -54,7 +67,17 @@ def print_rbac(
         raise typer.BadParameter(str(error), param_hint="--lease") from None
     found = plurals(policy)
     lease_place = (key.namespace, key.name)
-    sys.stdout.write(to_yaml(roles(found, namespaces, lease_place, (where, who), name, detectors=detectors)))
+    made = roles(
+        found,
+        namespaces,
+        lease_place,
+        (where, who),
+        name,
+        detectors=detectors,
+        granted=grant,
+        certificates=(certificate_secret(service), webhooks) if service else None,
+    )
+    sys.stdout.write(to_yaml(made))
 
 
 def print_detector_rbac(name: str, namespace: str, pod_accounts: Sequence[str]) -> None:
@@ -78,7 +101,7 @@ def _named(name: str, what: str, option: str) -> None:
 
 def plurals(policy: Policy) -> dict[KindKey, str]:
     """What roles call the kinds of the policy. Raises ConfigurationError for one that nobody knows."""
-    known = {kind: DEFAULT_PLURALS[kind] for kind in policy.kinds if kind in DEFAULT_PLURALS}
+    known = {kind: PLURALS[kind] for kind in policy.kinds if kind in PLURALS}
     others = sorted(policy.kinds - known.keys())
     return known | (asyncio.run(_asked(others)) if others else {})
 

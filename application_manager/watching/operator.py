@@ -1,7 +1,7 @@
 """The registrations with kopf, and nothing else: every event is handed on (see `relay`), nothing is handled here.
 
 Only `on.event`, which neither adds finalizers nor writes to objects. kopf's own Events, peering and progress storage
-are off. An instance's objects are filtered by label, on the server.
+are off. The API server selects holders' Leases and instances' objects by their labels.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from application_manager.cluster.client import LEASES, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
 from application_manager.watching.relay import News, Relist, relaying
+from wayside.leases import HOLDER_LEASE_LABEL
 
 _PAUSES = (0.1, 0.2, 0.5)  # s, between attempts to reach the API server; then the last again and again
 _LONG_PAUSE = 1.0  # s
@@ -43,7 +44,7 @@ async def watch(
     ready: asyncio.Event,
     pulse: Pulse,
 ) -> None:
-    """Hand on the news of our own kinds, of Leases, and of what bears an instance's label, until cancelled.
+    """Hand on the news of our own kinds, of holders' Leases, and of what has an instance's label, until cancelled.
 
     `namespaces` empty: all. `pulse` takes each watch's signs of life. `relist` hands on
     all that there is of a kind. `ready` is set once kopf has started. `connect`
@@ -71,10 +72,9 @@ async def watch(
     kopf.on.login(registry=registry)(login)
     for resource in own:
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)
-    kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=registry)(handled)
-    for resource in children:
+    for resource, label in ((LEASES, HOLDER_LEASE_LABEL), *((each, INSTANCE_LABEL) for each in children)):
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)
-        settings.watching.label_selectors[resource.group, resource.version, resource.plural] = INSTANCE_LABEL
+        settings.watching.label_selectors[resource.group, resource.version, resource.plural] = label
 
     identity: Any = "application-manager"  # else kopf asks for the user's name, and a container's may have none
     with pulsing(pulse), relaying(observe, vanished, relist):

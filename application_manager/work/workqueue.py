@@ -19,7 +19,7 @@ from collections.abc import Awaitable, Callable, Hashable
 from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
-from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.cluster.client import ApiError, NotGranted, Unreachable
 from application_manager.measures import Measures
 from application_manager.work.turns import Turns
 
@@ -183,6 +183,8 @@ class WorkQueue(Generic[Key]):
         began, failed = time.monotonic(), True
         try:
             await self._work(key)
+        except NotGranted:
+            self._failures.pop(key, None)  # once the namespace is granted, all its keys are asked for again
         except (ApiError, Unreachable) as error:
             pause = self._pause(key, error.retry_after if isinstance(error, ApiError) else None)
             log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)

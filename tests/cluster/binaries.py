@@ -9,6 +9,7 @@ Where they come from, in this order:
 2. the cache, `${XDG_CACHE_HOME:-~/.cache}/wayside/controlplane/<hash>/`, into which a missing program is built from
    the Go module in `controlplane/`. The hash covers all that decides what comes out: go.mod, go.sum, flags, platform.
 
+With `WAYSIDE_TEST_KUBERNETES=oldest` these are of the oldest Kubernetes that Wayside supports (`make compat`).
 Nothing prebuilt is ever downloaded, so the cluster tests run wherever Go modules do.
 """
 
@@ -22,7 +23,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tests.gobuild import KUBERNETES, BuildError, GoModule
+from tests.gobuild import KUBERNETES, OLDEST_KUBERNETES, BuildError, GoModule
 
 PACKAGES: Mapping[str, str] = {  # the small ones first: an error of the setup shows after seconds
     "etcd": "go.etcd.io/etcd/server/v3",
@@ -32,7 +33,18 @@ PACKAGES: Mapping[str, str] = {  # the small ones first: an error of the setup s
     "kube-apiserver": "k8s.io/kubernetes/cmd/kube-apiserver",
 }
 
-MODULE = GoModule("controlplane", Path(__file__).parent / "controlplane", PACKAGES, KUBERNETES)
+_FOLDER = Path(__file__).parent / "controlplane"
+MODULE = GoModule("controlplane", _FOLDER, PACKAGES, KUBERNETES)
+OLDEST = GoModule(
+    "controlplane",
+    _FOLDER / "oldest",
+    {name: package for name, package in PACKAGES.items() if name not in ("etcd", "kubectl")},
+    OLDEST_KUBERNETES,
+)
+"""Of the oldest Kubernetes that Wayside supports; etcd and kubectl are those of `MODULE`."""
+
+VERSION = "WAYSIDE_TEST_KUBERNETES"
+"""The variable that chooses: `oldest`, else the newest."""
 
 
 class BinariesUnavailableError(Exception):
@@ -60,12 +72,13 @@ def ensure_binaries(console: Console | None = None) -> Binaries:
     """
     console = console or Console(stderr=True)
     found = {name: path for name in PACKAGES if (path := _find(name)) is not None}
-    if missing := tuple(name for name in PACKAGES if name not in found):
-        try:
-            folder = MODULE.ensure(console, missing)
-        except BuildError as error:
-            raise BinariesUnavailableError(str(error)) from error
-        found |= {name: folder / name for name in missing}
+    for module in (MODULE, OLDEST):
+        if missing := tuple(name for name in PACKAGES if name not in found and _module(name) is module):
+            try:
+                folder = module.ensure(console, missing)
+            except BuildError as error:
+                raise BinariesUnavailableError(str(error)) from error
+            found |= {name: folder / name for name in missing}
     return Binaries(**{name.replace("-", "_"): path for name, path in found.items()})
 
 
@@ -87,8 +100,13 @@ def _find(name: str) -> Path | None:
             raise BinariesUnavailableError(
                 f"KUBEBUILDER_ASSETS={assets} has no {name}: add it there, or unset the variable to build all"
             )
-    built = cache_folder() / name
+    built = _module(name).folder() / name
     return built if built.is_file() else None
+
+
+def _module(name: str) -> GoModule:
+    """From which module a program comes."""
+    return OLDEST if os.environ.get(VERSION) == "oldest" and name in OLDEST.packages else MODULE
 
 
 def main() -> int:

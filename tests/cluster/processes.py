@@ -45,6 +45,10 @@ class Process:
         """The exit code of the present run, negative for a signal; None while it goes on."""
         return self._child.returncode
 
+    def resident_bytes(self) -> int:
+        """The memory that the present run holds now; 0 where the system does not report it."""
+        return self._child.resident_bytes()
+
     def terminate(self, patience: float = 60) -> int:
         """Send SIGTERM, wait for the end, return the exit code; TimeoutError (and SIGKILL) after `patience` seconds."""
         return self._child.terminate(patience)
@@ -92,10 +96,6 @@ class Process:
         found = wait_until(look, lambda found: found is not None, timeout=timeout, what=what, diagnose=self._child.tail)
         assert found is not None
         return found
-
-    def resident_bytes(self) -> int:
-        """Return the memory that the present run holds now."""
-        return self._child.resident_bytes()
 
     def tail(self, lines: int = 40) -> str:
         """Return the last lines of the log under a heading, for messages."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import datetime
+import socket
+import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from application_manager.admission.authority import issued
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane
@@ -18,7 +23,6 @@ from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.namespaces import fresh_namespace
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
-from tests.cluster.webhook import printed
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import CHART, Helm, names
 from tests.ports import free_ports
@@ -106,12 +110,12 @@ def test_what_is_installed_changes_with_upgrades_and_goes_with_the_release_but_f
     assert town["metadata"]["labels"]["a"] == "b"
     assert town["spec"]["mode"] == "Standalone"
     assert there.get("EventRule", "one")["spec"]["when"] == EVENT_RULE["spec"]["when"]
-    secret = there.get("Secret", f"{RELEASE}-webhook-tls")["data"]
-    hook = there.get("ValidatingWebhookConfiguration", f"{RELEASE}-{there.namespace}")
-    assert hook["webhooks"][0]["clientConfig"]["caBundle"] == secret["ca.crt"]
+    filled = {"data": {"ca.crt": "YQ=="}}  # as a manager does
+    there.patch("Secret", f"{RELEASE}-webhook-certificates", filled)
 
     install(helm, there, ALL | {"manager": {"replicas": 1}}, "upgrade")
-    assert there.get("Secret", f"{RELEASE}-webhook-tls")["data"] == secret, "an upgrade keeps the certificates"
+    kept = there.get("Secret", f"{RELEASE}-webhook-certificates")["data"]
+    assert kept == filled["data"], "an upgrade keeps the certificates"
     assert there.find("PodDisruptionBudget", f"{RELEASE}-manager") is None
     assert there.get("Detector", "town")["metadata"]["uid"] == town["metadata"]["uid"], (
         "it is taken over, not made anew"
@@ -196,7 +200,7 @@ def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_th
     container = there.get("Deployment", f"{RELEASE}-manager")["spec"]["template"]["spec"]["containers"][0]
     metrics, webhook = free_ports(2)
     certificates = tmp_path / "certificates"
-    printed("webhooks", "--url", f"https://127.0.0.1:{webhook}", "--make-certificates", str(certificates))
+    service, hook = f"{RELEASE}-webhook.{there.namespace}.svc", f"{RELEASE}-{there.namespace}"
     here = {
         "--metrics-port": str(metrics),
         "--admission-port": str(webhook),
@@ -210,14 +214,29 @@ def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_th
     try:
         manager = processes.start(*container["command"], container["args"][0], *arguments)
         manager.wait_for_output("active: holds the Lease")  # the chart's, which is empty at first
+        first = trusted(there, hook)
+        assert shown(webhook, first, service) == (certificates / "tls.crt").read_bytes()
         (pod,) = helm.rendered({"manager": {"namespaces": [there.namespace]}}).of("Pod")
         script, *where = pod["spec"]["containers"][0]["args"]
         assert [each.partition(":")[0] for each in where] == ["http", "https", "/authority/ca.crt", there.namespace]
-        where[:3] = [f"http://127.0.0.1:{metrics}", f"https://127.0.0.1:{webhook}", str(certificates / "ca.crt")]
-        done = subprocess.run([sys.executable, "-c", script, *where], capture_output=True, text=True, check=False)
+        where[:3] = [f"http://127.0.0.1:{metrics}", f"https://{service}:{webhook}", str(certificates / "ca.crt")]
+        done = subprocess.run(
+            [sys.executable, "-c", RESOLVING + script, *where], capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stderr
         assert "the manager is ready" in done.stdout
         assert "the webhook refuses what is wrong" in done.stdout
+        # What is about to expire is renewed, and the API server trusts both before the next one is shown.
+        dying = issued((service,), datetime.timedelta(minutes=20))
+        data = {name: base64.b64encode(content).decode() for name, content in dying.items()}
+        there.patch("Secret", f"{RELEASE}-webhook-certificates", {"data": data})
+        bundle = wait_until(lambda: trusted(there, hook), lambda found: found != first, what="there is a new authority")
+        assert dying["ca.crt"] in bundle
+        wait_until(
+            lambda: shown(webhook, first + bundle, service),
+            lambda found: found == (certificates / "tls.crt").read_bytes() and shown(webhook, bundle, service) == found,
+            what="the new one is shown",
+        )
         assert manager.terminate() == 0
         assert "may not" not in manager.output()
     finally:
@@ -257,3 +276,31 @@ def test_people_may_with_our_kinds_what_they_may_with_others(helm: Helm, there: 
         lambda found: found == wanted,
         what="Kubernetes' own roles have ours",
     )
+
+
+RESOLVING = """
+import socket
+_resolve = socket.getaddrinfo
+socket.getaddrinfo = lambda host, *rest, **more: _resolve("127.0.0.1", *rest, **more)
+"""
+"""As the cluster's DNS leads to the Service."""
+
+
+def trusted(api: Api, hook: str) -> bytes:
+    """The authorities by which the API server judges the manager's certificate, the same for both webhooks."""
+    kinds = ("ValidatingWebhookConfiguration", "MutatingWebhookConfiguration")
+    (bundle,) = {each["clientConfig"]["caBundle"] for kind in kinds for each in api.get(kind, hook)["webhooks"]}
+    return base64.b64decode(bundle)
+
+
+def shown(port: int, authorities: bytes, host: str) -> bytes:
+    """The certificate that is shown at the port to whom trusts these authorities; empty where they do not."""
+    context = ssl.create_default_context(cadata=authorities.decode())
+    try:
+        with (
+            socket.create_connection(("127.0.0.1", port)) as plain,
+            context.wrap_socket(plain, server_hostname=host) as connection,
+        ):
+            return ssl.DER_cert_to_PEM_cert(connection.getpeercert(binary_form=True) or b"").encode()
+    except ssl.SSLCertVerificationError:
+        return b""

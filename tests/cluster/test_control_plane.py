@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import os
+
 import pytest
 
 from tests.cluster.api import Api
+from tests.cluster.binaries import VERSION
 from tests.cluster.managed_world import deployment
 from tests.cluster.pods import mark_pods_ready
 
@@ -16,6 +20,11 @@ def test_marking_pods_twice_changes_nothing(api: Api) -> None:
     first = api.list("Pod")
     assert mark_pods_ready(api) == []
     assert api.list("Pod") == first
+
+
+def test_it_has_the_version_that_was_chosen(api: Api) -> None:
+    chosen = "v1.31.0" if os.environ.get(VERSION) == "oldest" else "v1.36.3"
+    assert json.loads(api.raw("/version"))["gitVersion"] == chosen
 
 
 def test_an_unknown_kind_is_named(api: Api) -> None:

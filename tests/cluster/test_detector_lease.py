@@ -18,6 +18,7 @@ from tests.cluster.api import Api, Object
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.waiting import PATIENCE, wait_until
+from wayside.leases import HOLDER_LEASE_LABEL
 
 NAME = "wayside-intersection-a"
 LONG = 600  # s: a Lease that lasts longer than any wait here
@@ -148,7 +149,11 @@ def test_what_was_released_is_taken_at_once_and_still_lasts(api: Api, namespace:
     released = api.get("Lease", NAME)["spec"]
     assert released.get("holderIdentity") in {None, ""}
     assert released["leaseDurationSeconds"] == LONG, "the manager keeps counting the demands for the usual time"
+    assert api.get("Lease", NAME)["metadata"]["labels"] == {HOLDER_LEASE_LABEL: "true"}
+    api.patch("Lease", NAME, {"metadata": {"labels": {HOLDER_LEASE_LABEL: None, "team": "mobility"}}})
     Holding(loop, namespace, Identity("pod-2")).wait_held()
+    labels = api.get("Lease", NAME)["metadata"]["labels"]
+    assert labels == {HOLDER_LEASE_LABEL: "true", "team": "mobility"}, "as one of an older release gets it"
 
 
 def test_the_next_container_of_the_same_pod_takes_over_at_once(namespace: str, loop: Background) -> None:

@@ -26,6 +26,7 @@ from tests.cluster.processes import Process, Processes
 from tests.cluster.test_manager_metrics import scraped
 from tests.cluster.waiting import wait_until
 from tests.ports import free_port
+from wayside.leases import HOLDER_LEASE_LABEL
 from wayside.times import parse_seconds
 
 NORTH = instance_name("app", "north")
@@ -98,7 +99,7 @@ def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process
     lease: Object = {
         "apiVersion": "coordination.k8s.io/v1",
         "kind": "Lease",
-        "metadata": {"name": "wayside-det"},
+        "metadata": {"name": "wayside-det", "labels": {HOLDER_LEASE_LABEL: "true"}},
         "spec": {"holderIdentity": "det", "leaseDurationSeconds": LONG, "renewTime": "2026-01-01T00:00:00.000000Z"},
     }
     api.create(lease)

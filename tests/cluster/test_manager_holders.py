@@ -10,11 +10,12 @@ import pytest
 
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.holders.leases import LeaseView
-from tests.cluster.api import Api
+from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import condition, task, template, wait_settled
 from tests.cluster.processes import Process
 from tests.cluster.repeating import repeated
 from tests.cluster.waiting import wait_until
+from wayside.leases import HOLDER_LEASE_LABEL
 
 NORTH = instance_name("app", "north")
 LOST = {"det": LeaseView(1000.0)}
@@ -26,7 +27,10 @@ SHORT = 10  # s: to be waited for, and long beside the half second of the renewa
 
 @pytest.fixture
 def renew(api: Api) -> Callable[..., None]:
-    """Renews the Lease of a holder, by default `det`, for a number of seconds; that of `det` begins with a long one."""
+    """Renews the Lease of a holder, by default `det`, for a number of seconds; that of `det` begins with a long one.
+
+    That of `old` has no label, as those of detectors of older releases.
+    """
     minutes = itertools.count()
 
     def renew(duration: int, holder: str = "det") -> None:
@@ -35,7 +39,9 @@ def renew(api: Api) -> Callable[..., None]:
             "leaseDurationSeconds": duration,
             "renewTime": "2020-01-01T{:02}:{:02}:00.000000Z".format(*divmod(next(minutes), 60)),  # a clock far behind
         }
-        metadata = {"name": f"wayside-{holder}"}
+        metadata: Object = {"name": f"wayside-{holder}"}
+        if holder != "old":
+            metadata["labels"] = {HOLDER_LEASE_LABEL: "true"}
         api.apply({"apiVersion": "coordination.k8s.io/v1", "kind": "Lease", "metadata": metadata, "spec": spec})
 
     renew(LONG)
@@ -82,16 +88,23 @@ def test_a_lost_holder_releases_and_a_returning_one_counts_again(
 def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, renew: Callable[..., None]) -> None:
     api.create(lossy())
     renew(SHORT, "silent")
-    for holder in ("det", "silent", "nobody"):
+    renew(SHORT, "old")
+    for holder in ("det", "old", "silent", "nobody"):
         api.create(task(holder, holder=holder))
         # There is patience with one that has no Lease: for 15 s, and one more.
         api.wait_for("ApplicationTask", holder, lambda raw: reason(raw) == "Accepted", what="it counts")
     name = instance_name("app", "det")
     uid = api.wait_for("Deployment", name, lambda _: True, what="the Deployment exists")["metadata"]["uid"]
-    with repeated("renewing", lambda: renew(SHORT), 0.5):
+
+    def renew_both() -> None:
+        renew(SHORT)
+        renew(SHORT, "old")
+
+    with repeated("renewing", renew_both, 0.5):
         renew(SHORT, "silent")  # for the last time
         api.wait_for("ApplicationTask", "silent", lambda raw: reason(raw) == "HolderLost", what="it is lost")
-        assert reason(api.get("ApplicationTask", "det")) == "Accepted"
+        for holder in ("det", "old"):
+            assert reason(api.get("ApplicationTask", holder)) == "Accepted"
     assert api.get("Deployment", name)["metadata"]["uid"] == uid
 
 

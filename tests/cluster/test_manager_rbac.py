@@ -9,7 +9,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 import yaml
@@ -18,20 +18,23 @@ from application_manager.cluster.client import Client
 from application_manager.cluster.connection import load_configuration
 from application_manager.cluster.entitlement import lacking
 from application_manager.core.claims.claims import instance_name
-from application_manager.core.objects.policy import DEFAULT_PLURALS, Policy
+from application_manager.core.objects.policy import PLURALS as ALL_PLURALS
+from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rights import lease_rights, rights, roles
 from tests import programs
-from tests.cluster.api import Api, Object
+from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import Seen, faulty_proxy
 from tests.cluster.managed_world import condition, config, deployment, end, start_manager, task, template, wait_settled
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
+from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
+from wayside.leases import HOLDER_LEASE_LABEL
 
 KINDS = ("apps/v1/Deployment", "v1/ConfigMap")
 ALLOWED = [word for each in KINDS for word in ("--allowed-kinds", each)]
-PLURALS = {key: DEFAULT_PLURALS[key] for key in Policy.parse(list(KINDS), None).kinds}
+PLURALS = {key: ALL_PLURALS[key] for key in Policy.parse(list(KINDS), None).kinds}
 NORTH = instance_name("app", "north")
 
 Verb = tuple[str, str, str]
@@ -197,6 +200,9 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
         assert manager.terminate() == 0
     assert "orbidden" not in manager.output()
     assert "may not" not in manager.output()
+    watches = [each.path for each in proxy.seen if "/leases?" in each.path and "watch=true" in each.path]
+    assert watches
+    assert {tuple(parse_qs(urlsplit(each).query)["labelSelector"]) for each in watches} == {(HOLDER_LEASE_LABEL,)}
     asked = set(used(proxy.seen, namespace))
     for group, resource, verb in [*asked]:
         if verb == "patch" and resource in ("applicationinstances", "deployments", "configmaps"):
@@ -208,25 +214,82 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
 
 
 @pytest.mark.own_control_plane
-def test_it_lives_on_a_cluster_role(
+def test_where_it_looks_after_all_namespaces_it_writes_in_those_that_are_granted_and_can_grant_nothing_else(
     api: Api, processes: Processes, namespace: str, account: Path, control_plane: ControlPlane
 ) -> None:
-    manifests = printed("--account", f"{namespace}/manager", "--name", namespace, *ALLOWED)
-    put(api, manifests)
+    other = control_plane.api(new_namespace(control_plane.api(), "other"))
+    options = ("--account", f"{namespace}/manager", "--name", namespace, "--detectors", *ALLOWED)
+    put(api, manifests := printed(*options, "--grant", namespace))
     try:
-        wait_in_force(account, namespace, manifests)
-        lease = ["--lease", f"{namespace}/application-manager"]
-        manager = start_manager(processes, None, *ALLOWED, *lease, kubeconfig=account)
-        manager.wait_for_output("active: holds the Lease")
-        api.create(template())
-        api.create(task("north"))
-        api.wait_for("Deployment", NORTH, lambda _: True, what="it is served")
-        wait_settled(api)
-        assert manager.terminate() == 0
+        wait_in_force(account, namespace, [each for each in manifests if each["kind"] != "ClusterRoleBinding"])
+        lease = ["--lease", f"{namespace}/application-manager", "--detector-image", "wayside:1"]
+        with faulty_proxy(account) as (proxy, kubeconfig):
+            manager = start_manager(processes, None, *ALLOWED, *lease, kubeconfig=kubeconfig)
+            manager.wait_for_output("active: holds the Lease")
+            for each in (other, api):
+                each.create(template())
+                each.create(task("north"))
+            api.create(DETECTOR | {"spec": DETECTOR["spec"] | {"mode": "Standalone"}})
+            api.wait_for("Deployment", NORTH, lambda _: True, what="it is served")
+            name = f"detector-{DETECTOR['metadata']['name']}"
+            api.wait_for("Deployment", name, lambda _: True, what="the detector has its rights and its pod")
+            wait_settled(api)
+            manager.wait_for_output(f"namespace {other.namespace} is not granted to this manager")
+            asked = list(used(proxy.seen, other.namespace))
+            assert {verb for _, _, verb in asked} <= {"get", "list"}, "nothing is even tried there"
+            assert other.find("ApplicationInstance", NORTH) is None
+
+            what_it_cannot_do(Api(account, namespace), Api(account, other.namespace), api.get("Role", name))
+
+            put(api, printed(*options, "--grant", namespace, "--grant", other.namespace))
+            other.wait_for("Deployment", NORTH, lambda _: True, what="once it is granted, it is served")
+            wait_settled(other)
+            assert manager.terminate() == 0
         assert "orbidden" not in manager.output()
     finally:
         for kind in ("ClusterRoleBinding", "ClusterRole"):
             api.delete(kind, namespace)
+        api.delete("ClusterRole", f"{namespace}-writer")
+
+
+def what_it_cannot_do(here: Api, elsewhere: Api, role: Object) -> None:
+    """Whoever has the manager's account cannot do these.
+
+    Args:
+        here: with the account, for a namespace that is granted.
+        elsewhere: for one that is not.
+        role: of a detector, as the manager made it.
+    """
+    for each in (here, elsewhere):
+        with pytest.raises(ApiError, match='cannot list resource "secrets"'):
+            each.list("Secret")
+    rbac = {"apiVersion": role["apiVersion"]}
+    more: Object = rbac | {"kind": "Role", "metadata": {"name": "more"}}
+    for rule in (
+        {"apiGroups": [""], "resources": ["secrets"], "verbs": ["get"]},
+        {"apiGroups": [""], "resources": ["pods/exec"], "verbs": ["create"]},
+        {"apiGroups": ["wayside.dev"], "resources": ["applicationtemplates"], "verbs": ["create"]},
+        {"apiGroups": ["*"], "resources": ["*"], "verbs": ["*"]},
+    ):
+        with pytest.raises(ApiError, match="attempting to grant RBAC permissions not currently held"):
+            here.create(more | {"rules": [rule]})
+    subjects = [{"kind": "ServiceAccount", "namespace": here.namespace, "name": "default"}]
+    for name in ("cluster-admin", "edit", "view"):
+        reference = {"apiGroup": "rbac.authorization.k8s.io", "kind": "ClusterRole", "name": name}
+        binding = more | {"kind": "RoleBinding", "roleRef": reference, "subjects": subjects}
+        with pytest.raises(ApiError, match="attempting to grant RBAC permissions not currently held"):
+            here.create(binding)
+        with pytest.raises(ApiError, match='cannot create resource "clusterrolebindings"'):
+            here.create(binding | {"kind": "ClusterRoleBinding"})
+    here.create(more | {"rules": role["rules"]})  # a detector's rights it can grant where it may write, and only there
+    with pytest.raises(ApiError, match='cannot create resource "roles"'):
+        elsewhere.create(more | {"rules": role["rules"]})
+    lease = {"apiVersion": "coordination.k8s.io/v1", "kind": "Lease", "metadata": {"name": "any"}, "spec": {}}
+    with pytest.raises(ApiError, match='cannot create resource "leases"'):
+        elsewhere.create(lease)
+    for kind in ("Pod", "Lease", "Deployment", "ApplicationTask"):
+        with pytest.raises(ApiError, match="cannot patch resource"):
+            elsewhere.patch(kind, "any", {"metadata": {"labels": {"a": "b"}}})
 
 
 def test_each_verb_that_lacks_is_noticed(

@@ -65,6 +65,17 @@ class Place:
         return made | ({} if authority is None else {"caBundle": base64.b64encode(authority).decode()})
 
 
+def certificate_secret(service: str) -> tuple[str, str]:
+    """Namespace and name of the Secret with the certificate that the manager makes for a Service NAMESPACE/NAME.
+
+    Raises ValueError where that is none.
+    """
+    if _SERVICE.fullmatch(service) is None or ":" in service:
+        raise ValueError(f"{service!r} is no Service: write NAMESPACE/NAME")
+    namespace, _, name = service.partition("/")
+    return namespace, f"{name}-certificates"
+
+
 def webhook_configuration(
     place: Place, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
 ) -> dict[str, Any]:

@@ -15,7 +15,9 @@ from application_manager.core.objects.podspecs import NamedAccount, PodSpec, pod
 KindKey = tuple[str, str]
 """apiVersion and kind."""
 
-DEFAULT_PLURALS: Mapping[KindKey, str] = {
+SECRET: KindKey = ("v1", "Secret")
+
+PLURALS: Mapping[KindKey, str] = {
     ("apps/v1", "DaemonSet"): "daemonsets",
     ("apps/v1", "Deployment"): "deployments",
     ("apps/v1", "StatefulSet"): "statefulsets",
@@ -28,12 +30,13 @@ DEFAULT_PLURALS: Mapping[KindKey, str] = {
     ("v1", "ConfigMap"): "configmaps",
     ("v1", "PersistentVolumeClaim"): "persistentvolumeclaims",
     ("v1", "Pod"): "pods",
-    ("v1", "Secret"): "secrets",
+    SECRET: "secrets",
     ("v1", "Service"): "services",
 }
-"""The kinds that are allowed where the administrator says nothing, and what paths and roles call them."""
+"""The kinds that are known without a cluster, and what paths and roles call them."""
 
-DEFAULT_KINDS: frozenset[KindKey] = frozenset(DEFAULT_PLURALS)
+DEFAULT_KINDS: frozenset[KindKey] = frozenset(PLURALS) - {SECRET}
+"""The kinds that are allowed where the administrator says nothing."""
 
 _NEVER_KINDS = frozenset({"Role", "RoleBinding", "ClusterRole", "ClusterRoleBinding", "ServiceAccount", "Namespace"})
 _NEVER_GROUPS = frozenset(
@@ -79,6 +82,14 @@ class Policy:
         """
         parsed = frozenset(_parse_kind(each) for each in kinds) if kinds else DEFAULT_KINDS
         return cls(parsed, frozenset(service_accounts or ["default"]))
+
+    def check_everywhere(self) -> None:
+        """Raise ValueError for a kind that no manager of all namespaces may look at."""
+        if SECRET in self.kinds:
+            raise ValueError(
+                "v1/Secret needs a manager of named namespaces: one of all namespaces would read every Secret of the "
+                "cluster; name them by --namespace, or leave the kind out"
+            )
 
     def kind_problem(self, api_version: str, kind: str) -> str | None:
         """Why the kind may not be used, or None if it may."""

@@ -6,8 +6,8 @@ for each of its entries, and the tests hold it against what a manager does. A ve
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from application_manager.core.objects.policy import KindKey
@@ -17,7 +17,9 @@ from wayside.leases import lease_name
 
 _GROUP = API_VERSION.partition("/")[0]
 _LEASES = "coordination.k8s.io"
+_RBAC = "rbac.authorization.k8s.io"
 _LOOKING = ("list", "watch")
+_READING = frozenset({"get", *_LOOKING})
 _TOLD_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
 """The kinds whose status does not tell that their pods are refused (core/health/refusals.py)."""
 
@@ -67,6 +69,26 @@ def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[R
     return [*_own(), *_children(plurals), *(_running_detectors() if detectors else ())]
 
 
+def reading(needed: Iterable[Right]) -> list[Right]:
+    """What of the rights changes nothing: all that a manager of all namespaces has in each of them."""
+    return _narrowed(needed, lambda verb: verb in _READING)
+
+
+def writing(needed: Iterable[Right]) -> list[Right]:
+    """What of the rights changes something, or may be handed on to detectors: it is granted by namespace."""
+    return _narrowed(needed, lambda verb: verb not in _READING)
+
+
+def granting() -> Right:
+    """The right that a manager of all namespaces asks about to learn whether it may write in one."""
+    return Right(_GROUP, "applicationtasks/status", ("patch",), "nobody learns how they are")
+
+
+def _narrowed(needed: Iterable[Right], wanted: Callable[[str], bool]) -> list[Right]:
+    narrowed = [replace(each, verbs=tuple(filter(wanted, each.verbs))) for each in needed]
+    return [each for each in narrowed if each.verbs]
+
+
 def detector_rights(name: str) -> list[Right]:
     """What the Detector of that name must be allowed to do in its namespace, where it runs by itself."""
     return [
@@ -105,6 +127,22 @@ def lease_rights(name: str) -> list[Right]:
     ]
 
 
+def certificate_rights(secret: str, webhooks: str) -> tuple[list[Right], list[Right]]:
+    """What a manager needs that makes its webhook's certificate: in the Secret's namespace, and in the cluster.
+
+    Args:
+        secret: its name.
+        webhooks: the name of the webhook configurations.
+    """
+    purpose = "the webhook has no certificate that the API server trusts"
+    group = "admissionregistration.k8s.io"
+    plurals = ("validatingwebhookconfigurations", "mutatingwebhookconfigurations")
+    return (
+        [Right("", "secrets", ("get", "update"), purpose, vital=True, name=secret)],
+        [Right(group, each, ("get", "patch"), purpose, vital=True, name=webhooks) for each in plurals],
+    )
+
+
 def node_rights() -> list[Right]:
     """What is of use for the whole cluster, and can be done without: nodes belong to no namespace."""
     return [Right("", "nodes", ("list",), "that no node is as a template requires is left to the scheduler to say")]
@@ -129,8 +167,8 @@ def _running_detectors() -> Iterator[Right]:
     no_detector = "no detector is run"
     for group, resource in (
         ("", "serviceaccounts"),
-        ("rbac.authorization.k8s.io", "roles"),
-        ("rbac.authorization.k8s.io", "rolebindings"),
+        (_RBAC, "roles"),
+        (_RBAC, "rolebindings"),
         ("apps", "deployments"),
     ):
         yield Right(group, resource, ("get", "list", "create", "patch", "delete"), no_detector)
@@ -165,23 +203,40 @@ def roles(
     name: str = "wayside-application-manager",
     *,
     detectors: bool = False,
+    granted: Iterable[str] = (),
+    certificates: tuple[tuple[str, str], str] | None = None,
 ) -> list[dict[str, Any]]:
     """The roles and their bindings, as manifests.
 
+    A manager of named namespaces has a Role in each. One of all namespaces has a ClusterRole that reads, and another
+    one that writes, which only RoleBindings lead to.
+
     Args:
         plurals: of the kinds that are allowed.
-        namespaces: those that are looked after: a Role in each; empty: a ClusterRole.
+        namespaces: those that are looked after; empty: all.
         lease: namespace and name of the managers' Lease.
         account: namespace and name of the manager's service account.
-        name: of all roles and bindings; that of the Lease has `-lease` behind it.
+        name: of all roles and bindings; those of the Lease end with `-lease`, of the webhook's certificate
+            with `-certificates`, the ClusterRole that writes with `-writer`.
         detectors: whether the manager runs detectors too.
+        granted: without `namespaces`: those in which the manager may write.
+        certificates: namespace and name of the Secret, and the name of the webhook configurations, where the manager
+            makes its webhook's certificate.
     """
     where = list(dict.fromkeys(namespaces))
-    rules = merged([*rights(plurals, detectors=detectors), *([] if where else node_rights())])
+    needed = rights(plurals, detectors=detectors)
     found: list[dict[str, Any]] = []
-    everywhere: list[str | None] = [None]
-    for namespace in where or everywhere:
-        found += bound(name, namespace, rules, account)
+    for namespace in where:
+        found += bound(name, namespace, merged(needed), account)
+    if not where:
+        found += bound(name, None, merged([*reading(needed), *node_rights()]), account)
+        found.append(_role(f"{name}-writer", None, merged(writing(needed))))
+        found += [_binding(name, each, ("ClusterRole", f"{name}-writer"), account) for each in dict.fromkeys(granted)]
+    if certificates is not None:
+        (namespace, secret), webhooks = certificates
+        there, everywhere = certificate_rights(secret, webhooks)
+        found += bound(f"{name}-certificates", namespace, merged(there), account)
+        found += bound(f"{name}-certificates", None, merged(everywhere), account)
     return [*found, *bound(f"{name}-lease", lease[0], merged(lease_rights(lease[1])), account)]
 
 
@@ -206,14 +261,24 @@ def bound(
 
     Both are for the namespace, or without one for the cluster.
     """
-    api, group = "rbac.authorization.k8s.io/v1", "rbac.authorization.k8s.io"
-    prefix = "" if namespace else "Cluster"
-    metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
-    yield {"apiVersion": api, "kind": f"{prefix}Role", "metadata": metadata, "rules": rules}
-    yield {
-        "apiVersion": api,
-        "kind": f"{prefix}RoleBinding",
-        "metadata": metadata,
-        "roleRef": {"apiGroup": group, "kind": f"{prefix}Role", "name": name},
+    role = _role(name, namespace, rules)
+    yield role
+    yield _binding(name, namespace, (role["kind"], name), *accounts)
+
+
+def _role(name: str, namespace: str | None, rules: list[dict[str, Any]]) -> dict[str, Any]:
+    return _object("Role", name, namespace) | {"rules": rules}
+
+
+def _binding(name: str, namespace: str | None, role: tuple[str, str], *accounts: tuple[str, str]) -> dict[str, Any]:
+    """`role`: kind and name; `accounts`: namespace and name of each."""
+    return _object("RoleBinding", name, namespace) | {
+        "roleRef": {"apiGroup": _RBAC, "kind": role[0], "name": role[1]},
         "subjects": [{"kind": "ServiceAccount", "namespace": each[0], "name": each[1]} for each in accounts],
     }
+
+
+def _object(kind: str, name: str, namespace: str | None) -> dict[str, Any]:
+    where = {"namespace": namespace} if namespace else {}
+    kind = kind if namespace else f"Cluster{kind}"
+    return {"apiVersion": f"{_RBAC}/v1", "kind": kind, "metadata": {"name": name} | where}

@@ -15,10 +15,10 @@ and the object. */}}
 {{- define "wayside.lookedAfter" -}}
 {{- $root := index . 0 -}}{{- $object := index . 2 -}}
 {{- $namespace := default $root.Release.Namespace $object.namespace -}}
-{{- with $root.Values.manager.namespaces -}}
-{{- if not (has $namespace .) -}}
-{{- fail (printf "%s %s is in namespace %s, which the manager does not look after: add it to manager.namespaces, or give it the namespace of one of them (%s)" (index $ 1) $object.name $namespace (join ", " .)) -}}
-{{- end -}}
+{{- $list := ternary "namespaces" "grant" (not (empty $root.Values.manager.namespaces)) -}}
+{{- $namespaces := default (list $root.Release.Namespace) (index $root.Values.manager $list) -}}
+{{- if not (has $namespace $namespaces) -}}
+{{- fail (printf "%s %s is in namespace %s, which the manager does not look after: add it to manager.%s, or give it the namespace of one of them (%s)" (index $ 1) $object.name $namespace $list (join ", " $namespaces)) -}}
 {{- end -}}
 {{- $namespace -}}
 {{- end -}}

@@ -77,7 +77,7 @@ app.kubernetes.io/part-of: wayside
 {{- if eq .Values.webhook.certificates.from "Secret" -}}
 {{ required "webhook.certificates.secretName is empty: name the Secret with tls.crt, tls.key and ca.crt" .Values.webhook.certificates.secretName }}
 {{- else -}}
-{{ include "wayside.fullname" . }}-webhook-tls
+{{ include "wayside.fullname" . }}-webhook-{{ ternary "certificates" "tls" (eq .Values.webhook.certificates.from "Manager") }}
 {{- end -}}
 {{- end -}}
 
@@ -89,27 +89,6 @@ app.kubernetes.io/part-of: wayside
 {{- else -}}
 {{ fail "router.tls needs a certificate: give router.tls.secretName (tls.crt, tls.key, ca.crt) or router.tls.issuerRef, or set router.tls.enabled to false for a trial" }}
 {{- end -}}
-{{- end -}}
-
-{{/* The Secret with ca.crt, tls.crt and tls.key that the chart made before, or a new one's data: made once a rendering,
-since both the Secret and the webhook need the same. */}}
-{{- define "wayside.madeCertificates" -}}
-{{- if not (hasKey .Values "_made") -}}
-{{- $name := printf "%s-webhook" (include "wayside.fullname" .) -}}
-{{- $secret := lookup "v1" "Secret" .Release.Namespace (include "wayside.webhookSecret" .) -}}
-{{- $data := dict -}}
-{{- if and $secret $secret.data (hasKey $secret.data "ca.crt") (hasKey $secret.data "tls.crt") (hasKey $secret.data "tls.key") -}}
-{{- $data = pick $secret.data "ca.crt" "tls.crt" "tls.key" -}}
-{{- else -}}
-{{- $days := int .Values.webhook.certificates.validityDays -}}
-{{- $ca := genCA (printf "%s authority" $name) $days -}}
-{{- $host := printf "%s.%s" $name .Release.Namespace -}}
-{{- $cert := genSignedCert (printf "%s.svc" $name | trunc 63) nil (list (printf "%s.svc" $host) (printf "%s.svc.cluster.local" $host) $host) $days $ca -}}
-{{- $data = dict "ca.crt" (b64enc $ca.Cert) "tls.crt" (b64enc $cert.Cert) "tls.key" (b64enc $cert.Key) -}}
-{{- end -}}
-{{- $_ := set .Values "_made" $data -}}
-{{- end -}}
-{{- .Values._made | toJson -}}
 {{- end -}}
 
 {{- define "wayside.kind" -}}

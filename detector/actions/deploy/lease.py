@@ -32,7 +32,7 @@ from pathlib import Path
 from detector.cluster.api import Api, JsonObject, Resource
 from detector.cluster.backoff import Backoff
 from detector.cluster.errors import AlreadyExistsError, ApiError, ConflictError, NotFoundError
-from wayside.leases import DEFAULT_DURATION, lease_name
+from wayside.leases import DEFAULT_DURATION, HOLDER_LEASE_LABEL, lease_name
 
 _log = logging.getLogger(__name__)
 
@@ -172,7 +172,8 @@ class HolderLease:
             "leaseDurationSeconds": round(self._duration),
             "renewTime": moment,
         }
-        metadata = dict(lease["metadata"]) if lease else {"name": self.name}
+        metadata: JsonObject = dict(lease["metadata"]) if lease else {"name": self.name}
+        metadata["labels"] = {**(metadata.get("labels") or {}), HOLDER_LEASE_LABEL: "true"}
         if self._identity.owner:
             metadata["ownerReferences"] = [self._identity.owner]
         return {"apiVersion": LEASES.api_version, "kind": "Lease", "metadata": metadata, "spec": spec}

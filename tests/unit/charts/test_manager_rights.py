@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from application_manager.cli import app
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.entitlement import judge
-from application_manager.core.objects.policy import DEFAULT_PLURALS, KindKey
+from application_manager.core.objects.policy import PLURALS, KindKey
 from application_manager.core.objects.rights import merged, rights, roles
 from tests.guides import guide
 
@@ -37,22 +37,38 @@ def test_a_kind_that_is_not_allowed_is_in_no_role() -> None:
     assert found["", "pods"] == {"list", "watch", "patch"}
     assert {group for group, _ in found} == {"", "apps", "coordination.k8s.io", "events.k8s.io", "wayside.dev"}
     assert ("", "secrets") not in found
-    assert ("", "secrets") in verbs(dict(DEFAULT_PLURALS))
+    assert ("", "secrets") in verbs(dict(PLURALS))
 
 
 def test_nothing_is_granted_by_a_wildcard_and_no_rights_can_be_given_on() -> None:
-    for rule in merged(rights(dict(DEFAULT_PLURALS))):
+    for rule in merged(rights(dict(PLURALS))):
         assert "*" not in str(rule)
         assert not {"escalate", "bind", "impersonate"} & set(rule["verbs"])
 
 
-def test_namespaces_have_a_role_each_and_all_of_them_a_cluster_role() -> None:
+def test_namespaces_have_a_role_each() -> None:
     where = [(each["kind"], each["metadata"].get("namespace")) for each in roles({}, ["a", "b"], LEASE, ACCOUNT)]
     own = [("Role", "system"), ("RoleBinding", "system")]
     assert where == [(kind, each) for each in ("a", "b") for kind in ("Role", "RoleBinding")] + own
-    everywhere = roles({}, [], LEASE, ACCOUNT)
-    assert [each["kind"] for each in everywhere] == ["ClusterRole", "ClusterRoleBinding", "Role", "RoleBinding"]
-    assert everywhere[2]["rules"][0]["resourceNames"] == ["application-manager"]
+
+
+def test_all_namespaces_can_be_read_and_those_that_are_granted_written() -> None:
+    everywhere = roles({DEPLOYMENT: "deployments"}, [], LEASE, ACCOUNT, "m", detectors=True, granted=["a", "b", "a"])
+    assert [(each["kind"], each["metadata"].get("namespace")) for each in everywhere] == [
+        ("ClusterRole", None),
+        ("ClusterRoleBinding", None),
+        ("ClusterRole", None),
+        ("RoleBinding", "a"),
+        ("RoleBinding", "b"),
+        ("Role", "system"),
+        ("RoleBinding", "system"),
+    ]
+    reader, bound, writer, granted = everywhere[:4]
+    assert {verb for rule in reader["rules"] for verb in rule["verbs"]} == {"get", "list", "watch"}
+    assert not {verb for rule in writer["rules"] for verb in rule["verbs"]} & {"get", "list", "watch"}
+    assert bound["roleRef"]["name"] == "m"
+    assert (granted["roleRef"]["kind"], granted["roleRef"]["name"]) == ("ClusterRole", writer["metadata"]["name"])
+    assert everywhere[-2]["rules"][0]["resourceNames"] == ["application-manager"]
     assert all(each["subjects"][0]["name"] == "manager" for each in everywhere if "subjects" in each)
 
 
@@ -68,6 +84,8 @@ def test_the_command_prints_what_the_table_says() -> None:
         (["--account", "manager"], "write NAMESPACE/NAME"),
         (["--allowed-kinds", "rbac.authorization.k8s.io/v1/Role"], "can never be allowed"),
         (["--lease", "wayside-town"], "write NAME or NAMESPACE/NAME"),
+        (["--allowed-kinds", "v1/Secret"], "needs a manager of named namespaces"),
+        (["--namespace", "a", "--grant", "b"], "goes without --namespace"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: list[str], said: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.policy import DEFAULT_KINDS, SECRET, Policy
 from application_manager.core.objects.rendering import Renderer, RenderError, owned
 from tests.unit.manager_objects import DEPLOYMENT, instance, template
 
@@ -201,10 +201,13 @@ def test_all_problems_are_told_at_once() -> None:
     assert "manifests[1].data.a" in message
 
 
-def test_a_secret_with_a_service_accounts_token_is_refused() -> None:
+def test_a_secret_needs_leave_and_never_holds_a_service_accounts_token() -> None:
     secret = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "s"}}
-    assert len(render(secret).manifests) == 1
-    assert "service-account-token" in refusal({**secret, "type": "kubernetes.io/service-account-token"})
+    assert "v1/Secret is not of the kinds that the administrator allows" in refusal(secret)
+    allowed = Policy(DEFAULT_KINDS | {SECRET})
+    assert len(render(secret, policy=allowed).manifests) == 1
+    token = {**secret, "type": "kubernetes.io/service-account-token"}
+    assert "service-account-token" in refusal(token, policy=allowed)
 
 
 def test_with_a_key_each_name_must_tell_the_instance() -> None:
