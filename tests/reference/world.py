@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,8 +51,8 @@ class World:
     known: dict[str, Known] = field(default_factory=dict)
     floor: int | None = None
     """Windows reach back to the last gap at most."""
-    gone: set[int] = field(default_factory=set)
-    """The numbers of the samples that the buffer has no more."""
+    gone: dict[int, int] = field(default_factory=dict)
+    """The numbers of the samples that the buffer has no more, and since when."""
 
     def take(self, sample: Sample) -> None:
         """A sample arrives."""
@@ -60,27 +61,28 @@ class World:
         known.last = max(known.last, sample.time)
         held = self._held(sample.client, sample.stream)
         while len(held) > self.counts.get(sample.stream, len(held)):
-            self.gone.add(held.pop(0).number)
+            self.gone[held.pop(0).number] = sample.time
         while len(held) > 1 and _size(held) > self.sizes.get(sample.stream, _size(held)):
-            self.gone.add(held.pop(0).number)
+            self.gone[held.pop(0).number] = sample.time
         everything = [each for each in self.samples if each.number not in self.gone]
         if self.size is not None and _size(everything) > self.size:
             everything.sort(key=lambda each: (each.time, each.client, each.stream, each.number))
             while _size(everything) > self.size - self.size // 64:
-                self.gone.add(everything.pop(0).number)
+                self.gone[everything.pop(0).number] = sample.time
 
     def sweep(self, now: int) -> None:
         """A whole second: what is older than its duration leaves the buffer, but for the newest."""
         for client, stream in {(each.client, each.stream) for each in self.samples}:
             for each in self._held(client, stream)[:-1]:
                 if each.time <= now - self.durations[stream]:
-                    self.gone.add(each.number)
+                    self.gone[each.number] = now
 
-    def _held(self, client: str, stream: str) -> list[Sample]:
-        """What the buffer has of a client's stream, in order."""
+    def _held(self, client: str, stream: str, then: int | None = None) -> list[Sample]:
+        """What the buffer has of a client's stream, in order; `then`: what it had at that time."""
         mine = [each for each in self.samples if (each.client, each.stream) == (client, stream)]
         return sorted(
-            (each for each in mine if each.number not in self.gone), key=lambda each: (each.time, each.number)
+            (each for each in mine if each.number not in self.gone or self.gone[each.number] > (then or math.inf)),
+            key=lambda each: (each.time, each.number),
         )
 
     def gap(self, time: int) -> None:
@@ -103,7 +105,7 @@ class World:
 
     def kept(self, client: str, stream: str, now: int) -> list[Sample]:
         """Those that the buffer still shows: of the last seconds, and the newest in any case."""
-        mine = [each for each in self._held(client, stream) if each.time <= now]
+        mine = [each for each in self._held(client, stream, now) if each.time <= now]
         return [each for each in mine if each.time > now - self.durations[stream]] or mine[-1:]
 
     def fresh(self, client: str, stream: str, now: int) -> bool:
