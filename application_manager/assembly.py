@@ -46,6 +46,7 @@ from wayside.tracing import Tracing
 
 _JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
 _INSTANCE_WORKERS = 16
+_INSTANCE_SHARE = 6  # of these for one namespace: more requests at once make each take longer, also those of others
 _CONFIGURATION_WORKERS = 4
 _JUDGING_WORKERS = 4  # one a namespace: they mostly wait for worker processes
 _STATUS_WORKERS = 2  # few: what runs goes before what is said of it
@@ -84,7 +85,7 @@ class Assembly:
         self.recorder = Recorder(client, measures)
         applier = self.applier = Applier(client, self.world.store, resources)
         self._instances: WorkQueue[Name] = WorkQueue(
-            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures
+            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures, share=_INSTANCE_SHARE
         )
         self.world.places.changed = self._instances.add
         self._statuses: WorkQueue[Name] = WorkQueue(

@@ -236,8 +236,8 @@ class Manager:
         found = self._leadership.lease
         return TemplateManager(lease=found[0], since=found[1]) if found is not None else None
 
-    async def _relist(self, resource: Any, namespace: str | None) -> None:
-        await self._listing.again(resource.group, resource.plural, namespace)
+    async def _relist(self, resource: Any, namespace: str | None, labels: str) -> None:
+        await self._listing.again(resource.group, resource.plural, namespace, labels)
 
     async def _connection(self) -> kopf.ConnectionInfo:
         configuration = self._client.configuration

@@ -3,7 +3,7 @@
 Managers with one Lease take turns by that. Two releases have a Lease each, and none may read the other's. So each
 writes its Lease, and when that was created, into the status of every template. Of two, the one with the older Lease
 acts in a namespace and the other one waits there. By an attempt, the younger one learns whether the older one is alive:
-it writes itself into one template, and the older one then writes itself back.
+it writes itself into one template, and the older one then writes itself back. docs/decisions/0028 has the reasons.
 """
 
 from __future__ import annotations

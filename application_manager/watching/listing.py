@@ -64,14 +64,14 @@ class Listing:
             self.world.leases.forget_except(self.world.claims.holders())
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
-    async def again(self, group: str, plural: str, namespace: str | None) -> None:
+    async def again(self, group: str, plural: str, namespace: str | None, labels: str) -> None:
         """List a kind again, in a namespace, or for None in all: what is there and what is gone.
 
         Raises ApiError or Unreachable.
         """
         for resource in (LEASES, *self.own, *self.children):
             if (resource.group, resource.plural) == (group, plural):
-                await self._list(resource, INSTANCE_LABEL if resource in self.children else "", (namespace,))
+                await self._list(resource, labels, (namespace,))
 
     async def _everything(self) -> None:
         for resource in self.own:

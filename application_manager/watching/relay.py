@@ -3,7 +3,7 @@
 kopf keeps a task and a queue for each object that has news, and the object itself with them. For handlers that do no
 more than put an object into a cache, that is most of the time and the memory that the news take. So kopf keeps the
 watches up (connections, retries, versions that are too old), and sees of each event its version. Its lists are ours: it
-learns the version to watch from, and we list what is there after that. docs/decisions/0032 has the details.
+learns the version to watch from, and we list what is there after that. docs/decisions/0027 has the details.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from kopf._cogs.clients import fetching, watching
 from application_manager.cluster.client import ApiError, Object, Unreachable
 
 News = Callable[[Object], None]
-Relist = Callable[[Any, str | None], Awaitable[None]]
-"""Lists a resource of kopf's again; in a namespace, or in all for None. May raise ApiError or Unreachable."""
+Relist = Callable[[Any, str | None, str], Awaitable[None]]
+"""Lists a resource of kopf's again: in a namespace, or in all for None, by a label selector. May raise ApiError or
+Unreachable."""
 
 log = logging.getLogger(__name__)
 
@@ -54,13 +55,13 @@ def relaying(observe: News, vanished: News, relist: Relist) -> Iterator[None]:
             yield {"type": "BOOKMARK", "object": {"metadata": {"resourceVersion": version}}}
             await asyncio.sleep(0)  # many may have arrived: the work goes on in between
 
-    async def fetch_objs(*, resource: Any, namespace: Any, **about: Any) -> AsyncIterator[Any]:
-        version = None
-        async for _, as_of in fetch(resource=resource, namespace=namespace, **about):
+    async def fetch_objs(*, settings: Any, resource: Any, namespace: Any, **about: Any) -> AsyncIterator[Any]:
+        version, labels = None, ",".join(sorted(set(settings.watching.label_selectors.collect(resource))))
+        async for _, as_of in fetch(settings=settings, resource=resource, namespace=namespace, **about):
             version = as_of
             break
         try:
-            await relist(resource, namespace)
+            await relist(resource, namespace, labels)
         except (ApiError, Unreachable) as error:
             log.warning("%s cannot be listed: %s", resource.plural, error)
             raise TimeoutError from error  # which kopf takes as a reason to begin anew

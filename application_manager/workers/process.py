@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Protocol, TypeVar
 
 LENGTH = struct.Struct("<I")
 
-MEMORY = 512 * 1024 * 1024
+MEMORY = 256 * 1024 * 1024
 """Bytes of data that the process may have; it has 40 MB when it starts."""
 
 _NICENESS = 5  # the manager's own work goes first

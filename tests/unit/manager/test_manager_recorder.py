@@ -32,6 +32,33 @@ def say(events: Recorder, first: int, count: int) -> None:
         events.say(about, Reason.ACCEPTED, "counts", NOW)
 
 
+class Taking:
+    """An API server that takes all Events, and notes their namespaces."""
+
+    def __init__(self) -> None:
+        self.namespaces: list[str] = []
+
+    async def create(self, _: Any, manifest: Any) -> None:
+        self.namespaces.append(manifest["metadata"]["namespace"])
+
+
+def test_namespaces_take_turns() -> None:
+    server = Taking()
+    events = Recorder(cast("Client", server))
+
+    async def flood() -> None:
+        say(events, 0, 100)
+        one = task("one")
+        quiet = one.metadata.model_copy(update={"namespace": "quiet", "uid": "quiet"})
+        events.say(one.model_copy(update={"metadata": quiet}), Reason.ACCEPTED, "counts", NOW)
+        events.finish()
+        await events.run()
+
+    asyncio.run(flood())
+    assert len(server.namespaces) == 101
+    assert server.namespaces.index("quiet") == 1
+
+
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [each.getMessage() for each in caplog.records if "were dropped" in each.getMessage()]
 

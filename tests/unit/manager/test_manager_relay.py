@@ -43,7 +43,7 @@ async def watched(taken: list[Event], *, unreachable: bool = False) -> list[Any]
         if raw["metadata"]["name"] == "faulty":
             raise ValueError("a defect")
 
-    async def relist(resource: Any, namespace: str | None) -> None:
+    async def relist(resource: Any, namespace: str | None, labels: str) -> None:
         if unreachable:
             raise Unreachable("gone")
         taken.append(("listed", f"{resource.plural} in {namespace}"))

@@ -244,3 +244,28 @@ def test_no_namespace_has_more_workers_than_its_share() -> None:
 
     asyncio.run(scenario())
     assert done == [("a", "1"), ("a", "2"), ("a", "3")]
+
+
+@in_a_loop
+async def test_a_queue_yields_to_the_one_before_it_in_the_same_namespace_alone() -> None:
+    done: list[tuple[str, str]] = []
+    both = asyncio.Event()
+
+    async def say(key: tuple[str, str]) -> None:
+        done.append(key)
+        if len(done) == 2:
+            both.set()
+
+    async def never(_: tuple[str, str]) -> None:
+        raise AssertionError
+
+    first = WorkQueue("first", never, 1)
+    first.add(("loud", "waits"))
+    queue = WorkQueue("q", say, 1, first)
+    queue.add(("loud", "a"))
+    queue.add(("quiet", "b"))
+    working = asyncio.create_task(queue.run())
+    async with asyncio.timeout(60):
+        await both.wait()
+    working.cancel()
+    assert done == [("quiet", "b"), ("loud", "a")]
