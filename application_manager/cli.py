@@ -199,6 +199,12 @@ def run(
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
     ] = None,
+    metrics_certificates: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."
+        ),
+    ] = None,
     zenoh: Annotated[
         list[str] | None,
         typer.Option(
@@ -280,8 +286,13 @@ def run(
             metavar="NAME", help="With --admission-service: the webhook configurations that get the authority."
         ),
     ] = "wayside",
+    log_format: Annotated[
+        commandline.LogFormat,
+        typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="Log lines for people, or one JSON object a line."),
+    ] = commandline.LogFormat.TEXT,
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
+    commandline.log_as(log_format)
     with importing():
         import asyncio
 
@@ -303,6 +314,7 @@ def run(
         watch_timeout=_seconds("--watch-timeout", watch_timeout),
         metrics_port=metrics_port,
         memory_limit=_bytes("--memory-limit", memory_limit) if memory_limit else container_limit(),
+        metrics_certificates=metrics_certificates,
         cpu_time=_seconds("--expression-cpu-time", expression_cpu_time),
         zenoh=settings(zenoh) if zenoh else None,
         helm=Helm(helm),
