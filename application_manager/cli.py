@@ -145,17 +145,24 @@ def _lease(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
 
 
 def _detectors(
-    image: str | None, policy: PullPolicy | None, secrets: list[str] | None, variables: list[str] | None
+    image: str | None,
+    policy: PullPolicy | None,
+    secrets: list[str] | None,
+    variables: list[str] | None,
+    user: str | None,
 ) -> PodDefaults | None:
-    from application_manager.core.objects.poddefaults import PodDefaults, parse_environment
+    from application_manager.core.objects.poddefaults import USER, PodDefaults, parse_environment, parse_user
 
+    option = "--detector-env"
     try:
         environment = parse_environment(variables or ())
+        option = "--detector-user"
+        number = USER if user is None else parse_user(user)
     except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--detector-env") from None
+        raise typer.BadParameter(str(error), param_hint=option) from None
     if image:
-        return PodDefaults(image, policy, tuple(secrets or ()), environment)
-    if policy or secrets or environment:
+        return PodDefaults(image, policy, tuple(secrets or ()), environment, number)
+    if policy or secrets or environment or user:
         commandline.refuse(
             "options for detectors' pods do nothing without --detector-image: give it, or leave them out"
         )
@@ -201,9 +208,7 @@ def run(
     ] = None,
     metrics_certificates: Annotated[
         Path | None,
-        typer.Option(
-            help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."
-        ),
+        typer.Option(help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."),
     ] = None,
     zenoh: Annotated[
         list[str] | None,
@@ -258,6 +263,13 @@ def run(
     detector_env: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="An environment variable of all detectors; repeatable."),
+    ] = None,
+    detector_user: Annotated[
+        str | None,
+        typer.Option(
+            metavar="UID|cluster",
+            help="As whom detectors run: a number, or `cluster` where that chooses (OpenShift). Default: 65532.",
+        ),
     ] = None,
     admission_port: Annotated[
         int | None,
@@ -322,7 +334,7 @@ def run(
         chart_folder=chart_folder,
         admission=_serving(admission_port, admission_certificates, admission_service, admission_webhooks),
         lease=_lease(lease, tuple(namespace or ())),
-        detectors=_detectors(detector_image, detector_pull_policy, detector_pull_secret, detector_env),
+        detectors=_detectors(detector_image, detector_pull_policy, detector_pull_secret, detector_env, detector_user),
     )
     asyncio.run(serve(options))
     commandline.leave()

@@ -1,7 +1,7 @@
 """`helm test`: the manager is ready, and what the API server asks it, it answers with a certificate that is trusted.
 
-Arguments: where /readyz is served, and the file of its authority, empty without TLS; with the webhook also where that is,
-the file of its authority, and a namespace that the manager looks after.
+Arguments: where /readyz is served, and the file of its authority, empty without TLS; with the webhook also where that
+is, the file of its authority, and a namespace that the manager looks after.
 """
 
 import json
