@@ -2,6 +2,9 @@
 #
 #   docker build -t wayside --build-arg VERSION=$(git describe --always) .
 #
+# With --build-arg REQUIREMENTS=requirements-full.txt it also has what ONNX models, Protobuf recordings and results of
+# replays need; docs/images.md says how both are built for two architectures, published and signed.
+#
 # The base is pinned by its digest (Python 3.13 on Debian 13), what is installed by docker/requirements.txt, with hashes.
 # Files bear no times of the build, so the same source gives the same layers (BuildKit: also give
 # --build-arg SOURCE_DATE_EPOCH=0 and --output type=image,rewrite-timestamp=true; buildah: --timestamp 0). Where the base
@@ -11,8 +14,9 @@ ARG BASE=docker.io/library/python:3.13-slim-trixie@sha256:9d2e5553305c7c7b009799
 FROM ${BASE} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PYTHONDONTWRITEBYTECODE=1
 RUN python3 -m venv /opt/wayside
-COPY docker/requirements.txt /source/docker/requirements.txt
-RUN /opt/wayside/bin/pip install --no-compile --only-binary=:all: --require-hashes -r /source/docker/requirements.txt
+COPY docker/requirements.txt docker/requirements-full.txt /source/docker/
+ARG REQUIREMENTS=requirements.txt
+RUN /opt/wayside/bin/pip install --no-compile --only-binary=:all: --require-hashes -r "/source/docker/${REQUIREMENTS}"
 COPY pyproject.toml README.md LICENSE /source/
 COPY wayside /source/wayside
 COPY detector /source/detector

@@ -11,22 +11,24 @@ import logging
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from application_manager.commands.options import (
+    bytes_of,
+    detectors_of,
+    lease_of,
+    policy_of,
+    seconds_of,
+    serving_of,
+    tasks_of,
+)
 from application_manager.commands.printing import detector_rbac, inject, rbac, webhooks
 from application_manager.core.objects.pullpolicy import PullPolicy
 from wayside import commandline
 from wayside.beginning import importing
 from wayside.inputerror import InputError
-
-if TYPE_CHECKING:
-    from application_manager.admission.reviewing import Serving
-    from application_manager.cluster.leadership import LeaseKey
-    from application_manager.core.holders.policies import TaskPolicy
-    from application_manager.core.objects.poddefaults import PodDefaults
-    from application_manager.core.objects.policy import Policy
 
 app = typer.Typer(
     add_completion=False,
@@ -78,90 +80,6 @@ def _main(
             handler.addFilter(lambda record: not record.getMessage().startswith("Request attempt"))
 
 
-def _seconds(option: str, written: str) -> float:
-    from wayside.api.base import Duration
-
-    try:
-        return Duration.parse(written).seconds
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from None
-
-
-def _bytes(option: str, written: str) -> int:
-    from wayside.api.base import PositiveQuantity
-
-    try:
-        return PositiveQuantity.parse(written).bytes
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from None
-
-
-def _policy(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
-    """The policy; `everywhere`: of a manager that looks after all namespaces."""
-    from application_manager.core.objects.policy import Policy
-
-    try:
-        policy = Policy.parse(kinds, accounts)
-        if everywhere:
-            policy.check_everywhere()
-        return policy
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
-
-
-def _tasks(most: int | None, holders: list[str] | None) -> TaskPolicy:
-    from application_manager.core.holders.policies import HolderPolicy, TaskPolicy
-
-    try:
-        return TaskPolicy(most, tuple(HolderPolicy.parse(each) for each in holders or ()))
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--holder-policy") from None
-
-
-def _serving(port: int | None, certificates: Path | None, service: str | None, webhooks: str) -> Serving | None:
-    if port is None and certificates is None and service is None:
-        return None
-    from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
-    from application_manager.core.findings.webhooks import certificate_secret
-
-    if port is None or certificates is None:
-        commandline.refuse(f"{PORT_OPTION} and {FOLDER_OPTION} go together: give both, or none")
-    if service is None:
-        return Serving(port, certificates)
-    try:
-        certificate_secret(service)
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--admission-service") from None
-    return Serving(port, certificates, service, webhooks)
-
-
-def _lease(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
-    from application_manager.cluster.leadership import lease_key
-
-    try:
-        return lease_key(given, namespaces)
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--lease") from None
-
-
-def _detectors(
-    image: str | None, policy: PullPolicy | None, secrets: list[str] | None, variables: list[str] | None
-) -> PodDefaults | None:
-    from application_manager.core.objects.poddefaults import PodDefaults, parse_environment
-
-    try:
-        environment = parse_environment(variables or ())
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--detector-env") from None
-    if image:
-        return PodDefaults(image, policy, tuple(secrets or ()), environment)
-    if policy or secrets or environment:
-        commandline.refuse(
-            "options for detectors' pods do nothing without --detector-image: give it, or leave them out"
-        )
-    return None
-
-
 @app.command()
 def run(
     namespace: Annotated[
@@ -198,6 +116,10 @@ def run(
     ] = "90s",
     metrics_port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
+    ] = None,
+    metrics_certificates: Annotated[
+        Path | None,
+        typer.Option(help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."),
     ] = None,
     zenoh: Annotated[
         list[str] | None,
@@ -253,6 +175,13 @@ def run(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="An environment variable of all detectors; repeatable."),
     ] = None,
+    detector_user: Annotated[
+        str | None,
+        typer.Option(
+            metavar="UID|cluster",
+            help="As whom detectors run: a number, or `cluster` where that chooses (OpenShift). Default: 65532.",
+        ),
+    ] = None,
     admission_port: Annotated[
         int | None,
         typer.Option(
@@ -280,8 +209,13 @@ def run(
             metavar="NAME", help="With --admission-service: the webhook configurations that get the authority."
         ),
     ] = "wayside",
+    log_format: Annotated[
+        commandline.LogFormat,
+        typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="Log lines for people, or one JSON object a line."),
+    ] = commandline.LogFormat.TEXT,
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
+    commandline.log_as(log_format)
     with importing():
         import asyncio
 
@@ -293,24 +227,25 @@ def run(
         from application_manager.work.publishing import settings
 
     options = Options(
-        policy=_policy(allowed_kinds, service_accounts, everywhere=not namespace),
+        policy=policy_of(allowed_kinds, service_accounts, everywhere=not namespace),
         namespaces=tuple(namespace or ()),
         max_instances=max_instances,
-        tasks=_tasks(max_tasks, holder_policy),
-        resync=_seconds("--resync", resync),
-        ttl_after_finished=_seconds("--ttl-after-finished", ttl_after_finished),
-        stalled_after=_seconds("--stalled-after", stalled_after),
-        watch_timeout=_seconds("--watch-timeout", watch_timeout),
+        tasks=tasks_of(max_tasks, holder_policy),
+        resync=seconds_of("--resync", resync),
+        ttl_after_finished=seconds_of("--ttl-after-finished", ttl_after_finished),
+        stalled_after=seconds_of("--stalled-after", stalled_after),
+        watch_timeout=seconds_of("--watch-timeout", watch_timeout),
         metrics_port=metrics_port,
-        memory_limit=_bytes("--memory-limit", memory_limit) if memory_limit else container_limit(),
-        cpu_time=_seconds("--expression-cpu-time", expression_cpu_time),
+        memory_limit=bytes_of("--memory-limit", memory_limit) if memory_limit else container_limit(),
+        metrics_certificates=metrics_certificates,
+        cpu_time=seconds_of("--expression-cpu-time", expression_cpu_time),
         zenoh=settings(zenoh) if zenoh else None,
         helm=Helm(helm),
         chart_cache=chart_cache or default_folder(),
         chart_folder=chart_folder,
-        admission=_serving(admission_port, admission_certificates, admission_service, admission_webhooks),
-        lease=_lease(lease, tuple(namespace or ())),
-        detectors=_detectors(detector_image, detector_pull_policy, detector_pull_secret, detector_env),
+        admission=serving_of(admission_port, admission_certificates, admission_service, admission_webhooks),
+        lease=lease_of(lease, tuple(namespace or ())),
+        detectors=detectors_of(detector_image, detector_pull_policy, detector_pull_secret, detector_env, detector_user),
     )
     asyncio.run(serve(options))
     commandline.leave()
@@ -337,7 +272,7 @@ def render(
         from application_manager.charts.helm import Helm
         from application_manager.commands.offline import charts_at_once, render_files
 
-    policy = _policy(allowed_kinds, service_accounts)
+    policy = policy_of(allowed_kinds, service_accounts)
     result = render_files(
         [*templates, *tasks], policy, max_instances, charts_at_once(Helm(helm), chart_cache, chart_folder)
     )
@@ -363,7 +298,7 @@ def check(
         from wayside.api.documents import DocumentError
 
     try:
-        checked = check_files(files, _policy(allowed_kinds, service_accounts))
+        checked = check_files(files, policy_of(allowed_kinds, service_accounts))
     except DocumentError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from None

@@ -30,6 +30,7 @@ class Options:
         resync: seconds between two full resyncs.
         ttl_after_finished: seconds that finished tasks are kept.
         metrics_port: where metrics and health are served; None: nowhere.
+        metrics_certificates: the folder with the certificate by which they are served; None: without TLS.
         zenoh: where configurations are published; None: nowhere.
         helm: renders charts.
         chart_cache: the folder in which fetched charts are kept.
@@ -50,6 +51,7 @@ class Options:
     resync: float = 60.0
     ttl_after_finished: float = 3600.0
     metrics_port: int | None = None
+    metrics_certificates: Path | None = None
     zenoh: zenoh.Config | None = None
     helm: Helm = field(default_factory=Helm)
     chart_cache: Path = field(default_factory=default_folder)

@@ -153,7 +153,14 @@ class Manager:
         ready = partial(self._lacks, watching)
         async with (
             watchdog(healthy, min(SILENT, limit)),
-            pages(self._options.metrics_port, self._measures, healthy, ready, lambda: self._leadership.role),
+            pages(
+                self._options.metrics_port,
+                self._measures,
+                healthy,
+                ready,
+                lambda: self._leadership.role,
+                self._options.metrics_certificates,
+            ),
             webhook(self._options.admission, desks),
         ):
             try:

@@ -90,8 +90,13 @@ def run(
             "reaches it.",
         ),
     ] = None,
+    log_format: Annotated[
+        commandline.LogFormat,
+        typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="Log lines for people, or one JSON object a line."),
+    ] = commandline.LogFormat.TEXT,
 ) -> None:
     """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
+    commandline.log_as(log_format)
     if (name is None) == (detector is None):
         refuse("give either --detector FILE and --rules FILE, or --name NAME")
     if name is not None and rules:

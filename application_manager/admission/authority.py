@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from application_manager.admission.certificate import CERTIFICATE, KEY
+from application_manager.cluster.certificate import CERTIFICATE, KEY
 from application_manager.cluster.connection import ConfigurationError
 
 AUTHORITY = "ca.crt"

@@ -21,8 +21,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from application_manager.admission.authority import AUTHORITY, VALID, issued, written
-from application_manager.admission.certificate import CERTIFICATE, KEY
 from application_manager.admission.reviewing import Serving
+from application_manager.cluster.certificate import CERTIFICATE, KEY
 from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.starting import until_answered

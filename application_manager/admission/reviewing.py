@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 from aiohttp import web
 
-from application_manager.admission.certificate import ServingCertificate
+from application_manager.cluster.certificate import ServingCertificate
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import certificate_secret

@@ -1,16 +1,21 @@
-"""/metrics, /healthz and /readyz over HTTP, in the manager's own event loop: one that hangs does not answer."""
+"""/metrics, /healthz and /readyz over HTTP(S), in the manager's own event loop: one that hangs does not answer."""
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Protocol
 
 from aiohttp import web
 
+from application_manager.cluster.certificate import ServingCertificate
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.measures import Measures
+
+FOLDER_OPTION = "--metrics-certificates"
 
 STALLED_AFTER = 300.0
 """Seconds without the end of a resync, at the least, after which the manager counts as stalled."""
@@ -55,17 +60,25 @@ def stalled(measures: Measures, every: float, queues: Sequence[Queue] = (), leas
 
 @asynccontextmanager
 async def pages(
-    port: int | None, measures: Measures, healthy: Lack, ready: Lack, role: Callable[[], str] = str
+    port: int | None,
+    measures: Measures,
+    healthy: Lack,
+    ready: Lack,
+    role: Callable[[], str] = str,
+    certificates: Path | None = None,
 ) -> AsyncIterator[int | None]:
     """Serve on all addresses while the block runs; the port, None where none is wanted. Port 0 takes a free one.
 
     `role` is what /readyz says beside "ok", if anything: a standby is ready as well.
 
-    Raises ConfigurationError where the port is taken.
+    `certificates`: the folder with tls.crt and tls.key, which may change; None: without TLS.
+
+    Raises ConfigurationError where the port is taken, or there is no certificate that can be used.
     """
     if port is None:
         yield None
         return
+    certificate = None if certificates is None else ServingCertificate(certificates, FOLDER_OPTION)
     application = web.Application()
 
     async def metrics(_: web.Request) -> web.Response:
@@ -81,15 +94,19 @@ async def pages(
         application.router.add_get(path, page)
     runner = web.AppRunner(application, access_log=None, handle_signals=False, shutdown_timeout=1)
     await runner.setup()
+    following = None if certificate is None else asyncio.create_task(certificate.follow(), name="metrics certificate")
     try:
         try:
-            await web.TCPSite(runner, port=port).start()
+            await web.TCPSite(runner, port=port, ssl_context=certificate.context if certificate else None).start()
         except OSError as error:
             reason = error.strerror or error
             raise ConfigurationError(f"--metrics-port {port}: {reason}: give another port") from error
         # With port 0, IPv6 has a port of its own; an IPv4 address is a pair.
         yield next(int(each[1]) for each in sorted(runner.addresses, key=len))
     finally:
+        if following is not None:
+            following.cancel()
+            await asyncio.gather(following, return_exceptions=True)
         await runner.cleanup()
 
 

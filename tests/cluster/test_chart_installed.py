@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import datetime
+import json
 import socket
 import ssl
 import subprocess
@@ -14,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.admission.authority import issued
+from application_manager.admission.authority import issued, make_certificates
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane
@@ -196,13 +197,16 @@ def wait_for_pods(api: Api, component: str, count: int) -> None:
 def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_that_it_answers(
     helm: Helm, there: Api, bare: ControlPlane, tmp_path: Path
 ) -> None:
-    install(helm, there, {"manager": {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"]}})
+    mine = {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"], "metrics": {"tlsSecret": "metrics"}}
+    install(helm, there, {"manager": mine, "logFormat": "json"})
     container = there.get("Deployment", f"{RELEASE}-manager")["spec"]["template"]["spec"]["containers"][0]
     metrics, webhook = free_ports(2)
     certificates = tmp_path / "certificates"
     service, hook = f"{RELEASE}-webhook.{there.namespace}.svc", f"{RELEASE}-{there.namespace}"
+    make_certificates(tmp_path / "metrics", ("127.0.0.1",))
     here = {
         "--metrics-port": str(metrics),
+        "--metrics-certificates": str(tmp_path / "metrics"),
         "--admission-port": str(webhook),
         "--admission-certificates": str(certificates),
     }
@@ -216,10 +220,12 @@ def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_th
         manager.wait_for_output("active: holds the Lease")  # the chart's, which is empty at first
         first = trusted(there, hook)
         assert shown(webhook, first, service) == (certificates / "tls.crt").read_bytes()
-        (pod,) = helm.rendered({"manager": {"namespaces": [there.namespace]}}).of("Pod")
+        (pod,) = helm.rendered({"manager": mine}).of("Pod")
         script, *where = pod["spec"]["containers"][0]["args"]
-        assert [each.partition(":")[0] for each in where] == ["http", "https", "/authority/ca.crt", there.namespace]
-        where[:3] = [f"http://127.0.0.1:{metrics}", f"https://{service}:{webhook}", str(certificates / "ca.crt")]
+        schemes = [each.partition(":")[0] for each in where]
+        assert schemes == ["https", "/metrics-authority/ca.crt", "https", "/authority/ca.crt", there.namespace]
+        where[:2] = [f"https://127.0.0.1:{metrics}", str(tmp_path / "metrics" / "ca.crt")]
+        where[2:4] = [f"https://{service}:{webhook}", str(certificates / "ca.crt")]
         done = subprocess.run(
             [sys.executable, "-c", RESOLVING + script, *where], capture_output=True, text=True, check=False
         )
@@ -239,6 +245,8 @@ def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_th
         )
         assert manager.terminate() == 0
         assert "may not" not in manager.output()
+        for line in manager.output().splitlines():
+            assert {"time", "level", "logger", "message"} <= json.loads(line).keys()
     finally:
         processes.kill_all()
 

@@ -351,6 +351,10 @@ def test_a_cluster_that_gives_users_and_has_one_registry_gets_what_it_takes(helm
             assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
     manager = helm.rendered(given).one("Deployment", "wayside-manager")["spec"]["template"]["spec"]["containers"][0]
     assert f"--detector-image={manager['image']}" in manager["args"]
+    assert "--detector-user=cluster" in manager["args"]
+    for user, options in ((65532, []), (1000, ["--detector-user=1000"])):
+        arguments = manager_arguments(helm.rendered({"podSecurityContext": {"runAsUser": user}}))
+        assert [each for each in arguments if "detector-user" in each] == options
 
 
 def test_the_deployment_and_the_webhooks_are_as_the_values_say(helm: Helm) -> None:

@@ -274,8 +274,10 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
     def kept() -> list[Any]:
         return json.loads(state.read_text())["episodes"] if state.exists() else []
 
-    with running(tmp_path) as process:
+    with running(tmp_path, "--log-format", "json") as process:
         wait_for(lambda: b"runs with 1 rules" in (tmp_path / "log").read_bytes(), "the detector runs")
+        for line in map(json.loads, (tmp_path / "log").read_text().split("\n")[:-1]):
+            assert {"time", "level", "logger", "message"} <= line.keys()
         car = Car(endpoint)
         car.wait_for(lambda: len(kept()) == 1 and len(events_in(events)) == 1, "the episode is open and kept")
         os.kill(process.pid, signal.SIGKILL)

@@ -37,7 +37,6 @@ KINDS = (
 METRICS, METRICS_PORT = "metrics", 9100
 _SECRETS_FOLDER = "/etc/wayside/secrets"  # where the detector looks for them
 _SECRET_FIELDS = frozenset({"tlsSecret", "credentialsSecret", "uriSecret"})
-USER = 65532  # of our image; that volumes shall be writable to it, its group says
 _SCRATCH_SIZE = "256Mi"
 
 
@@ -144,9 +143,8 @@ def _pod(detector: Detector, defaults: PodDefaults) -> Manifest:
         "terminationGracePeriodSeconds": 30,
         "securityContext": {
             "runAsNonRoot": True,
-            "runAsUser": USER,
-            "runAsGroup": USER,
-            "fsGroup": USER,
+            **run_as(defaults),
+            **({} if defaults.user is None else {"fsGroup": defaults.user}),  # volumes are writable to it
             "fsGroupChangePolicy": "OnRootMismatch",
             "seccompProfile": {"type": "RuntimeDefault"},
         },
@@ -199,6 +197,11 @@ def container(
         },
         "volumeMounts": mounts,
     }
+
+
+def run_as(defaults: PodDefaults) -> Manifest:
+    """As whom a detector runs, as a security context says it."""
+    return {} if defaults.user is None else {"runAsUser": defaults.user, "runAsGroup": defaults.user}
 
 
 def told(variable: str, path: str) -> Manifest:

@@ -12,6 +12,9 @@ from wayside.api.pod import RESERVED_VARIABLES
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
+USER = 65532  # of our image
+
+
 @dataclass(frozen=True, slots=True)
 class PodDefaults:
     """As the manager's options say.
@@ -21,12 +24,23 @@ class PodDefaults:
         pull_policy: of all images; None: Kubernetes' default, by the image's tag.
         pull_secrets: by which nodes pull the images; each namespace with detectors has Secrets of these names.
         environment: of the containers, e.g. where traces go; what a Detector gives itself wins.
+        user: as whom they run, and the group of their volumes; None: as the cluster chooses, as OpenShift does.
     """
 
     image: str
     pull_policy: PullPolicy | None = None
     pull_secrets: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
+    user: int | None = USER
+
+
+def parse_user(given: str) -> int | None:
+    """Read a user's number, or `cluster` for None. Raises ValueError for what is neither, and for root."""
+    if given == "cluster":
+        return None
+    if not given.isdigit() or int(given) == 0:
+        raise ValueError(f"{given!r} is no user: give a number other than 0, or `cluster` for one that it chooses")
+    return int(given)
 
 
 def parse_environment(given: Iterable[str]) -> dict[str, str]:

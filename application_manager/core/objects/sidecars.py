@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager.core.objects.detectors import USER, Manifest, container, probe, told, volumes_of
+from application_manager.core.objects.detectors import Manifest, container, probe, run_as, told, volumes_of
 from application_manager.core.objects.poddefaults import PodDefaults
 from wayside.api import Detector
 
@@ -130,8 +130,7 @@ def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], 
     # The pod's own securityContext is its author's, so all that the restricted standard asks for is said here.
     made["securityContext"] |= {
         "runAsNonRoot": True,
-        "runAsUser": USER,
-        "runAsGroup": USER,
+        **run_as(defaults),
         "seccompProfile": {"type": "RuntimeDefault"},
     }
     health = (

@@ -1,7 +1,7 @@
 """`helm test`: the manager is ready, and what the API server asks it, it answers with a certificate that is trusted.
 
-Arguments: where /readyz is served; with the webhook also where that is, the file of its authority, and a
-namespace that the manager looks after.
+Arguments: where /readyz is served, and the file of its authority, empty without TLS; with the webhook also where that
+is, the file of its authority, and a namespace that the manager looks after.
 """
 
 import json
@@ -19,9 +19,10 @@ WRONG = {
 }
 
 
-def ready(base):
+def ready(base, authority):
     """Say that the manager is ready; OSError where it is not."""
-    with urllib.request.urlopen(f"{base}/readyz", timeout=5) as answer:
+    context = ssl.create_default_context(cafile=authority) if authority else None
+    with urllib.request.urlopen(f"{base}/readyz", timeout=5, context=context) as answer:
         print("the manager is ready:", answer.read().decode().strip())
 
 
@@ -60,6 +61,6 @@ def wait(check, *arguments):
         time.sleep(1)
 
 
-wait(ready, sys.argv[1])
-if len(sys.argv) > 2:
-    wait(refuses, *sys.argv[2:])
+wait(ready, *sys.argv[1:3])
+if len(sys.argv) > 3:
+    wait(refuses, *sys.argv[3:])

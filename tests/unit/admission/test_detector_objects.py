@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from application_manager.cli import app
 from application_manager.core.conditions import find
 from application_manager.core.health.pods import Trouble, TroubleReason
 from application_manager.core.objects.detectors import detector_objects, detector_roles, secrets_of
-from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.poddefaults import PodDefaults, parse_user
 from application_manager.core.objects.pullpolicy import PullPolicy
 from application_manager.core.objects.rights import detector_rights, merged, rights
 from application_manager.core.statuses.rulestatus import detector_status
@@ -86,6 +87,18 @@ def test_the_secrets_are_those_that_the_detector_names_and_those_that_rules_may_
 def test_what_the_detector_follows_by_itself_does_not_change_the_pod() -> None:
     changed = detector(clientTimeout="7s", rules={"matchLabels": {"a": "b"}}, buffer={"bytes": "1Gi"})
     assert detector_objects(changed, DEFAULTS) == detector_objects(detector(), DEFAULTS)
+
+
+@pytest.mark.parametrize(("user", "fields"), [(None, {}), (7, {"runAsUser": 7, "runAsGroup": 7, "fsGroup": 7})])
+def test_the_user_is_the_one_of_the_manager_or_left_to_the_cluster(user: int | None, fields: dict[str, int]) -> None:
+    made = detector_objects(detector(), replace(DEFAULTS, user=user))[-1]["spec"]["template"]["spec"]
+    security = made["securityContext"]
+    assert {name: security[name] for name in security if name in ("runAsUser", "runAsGroup", "fsGroup")} == fields
+    assert security["runAsNonRoot"] is True
+    assert parse_user("cluster" if user is None else str(user)) == user
+    for wrong in ("0", "root", "-1"):
+        with pytest.raises(ValueError, match="is no user"):
+            parse_user(wrong)
 
 
 def test_all_objects_are_the_detectors_own_and_the_pod_runs_with_its_account() -> None:

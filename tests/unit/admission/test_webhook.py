@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from application_manager.admission.authority import make_certificates
-from application_manager.admission.certificate import ServingCertificate
 from application_manager.admission.reviewing import AT_ONCE, LARGEST, Desk, Serving, webhook
 from application_manager.cli import EXPECTED, app
+from application_manager.cluster.certificate import ServingCertificate
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import PATH

@@ -15,23 +15,37 @@ from tests.guides import ROOT
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 EXTRAS = ("etsi", "mqtt", "otel")
-PINS = {
-    canonicalize_name(name): (Version(version), block)
-    for block in re.split(r"\n(?=\S)", (ROOT / "docker" / "requirements.txt").read_text())
-    for name, version in re.findall(r"^([\w.-]+)==([^\s;\\]+)", block)
-}
-ASKED = [*PROJECT["dependencies"], *(each for extra in EXTRAS for each in PROJECT["optional-dependencies"][extra])]
+FULL = (*EXTRAS, "onnx", "protobuf", "results")
 
 
-@pytest.mark.parametrize("asked", ASKED)
-def test_the_image_has_what_the_programs_ask_for(asked: str) -> None:
-    requirement = Requirement(asked)
-    assert (name := canonicalize_name(requirement.name)) in PINS, "run `make requirements`"
-    assert requirement.specifier.contains(PINS[name][0]), "run `make requirements`"
+def pins(file: str) -> dict[str, tuple[Version, str]]:
+    """Version and lines of each package of a file in docker/."""
+    return {
+        canonicalize_name(name): (Version(version), block)
+        for block in re.split(r"\n(?=\S)", (ROOT / "docker" / file).read_text())
+        for name, version in re.findall(r"^([\w.-]+)==([^\s;\\]+)", block)
+    }
 
 
-def test_every_package_is_pinned_by_hashes() -> None:
-    assert [name for name, (_, block) in PINS.items() if "--hash=sha256:" not in block] == []
+PINS = {"requirements.txt": pins("requirements.txt"), "requirements-full.txt": pins("requirements-full.txt")}
+
+
+@pytest.mark.parametrize(("file", "extras"), [("requirements.txt", EXTRAS), ("requirements-full.txt", FULL)])
+def test_the_image_has_what_the_programs_ask_for(file: str, extras: tuple[str, ...]) -> None:
+    asked = [*PROJECT["dependencies"], *(each for extra in extras for each in PROJECT["optional-dependencies"][extra])]
+    for requirement in map(Requirement, asked):
+        name = canonicalize_name(requirement.name)
+        assert name in PINS[file], "run `make requirements`"
+        assert requirement.specifier.contains(PINS[file][name][0]), "run `make requirements`"
+
+
+def test_every_package_is_pinned_by_hashes_and_the_full_image_has_all_of_the_other_one() -> None:
+    small, full = PINS.values()
+    for each in (small, full):
+        assert [name for name, (_, block) in each.items() if "--hash=sha256:" not in block] == []
+    assert {name: version for name, (version, _) in small.items()}.items() <= {
+        name: version for name, (version, _) in full.items()
+    }.items()
 
 
 def test_the_base_is_pinned_by_its_digest_and_the_user_is_not_root() -> None:

@@ -1,0 +1,118 @@
+"""What options say, read and checked: each names its option where it is wrong (typer.BadParameter).
+
+What is read into is imported when it is read, as all that a command runs.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from application_manager.core.objects.pullpolicy import PullPolicy
+from wayside import commandline
+
+if TYPE_CHECKING:
+    from application_manager.admission.reviewing import Serving
+    from application_manager.cluster.leadership import LeaseKey
+    from application_manager.core.holders.policies import TaskPolicy
+    from application_manager.core.objects.poddefaults import PodDefaults
+    from application_manager.core.objects.policy import Policy
+
+
+def seconds_of(option: str, written: str) -> float:
+    """The duration of an option, in seconds."""
+    from wayside.api.base import Duration
+
+    try:
+        return Duration.parse(written).seconds
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from None
+
+
+def bytes_of(option: str, written: str) -> int:
+    """The quantity of an option, in bytes."""
+    from wayside.api.base import PositiveQuantity
+
+    try:
+        return PositiveQuantity.parse(written).bytes
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from None
+
+
+def policy_of(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
+    """The policy; `everywhere`: of a manager that looks after all namespaces."""
+    from application_manager.core.objects.policy import Policy
+
+    try:
+        policy = Policy.parse(kinds, accounts)
+        if everywhere:
+            policy.check_everywhere()
+        return policy
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
+
+
+def tasks_of(most: int | None, holders: list[str] | None) -> TaskPolicy:
+    """The bounds of tasks: of `--max-tasks` and `--holder-policy`."""
+    from application_manager.core.holders.policies import HolderPolicy, TaskPolicy
+
+    try:
+        return TaskPolicy(most, tuple(HolderPolicy.parse(each) for each in holders or ()))
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--holder-policy") from None
+
+
+def serving_of(port: int | None, certificates: Path | None, service: str | None, webhooks: str) -> Serving | None:
+    """Where the webhook is served; None: nowhere."""
+    if port is None and certificates is None and service is None:
+        return None
+    from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
+    from application_manager.core.findings.webhooks import certificate_secret
+
+    if port is None or certificates is None:
+        commandline.refuse(f"{PORT_OPTION} and {FOLDER_OPTION} go together: give both, or none")
+    if service is None:
+        return Serving(port, certificates)
+    try:
+        certificate_secret(service)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--admission-service") from None
+    return Serving(port, certificates, service, webhooks)
+
+
+def lease_of(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
+    """The Lease of the managers."""
+    from application_manager.cluster.leadership import lease_key
+
+    try:
+        return lease_key(given, namespaces)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--lease") from None
+
+
+def detectors_of(
+    image: str | None,
+    policy: PullPolicy | None,
+    secrets: list[str] | None,
+    variables: list[str] | None,
+    user: str | None,
+) -> PodDefaults | None:
+    """What holds for the pods of detectors; None: no detector is run."""
+    from application_manager.core.objects.poddefaults import USER, PodDefaults, parse_environment, parse_user
+
+    option = "--detector-env"
+    try:
+        environment = parse_environment(variables or ())
+        option = "--detector-user"
+        number = USER if user is None else parse_user(user)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from None
+    if image:
+        return PodDefaults(image, policy, tuple(secrets or ()), environment, number)
+    if policy or secrets or environment or user:
+        commandline.refuse(
+            "options for detectors' pods do nothing without --detector-image: give it, or leave them out"
+        )
+    return None
