@@ -94,6 +94,8 @@ def _messages(
 
 
 def _reasons(reasons: Mapping[int, str], changes: Integers, times: Integers) -> list[str | None]:
+    if not reasons:
+        return [None] * len(times)
     where = np.searchsorted(changes, times, "right") - 1
     return [reasons.get(at) for at in where.tolist()]
 
