@@ -48,7 +48,7 @@ def main() -> int:
     options = parser.parse_args()
     without, attached, messages = [], [], 0
     with running(options.vehicles) as (pid, port, log):
-        time.sleep(8)  # windows are full, and all subjects have been seen
+        time.sleep(35)  # windows are full, and all channels are open
         for _ in range(options.rounds):
             without.append(cost(pid, options.seconds).cpu)
             with viewer(port) as came:

@@ -54,7 +54,7 @@ _SURVEY = 5_000_000_000
 """Nanoseconds between two looks for new subjects."""
 _WAITING = 8
 """Maximum number of slices that wait for the view's thread."""
-_NEW = 50
+_NEW = 200
 """Maximum number of channels that are opened with one slice."""
 _MOST = 1000
 """Maximum number of channels of subjects."""
