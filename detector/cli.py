@@ -261,6 +261,25 @@ def try_(
 
 
 @app.command()
+def new(
+    case: Annotated[str | None, typer.Argument(help="The use case; without it, all are listed.")] = None,
+    stream: Annotated[str, typer.Option(help="The stream that the rule reads.")] = "odom",
+    name: Annotated[str | None, typer.Option(help="The rule's name; default: that of the use case.")] = None,
+) -> None:
+    """Print a rule to begin with, made from a use case."""
+    with importing():
+        from detector.drafts import draft, drafts
+
+    if case is not None:
+        typer.echo(draft(case, stream, name), nl=False)
+        return
+    found = drafts()
+    width = max(map(len, found))
+    for each, about in found.items():
+        typer.echo(f"{each:{width}}  {about}")
+
+
+@app.command()
 def schema(
     output: Annotated[Path | None, typer.Option(help="The file to write; default: print it.")] = None,
 ) -> None:

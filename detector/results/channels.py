@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import msgspec
@@ -27,8 +28,8 @@ class _Field(NamedTuple):
     """One value of a message."""
 
     path: tuple[str, ...]
-    series: Series
-    values: list[Any]
+    kind: Kind
+    values: list[float | bool | str | None]
 
 
 def topic_of(rule: str, subject: str) -> str:
@@ -36,6 +37,7 @@ def topic_of(rule: str, subject: str) -> str:
     return f"/wayside/{rule}/{subject}"
 
 
+@lru_cache(maxsize=4096)
 def path_of(name: str) -> tuple[str, ...]:
     """Where a signal or term stands in a message: `a.speed` in `a`, `fastest - speed` under `fastest_minus_speed`."""
     if re.fullmatch(r"[\w.]+", name):
@@ -52,7 +54,7 @@ def subject_channel(
     named = {**subject.signals, **(terms.computed if terms is not None else {})}
     short = {name: thinned(series, trace.begin, trace.end, buckets, exact) for name, series in named.items()}
     times = np.unique(np.concatenate([exact, *(series.times for series in short.values())]))
-    fields = [_Field(path_of(name), named[name], named[name].at(times).tolist()) for name in named]
+    fields = [_Field(path_of(name), each.kind, _plain(each, times)) for name, each in named.items()]
     limits: dict[str, Any] = {}
     for each in terms.thresholds if terms is not None else ():
         _put(limits, (each.field, *path_of(each.term)), each.value)
@@ -60,7 +62,7 @@ def subject_channel(
     reasons = {name: _reasons(steps.reasons, steps.times, times) for name, steps in subject.conditions.items()}
     schema: dict[str, Any] = {"type": "object", "title": f"wayside.{subject.rule}", "properties": {}}
     for field in fields:
-        _declare(schema, field.path, {"type": _TYPES[field.series.kind]})
+        _declare(schema, field.path, {"type": _TYPES[field.kind]})
     for name in said:
         _declare(schema, (name,), {"type": "string", "enum": [*WORDS]})
         _declare(schema, (f"{name}_reason",), {"type": "string"})
@@ -79,10 +81,10 @@ def _messages(
     encode = msgspec.json.Encoder().encode
     for row, time in enumerate(times.tolist()):
         message: dict[str, Any] = {}
-        for field in fields:
-            value = field.series.plain(field.values[row])
+        for path, _, values in fields:
+            value = values[row]
             if value is not None:
-                _put(message, field.path, value)
+                _put(message, path, value)
         for name, codes in said.items():
             message[name] = WORDS[codes[row]]
             reason = reasons[name][row]
@@ -93,7 +95,17 @@ def _messages(
         yield time, encode(message)
 
 
+def _plain(series: Series, times: Integers) -> list[float | bool | str | None]:
+    """The values at these times as JSON has them; None: unknown."""
+    values = series.at(times).tolist()
+    if series.kind is Kind.NUMBER:
+        return [None if value != value else value for value in values]  # noqa: PLR0124  NaN alone differs
+    return [series.plain(value) for value in values]
+
+
 def _reasons(reasons: Mapping[int, str], changes: Integers, times: Integers) -> list[str | None]:
+    if not reasons:
+        return [None] * len(times)
     where = np.searchsorted(changes, times, "right") - 1
     return [reasons.get(at) for at in where.tolist()]
 

@@ -1,9 +1,9 @@
 """The live view: what a detector evaluates now, over Foxglove's WebSocket protocol.
 
-    evaluation ─▶ a tracer for each half second ─▶ queue ─▶ thread: messages ─▶ server ─▶ clients
+    evaluation ─▶ a tracer for each second ─▶ queue ─▶ thread: messages ─▶ server ─▶ clients
 
-The evaluation only hands tracers over. A subject's messages are made where somebody has subscribed to its channel.
-While nobody has, the view looks for new subjects from time to time.
+The evaluation only hands tracers over. Rules are looked at where somebody has subscribed to a channel of theirs; from
+time to time all are, since a subject has a channel once it was seen.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from wayside.rules import CompiledRule
 
 _log = logging.getLogger(__name__)
 
-_SLICE = 500_000_000
+_SLICE = 1_000_000_000
 """Nanoseconds of evaluation that are handed over at a time."""
 _SURVEY = 5_000_000_000
-"""Nanoseconds between two looks for new subjects while nobody has subscribed."""
+"""Nanoseconds between two looks for new subjects."""
 _WAITING = 8
 """Maximum number of slices that wait for the view's thread."""
-_NEW = 50
+_NEW = 200
 """Maximum number of channels that are opened with one slice."""
 _MOST = 1000
 """Maximum number of channels of subjects."""
@@ -69,7 +69,7 @@ class ViewError(InputError, OSError):
 
 
 class _Slice(NamedTuple):
-    """What was evaluated in half a second."""
+    """What was evaluated in a second."""
 
     tracer: Tracer
     rules: Mapping[str, CompiledRule]
@@ -105,11 +105,14 @@ class LiveView:
             raise ViewError(f"--foxglove: {host}:{port} cannot be served ({error}): give another port") from error
         self._tracer: Tracer | None = None
         self._since = 0
-        """When the tracer began, or the last one ended."""
+        """When the tracer began."""
+        self._surveyed = 0
+        """When new subjects were last looked for."""
         self._events: list[Event] = []
         self._dropped = 0
         self._slices: queue.Queue[_Slice | None] = queue.Queue(_WAITING)
         self._channels: dict[str, _Open] = {}
+        self._digests: dict[str, str] = {}
         self._full = False
         self._scene = Scene()
         self._episodes = foxglove.Channel(EPISODES, schema=EPISODE, message_encoding="json", context=self._context)
@@ -131,7 +134,7 @@ class LiveView:
 
     def losses(self) -> Iterator[Loss]:
         """What was not shown."""
-        what = "half seconds left out of the live view, its thread being too slow"
+        what = "seconds left out of the live view, its thread being too slow"
         yield Loss(what, self._dropped, cause="view_dropped")
 
     # The evaluation
@@ -146,12 +149,22 @@ class LiveView:
         """The engine has taken in what came, and these events happened."""
         self._events += events
         if self._tracer is None:
-            if self._subscriptions.topics or engine.now - self._since >= _SURVEY:
-                self._tracer, self._since = Tracer(), engine.now
+            self._tracer = self._next(engine.now)
         elif engine.now - self._since >= _SLICE:
             self._hand_over(self._tracer, engine)
-            self._tracer = Tracer() if self._subscriptions.topics else None
-            self._since = engine.now
+            self._tracer = self._next(engine.now)
+
+    def _next(self, now: int) -> Tracer | None:
+        """What looks on from now on; None where nobody has subscribed, and no new subject is looked for."""
+        topics = self._subscriptions.topics
+        self._since = now
+        if now - self._surveyed >= _SURVEY:
+            self._surveyed = now
+            return Tracer()
+        if not topics:
+            return None
+        rules = frozenset(topic.split("/")[2] for topic in topics - {EPISODES, LOG, SCENE})
+        return Tracer(rules, ways=SCENE in topics)
 
     def _hand_over(self, tracer: Tracer, engine: Engine) -> None:
         tracer.settle()
@@ -165,7 +178,7 @@ class LiveView:
 
     def _witness(self, rule: CompiledRule) -> Any:
         def saw(evaluated: Evaluated) -> None:
-            if self._tracer is not None:
+            if self._tracer is not None and self._tracer.looks_at(rule.name):
                 self._tracer.witnessed(rule).saw(evaluated)
 
         return saw
@@ -192,7 +205,7 @@ class LiveView:
             try:
                 self._show(each)
             except Exception:  # noqa: BLE001  an error here must cost the view alone
-                _log.exception("half a second is left out of the live view")
+                _log.exception("a second is left out of the live view")
                 self._dropped += 1
 
     def _show(self, shown: _Slice) -> None:
@@ -252,6 +265,9 @@ class LiveView:
     def _forget(self, rules: Mapping[str, CompiledRule]) -> None:
         """Close the channels of rules that are gone or changed."""
         digests = {name: rule.digest for name, rule in rules.items()}
+        if digests == self._digests:
+            return
+        self._digests = digests
         for topic, known in [*self._channels.items()]:
             if digests.get(known.rule) != known.digest:
                 known.channel.close()

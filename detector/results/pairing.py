@@ -98,9 +98,10 @@ class PairLog:
         for begin, end in itertools.pairwise(bounds):
             key, own = int(keys[begin]), slice(begin, end)
             clients = names[key >> _SHIFT], names[key & (1 << _SHIFT) - 1]
-            subject = SubjectTrace(rule, Subject(clients, self._track.element.name).text, clients)
-            if not wanted(rule, subject.subject):
+            text = Subject(clients, self._track.element.name).text
+            if not wanted(rule, text):
                 continue
+            subject = SubjectTrace(rule, text, clients)
             left = _left(ordinals[own], len(ticks))
             for name, column in values.items():
                 kind = self._kinds.get(name, Kind.NUMBER)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from detector.results.series import Doubles, Kind, Series, SubjectTrace
-from wayside.expressions import Path
+from wayside.expressions import Expression, Path
 from wayside.expressions.syntax import Call, Constant, Node, Select, path_of
 from wayside.rules import CompiledRule
 
@@ -53,7 +54,7 @@ def terms_of(rule: CompiledRule, subject: SubjectTrace) -> Terms:
     for field, expression in (("when", rule.when), ("until", rule.until)):
         if expression is None:
             continue
-        for operator, left, right in _comparisons(expression.tree):
+        for operator, left, right in _compared(expression):
             for term, other, sign in ((left, right, operator), (right, left, _TURNED[operator])):
                 limit, name = _constant(other, expression.names, values), _text(term, expression.names)
                 if limit is None or name is None or not set(_names(term, expression.names)) <= subject.signals.keys():
@@ -62,6 +63,12 @@ def terms_of(rule: CompiledRule, subject: SubjectTrace) -> Terms:
                 if name not in subject.signals and name not in computed:
                     computed[name] = _computed(term, expression.names, subject.signals)
     return Terms(tuple(thresholds), computed)
+
+
+@lru_cache(maxsize=1024)
+def _compared(expression: Expression) -> tuple[tuple[str, Node, Node], ...]:
+    """The comparisons of a condition. Decoding its tree takes longer than all that is done with it."""
+    return tuple(_comparisons(expression.tree))
 
 
 def _comparisons(node: Node) -> Iterator[tuple[str, Node, Node]]:

@@ -60,7 +60,10 @@ class _Plan(NamedTuple):
 class Tracer:
     """Looks on at a replay. The engine's observer; ask it for the trace at the end."""
 
-    def __init__(self) -> None:
+    def __init__(self, rules: frozenset[str] | None = None, *, ways: bool = True) -> None:
+        """`rules` are those that are looked at, None: all; `ways`: note where clients are."""
+        self._rules = rules
+        self._with_ways = ways
         self.engine: Engine | None = None
         """That of the replay, for what it counts."""
         self._plans: dict[int, _Plan] = {}
@@ -98,13 +101,15 @@ class Tracer:
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
         """Note what changes in a block of rules about clients."""
-        numbers = self._numbers_of(block.clients)
         self._time(block.ticks[0], block.ticks[-1])
         plan = self._plans.get(id(tracks))
         if plan is None:
             self.settle()  # rules that were evaluated otherwise until now
             plan = self._plans[id(tracks)] = self._plan(tracks)
-        if looked is None and not _has_texts(block):  # codes of texts may not last
+        if not plan.conditions:
+            return
+        numbers = self._numbers_of(block.clients)
+        if looked is None and not _has_texts(plan, block):  # codes of texts may not last
             plan.waiting.append(Waiting(block, codes, numbers))
             if sum(len(each.block.ticks) for each in plan.waiting) * len(numbers) >= _POINTS:
                 self._flush(plan)
@@ -143,6 +148,8 @@ class Tracer:
         self._time(block.ticks[0], block.ticks[-1])
         numbers = np.array([self._number(FLEET)], np.int64)
         for track, members, verdicts in zip(tracks, block.members, block.verdicts, strict=True):
+            if not self.looks_at(track.rule.name):
+                continue
             key = _key(track, "count")
             changes = self._signals.setdefault("/".join(key), Changes())
             self._aliases.setdefault((track.rule.name, track.element.name, "count"), {})["/".join(key)] = changes
@@ -164,11 +171,22 @@ class Tracer:
         """Note what a rule about pairs sees at a tick."""
         time = these.block.ticks[0]
         self._time(time, time)
+        if not self._with_ways and not self.looks_at(track.rule.name):
+            return
         numbers = self._numbers_of(these.block.clients)
+        if self.looks_at(track.rule.name):
+            self._pair(track, these, time, numbers)
+        if self._with_ways:
+            assert isinstance(track.rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
+            self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
+
+    def looks_at(self, rule: str) -> bool:
+        """Whether the rule is one of those that are looked at."""
+        return self._rules is None or rule in self._rules
+
+    def _pair(self, track: Track, these: PairBlock, time: int, numbers: Integers) -> None:
         log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
         log.add(time, these, numbers)
-        assert isinstance(track.rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
-        self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
 
     # What came of it
 
@@ -192,24 +210,26 @@ class Tracer:
 
     def _of_clients(self, found: dict[tuple[str, str], SubjectTrace], wanted: Wanted) -> None:
         subjects: dict[tuple[str, str | None, int], SubjectTrace] = {}
+        whole = [Subject(() if name == FLEET else (name,)) for name in self._names]
+        chosen: dict[tuple[str, str | None], NDArray[np.bool_]] = {}
         for (rule, element, field), changes in self._conditions.items():
             reasons = self._reasons[rule, element, field]
-            for client, times, values, _ in changes.by_client():
-                name = self._names[client]
-                clients = () if name == FLEET else (name,)
+            if (rule, element) not in chosen:
+                texts_of = (subject._replace(element=element).text for subject in whole)
+                chosen[rule, element] = np.array([wanted(rule, text) for text in texts_of], bool)
+            for client, times, values, _ in changes.by_client(chosen[rule, element]):
+                clients = whole[client].clients
                 text = Subject(clients, element).text
-                if not wanted(rule, text):
-                    continue
                 subject = found.setdefault((rule, text), SubjectTrace(rule, text, clients))
                 subjects[rule, element, client] = subject
                 subject.conditions[field] = _steps(times, values.astype(np.uint8), reasons, client)
         texts = tuple(self._texts)
         for (rule, element, signal), parts in self._aliases.items():
-            if (rule, element, signal) in self._odd:
+            if (rule, element, signal) in self._odd or (rule, element) not in chosen:
                 continue
             by_client: dict[int, list[Series]] = {}
             for changes in parts.values():
-                for client, times, values, tags in changes.by_client():
+                for client, times, values, tags in changes.by_client(chosen[rule, element]):
                     if (rule, element, client) in subjects:
                         by_client.setdefault(client, []).append(_series(times, values, tags, texts))
             for client, series in by_client.items():
@@ -219,7 +239,8 @@ class Tracer:
 
     def _plan(self, tracks: Sequence[Track]) -> _Plan:
         owners: dict[int, tuple[Track, str]] = {}
-        for track in tracks:
+        wanted = [track for track in tracks if self.looks_at(track.rule.name)]
+        for track in wanted:
             for name, at in track.signals.items():
                 if at not in owners or _key(track, name) < _key(*owners[at]):
                     owners[at] = track, name
@@ -227,7 +248,7 @@ class Tracer:
         for at, (track, name) in owners.items():
             changes = self._signals.setdefault("/".join(_key(track, name)), Changes())
             signals.append((at, track, name, changes))
-            for other in tracks:
+            for other in wanted:
                 for alias, place in other.signals.items():
                     if place == at:
                         parts = self._aliases.setdefault((other.rule.name, other.element.name, alias), {})
@@ -235,7 +256,7 @@ class Tracer:
         conditions = []
         for row, track in enumerate(tracks):
             for field, expression in (("when", track.rule.when), ("until", track.rule.until)):
-                if expression is not None:
+                if expression is not None and self.looks_at(track.rule.name):
                     key = (track.rule.name, track.element.name, field)
                     self._reasons.setdefault(key, {})
                     conditions.append((row, track, field, self._conditions.setdefault(key, Changes())))
@@ -324,8 +345,9 @@ class Tracer:
         self._end = max(self._end, last)
 
 
-def _has_texts(block: Block) -> bool:
-    return any(column.tags is not None and bool((column.tags == Tag.TEXT).any()) for column in block.signals)
+def _has_texts(plan: _Plan, block: Block) -> bool:
+    tags = (block.signals[at].tags for at, _, _, _ in plan.signals)
+    return any(each is not None and bool((each == Tag.TEXT).any()) for each in tags)
 
 
 def _key(track: Track, name: str) -> tuple[str, str, str]:
@@ -342,6 +364,8 @@ def _steps(times: Integers, codes: Bytes, reasons: Mapping[tuple[int, int], str]
 
 
 def _series(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str]) -> Series:
+    if (tags == Tag.NUMBER).all():
+        return Series(times, values)
     known = (tags != Tag.ABSENT) & (tags != Tag.UNREACHABLE)
     kinds = {Tag.BOOLEAN: Kind.BOOLEAN, Tag.TEXT: Kind.TEXT}
     kind = next((kinds[tag] for tag in kinds if (tags == tag).any()), Kind.NUMBER)
