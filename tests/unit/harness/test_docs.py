@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+from application_manager.core.findings import checks as manager_checks
 from detector import findings as detector_checks
 from tests.guides import ROOT, guide
 
@@ -38,8 +39,11 @@ def test_links_between_pages_lead_to_files() -> None:
 
 
 def test_findings_are_documented_with_their_severities() -> None:
-    rows = [f"| `{each.name}` | {each.severity} | {each.meaning} |" for each in detector_checks.CHECKS]
-    section = guide("findings").partition("\n## `detector check`\n")[2].partition("\n## ")[0]
-    assert [line for line in section.splitlines() if line.startswith("| `")] == rows
-    names = [each.name for each in detector_checks.CHECKS]
-    assert len(set(names)) == len(names)
+    for command, checks in (
+        ("detector check", detector_checks.CHECKS),
+        ("application-manager check", manager_checks.CHECKS),
+    ):
+        rows = [f"| `{each.name}` | {each.severity} | {each.meaning} |" for each in checks]
+        section = guide("findings").partition(f"\n## `{command}`\n")[2].partition("\n## ")[0]
+        assert [line for line in section.splitlines() if line.startswith("| `")] == rows
+        assert len({each.name for each in checks}) == len(checks)
