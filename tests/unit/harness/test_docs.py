@@ -13,7 +13,7 @@ from tests.guides import ROOT, guide
 TROUBLES = guide("troubleshooting")
 DECISIONS = ROOT / "docs/decisions"
 STATUS = re.compile(r"(?:Accepted|Superseded by \[\d+\]\(\d{4}-[a-z0-9-]+\.md\)), \d{4}-\d\d-\d\d")
-LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
+LINK = re.compile(r"\]\((?!https?:)([^)#\s<]+)[)#]")
 
 
 def test_decisions_are_numbered_without_gaps_and_the_index_lists_each_with_its_status() -> None:
@@ -50,6 +50,13 @@ def test_findings_are_documented_with_their_severities() -> None:
         section = guide("findings").partition(f"\n## `{command}`\n")[2].partition("\n## ")[0]
         assert [line for line in section.splitlines() if line.startswith("| `")] == rows
         assert len({each.name for each in checks}) == len(checks)
+
+
+def test_files_that_contributing_names_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:wayside|detector|application_manager|tests|docs|crds|benchmarks)/[\w./]*)`", text)
+    assert len(named) > 20
+    assert [each for each in named if not (ROOT / each).exists()] == []
 
 
 def test_what_troubleshooting_quotes_occurs_in_the_code() -> None:
