@@ -3,7 +3,7 @@
 kopf keeps a task and a queue for each object that has news, and the object itself with them. For handlers that do no
 more than put an object into a cache, that is most of the time and the memory that the news take. So kopf keeps the
 watches up (connections, retries, versions that are too old), and sees of each event its version. Its lists are ours: it
-learns the version to watch from, and we list what is there after that. docs/decisions/0032 has the details.
+learns the version to watch from, and we list what is there after that. docs/decisions/0027 has the details.
 """
 
 from __future__ import annotations
