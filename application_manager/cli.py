@@ -285,9 +285,14 @@ def render(
 
 @app.command()
 def check(
-    files: Annotated[list[Path], typer.Argument(help="YAML files or folders.")],
+    files: Annotated[list[Path] | None, typer.Argument(help="YAML files or folders.")] = None,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
+    ignore: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Do not report the warnings of this name; may be repeated."),
+    ] = None,
+    listing: Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")] = False,
 ) -> None:
     """Say of templates, rules and detectors what the webhook would say, without a cluster.
 
@@ -295,12 +300,21 @@ def check(
     """
     with importing():
         from application_manager.commands.checking import check_files
+        from application_manager.core.findings.checks import CHECKS, UNREADABLE_FILE
         from wayside.api.documents import DocumentError
+        from wayside.findings import ignorable, listed
 
+    if listing:
+        typer.echo("\n".join(listed(CHECKS)))
+        raise typer.Exit
+    if not files:
+        commandline.refuse("give YAML files or folders, or --list")
+    ignored = ignorable(ignore or (), CHECKS)
     try:
-        checked = check_files(files, policy_of(allowed_kinds, service_accounts))
+        checked = check_files(files, policy_of(allowed_kinds, service_accounts), ignored)
     except DocumentError as error:
-        typer.echo(str(error), err=True)
+        for problem in error.problems:
+            typer.echo(f"{problem} [{UNREADABLE_FILE.name}]", err=True)
         raise typer.Exit(1) from None
     for line in checked.problems:
         typer.echo(line, err=True)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
+from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
 from application_manager.core.objects.policy import KindKey
@@ -28,6 +29,7 @@ from application_manager.workers.process import Job
 from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
+from wayside.findings import Finding
 from wayside.rules import depends
 
 AT_ONCE = 8
@@ -118,7 +120,8 @@ class Admission:
                     await self._look_up(TEMPLATE, rule.namespace)
         except (ApiError, Unreachable, TimeoutError) as error:
             log.warning("EventRule %s/%s is judged by what is known: %s", rule.namespace, rule.name, error)
-            return Findings((), findings.faults, findings.remarks)
+            problems = (Finding(INVALID_RULE.name, each, rule.name) for each in findings.problems)
+            return Findings((), (*problems, *findings.doubts), findings.remarks)
         return await self._judged(rule)
 
     async def _judged(self, rule: EventRule) -> Findings:
@@ -139,14 +142,15 @@ class Admission:
         """What is wrong with the detector; that rules of it no longer compile is a remark, since they may follow."""
         before = old if isinstance(old, Detector) else None
         findings = await self._run(detector.namespace, DetectorJob(detector))
-        remarks: list[str] = []
+        remarks: list[Finding] = []
         until = time.monotonic() + LOOKING_AT_RULES
         rules = self.world.models(EVENT_RULE, EventRule, detector.namespace)
         for first in range(0, len(rules), _RULES_AT_ONCE):
             some = rules[first : first + _RULES_AT_ONCE]
             remarks += (await self._run(detector.namespace, DetectorJob(detector, before, some))).remarks
             if time.monotonic() > until and first + _RULES_AT_ONCE < len(rules):
-                remarks.append("not all of its rules were looked at: their statuses will say whether they are in order")
+                unseen = "not all of its rules were looked at: their statuses will say whether they are in order"
+                remarks.append(Finding(BROKEN_RULE.name, unseen))
                 break
         return replace(findings, remarks=tuple(remarks))
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from application_manager.core.findings.checks import INVALID_DETECTOR, INVALID_RULE, INVALID_TEMPLATE
 from application_manager.core.findings.demanding import deploy_remarks
 from application_manager.core.findings.findings import Findings, field_of
 from application_manager.core.findings.rulefindings import detector_findings, rule_findings
@@ -14,6 +15,13 @@ from application_manager.core.objects.policy import Policy
 from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.api.base import Kind
 from wayside.api.documents import Document, FieldPath, field_text, load_documents
+from wayside.findings import Check, Finding
+
+_INVALID: Mapping[type[Kind], Check] = {
+    ApplicationTemplate: INVALID_TEMPLATE,
+    Detector: INVALID_DETECTOR,
+    EventRule: INVALID_RULE,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +39,10 @@ class Checked:
     looked_at: int = 0
 
 
-def check_files(paths: Iterable[Path], policy: Policy) -> Checked:
+def check_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = frozenset()) -> Checked:
     """Look at the templates, rules and detectors in the files, each with all others of its namespace among them.
+
+    Warnings whose names are in `ignored`, or in the annotation of their object, are left out.
 
     Raises DocumentError for files that cannot be read as our kinds.
     """
@@ -40,8 +50,8 @@ def check_files(paths: Iterable[Path], policy: Policy) -> Checked:
     found = {index: _findings(each.object, documents, policy) for index, each in enumerate(documents)}
     judged = [(documents[index], each) for index, each in found.items() if each is not None]
     return Checked(
-        [line for document, findings in judged for line in _lines(document, findings.problems)],
-        [line for document, findings in judged for line in _lines(document, findings.warnings)],
+        [line for document, findings in judged for line in _lines(document, _errors(document, findings))],
+        [line for document, findings in judged for line in _lines(document, _warnings(document, findings, ignored))],
         len(judged),
     )
 
@@ -64,13 +74,23 @@ def _findings(about: Kind, documents: Sequence[Document], policy: Policy) -> Fin
     return None
 
 
-def _lines(document: Document, findings: Iterable[str]) -> list[str]:
+def _errors(document: Document, findings: Findings) -> Iterable[Finding]:
+    name = _INVALID[type(document.object)].name
+    return (Finding(name, each) for each in findings.problems)
+
+
+def _warnings(document: Document, findings: Findings, ignored: Set[str]) -> Iterable[Finding]:
+    found = dict.fromkeys((*findings.doubts, *findings.remarks))
+    return (each for each in found if each.check not in ignored and not document.ignores(each.check))
+
+
+def _lines(document: Document, findings: Iterable[Finding]) -> list[str]:
     marks = {field_text(path): path for path in document.marks}
     what = f"{type(document.object).__name__} {document.object.name}"
     lines = []
     for finding in findings:
-        problem = document.problem(_path(field_of(finding), marks), finding)
-        lines.append(f"{problem.file}:{problem.line}:{problem.column}: {what}: {finding}")
+        problem = document.problem(_path(field_of(finding.text), marks), finding.text)
+        lines.append(f"{problem.file}:{problem.line}:{problem.column}: {what}: {finding} [{finding.check}]")
     return lines
 
 

@@ -28,6 +28,7 @@ from application_manager.knowledge.placebook import PlaceBook
 from application_manager.knowledge.podbook import PodBook
 from application_manager.knowledge.turnbook import TurnBook
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
+from wayside.findings import ignored_by
 
 Model = TypeVar("Model", bound=Kind)
 
@@ -39,6 +40,10 @@ DETECTOR: Final[KindKey] = (API_VERSION, "Detector")
 OWN_KINDS: Final = (TEMPLATE, INSTANCE, TASK, DETECTOR, EVENT_RULE)
 POD: Final[KindKey] = ("v1", "Pod")
 LEASE: Final[KindKey] = ("coordination.k8s.io/v1", "Lease")
+
+
+_Version = tuple[str, int, frozenset[str]]
+"""Of a template: its uid, its generation, and the warnings that its annotation ignores."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +106,7 @@ class World:
     places: PlaceBook = field(init=False)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
     exceeded: dict[Name, dict[Name, str]] = field(default_factory=dict)
-    _findings: dict[Name, tuple[tuple[str, int], Findings]] = field(default_factory=dict)
+    _findings: dict[Name, tuple[_Version, Findings]] = field(default_factory=dict)
 
     def __post_init__(self, full: Callable[[], bool], tasks: TaskPolicy | None) -> None:
         self.store = Store(OWN_KINDS, full)
@@ -286,5 +291,6 @@ class World:
         self.overlap.forget(name)
 
 
-def _version(template: ApplicationTemplate) -> tuple[str, int]:
-    return template.metadata.uid, template.metadata.generation
+def _version(template: ApplicationTemplate) -> _Version:
+    metadata = template.metadata
+    return metadata.uid, metadata.generation, ignored_by(metadata.annotations)

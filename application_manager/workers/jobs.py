@@ -24,6 +24,7 @@ from application_manager.core.statuses.rulestatus import detector_status, rule_s
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Detector, EventRule
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
+from wayside.findings import Finding
 
 _COMPILED = 64  # templates that a process keeps compiled
 
@@ -142,7 +143,7 @@ class RuleJob:
         found = rule_findings(self.rule, self.among.detectors, self.among.invalid_detectors, self.among.rules)
         return replace(found, remarks=tuple(self.remarks()))
 
-    def remarks(self) -> list[str]:
+    def remarks(self) -> list[Finding]:
         """What the rule's tasks would be refused for."""
         return deploy_remarks(self.rule, self.among.templates, self.among.invalid_templates)
 

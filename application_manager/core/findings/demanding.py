@@ -11,13 +11,17 @@ import json
 from collections.abc import Iterable, Iterator
 
 from application_manager.core.claims import parameters
+from application_manager.core.findings.checks import DEPLOY_PARAMETERS, UNKNOWN_TEMPLATE
 from wayside.api import ApplicationTemplate, EventRule
 from wayside.api.actions.deploy import Deploy
 from wayside.api.operation import Operation
+from wayside.findings import Finding, ignored_by
 
 
-def deploy_remarks(rule: EventRule, templates: Iterable[ApplicationTemplate], invalid: Iterable[str] = ()) -> list[str]:
-    """What the tasks of the rule would be refused for.
+def deploy_remarks(
+    rule: EventRule, templates: Iterable[ApplicationTemplate], invalid: Iterable[str] = ()
+) -> list[Finding]:
+    """What the tasks of the rule would be refused for, without what its annotation ignores.
 
     Args:
         rule: the rule.
@@ -25,7 +29,7 @@ def deploy_remarks(rule: EventRule, templates: Iterable[ApplicationTemplate], in
         invalid: the names of its namespace's other templates.
     """
     known, others = {each.name: each for each in templates}, set(invalid)
-    found: list[str] = []
+    found: list[Finding] = []
     for index, action in enumerate(rule.spec.actions):
         if action.deploy is None or action.deploy.template in others:
             continue
@@ -34,13 +38,15 @@ def deploy_remarks(rule: EventRule, templates: Iterable[ApplicationTemplate], in
         if template is None:
             close = difflib.get_close_matches(action.deploy.template, [*known, *others], n=1)
             remedy = f"did you mean {close[0]}?" if close else "create it, or tasks of this rule are refused"
-            found.append(
-                f"{where}.template: there is no ApplicationTemplate {action.deploy.template} in namespace "
-                f"{rule.namespace}: {remedy}"
+            missing = (
+                f"there is no ApplicationTemplate {action.deploy.template} in namespace {rule.namespace}: {remedy}"
             )
+            found.append(Finding(UNKNOWN_TEMPLATE.name, f"{where}.template: {missing}", rule.name))
         else:
-            found += _of_parameters(action.deploy, template, f"{where}.parameters")
-    return found
+            for each in _of_parameters(action.deploy, template, f"{where}.parameters"):
+                found.append(Finding(DEPLOY_PARAMETERS.name, each, rule.name))
+    ignored = ignored_by(rule.metadata.annotations)
+    return [each for each in found if each.check not in ignored]
 
 
 def _of_parameters(deploy: Deploy, template: ApplicationTemplate, where: str) -> Iterator[str]:

@@ -8,12 +8,14 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from wayside.findings import Finding
+
 _FIELD = re.compile(r"^((?:spec|metadata)\b.*?)(?:, line \d+, column \d+)?: ")
 
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """Texts that each name the field, the value and the remedy.
+    """Findings whose texts each name the field, the value and the remedy.
 
     Attributes:
         problems: what is wrong with the object itself, given what is there.
@@ -24,23 +26,27 @@ class Findings:
     """
 
     problems: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
+    remarks: tuple[Finding, ...] = ()
 
     @property
     def faults(self) -> tuple[str, ...]:
         """All that keeps the object from being used, each once."""
-        return tuple(dict.fromkeys((*self.problems, *self.doubts)))
+        return _texts(*self.problems, *self.doubts)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """All that is no reason to refuse it, each once."""
-        return tuple(dict.fromkeys((*self.doubts, *self.remarks)))
+        return _texts(*self.doubts, *self.remarks)
 
     @property
     def all(self) -> tuple[str, ...]:
         """Everything, each once."""
-        return tuple(dict.fromkeys((*self.problems, *self.doubts, *self.remarks)))
+        return _texts(*self.problems, *self.doubts, *self.remarks)
+
+
+def _texts(*findings: str | Finding) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(map(str, findings)))
 
 
 def field_of(finding: str) -> str:

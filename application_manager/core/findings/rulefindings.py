@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from application_manager.core.findings.checks import BROKEN_RULE, RULE_NOT_READY, RULE_NOT_SELECTED
 from application_manager.core.findings.findings import Findings
 from wayside.api import Detector, EventRule
+from wayside.findings import Finding
 from wayside.rules import (
     RuleError,
     RuleProblem,
@@ -45,7 +47,8 @@ def rule_findings(
     """
     judges = selecting(rule, detectors)
     if not judges:
-        return Findings(tuple(map(str, own_problems(rule))), (_not_selected(rule, detectors, invalid),))
+        unselected = Finding(RULE_NOT_SELECTED.name, _not_selected(rule, detectors, invalid), rule.name)
+        return Findings(tuple(map(str, own_problems(rule))), (unselected,))
     having: dict[RuleProblem, list[str]] = {}  # problem → detectors with which the rule has it
     passing: set[RuleProblem] = set()
     for detector in judges:
@@ -58,10 +61,13 @@ def rule_findings(
     # A rule that one detector can evaluate is a good one.
     refused = {name for each in own for name in having[each]} == {each.name for each in judges}
     problems: list[str] = []
-    doubts: list[str] = []
+    doubts: list[Finding] = []
     for problem, names in having.items():
         whose = "" if len(names) == len(judges) else f"with Detector {', '.join(names)}: "
-        (problems if refused and problem in own else doubts).append(f"{whose}{problem}")
+        if refused and problem in own:
+            problems.append(f"{whose}{problem}")
+        else:
+            doubts.append(Finding(RULE_NOT_READY.name, f"{whose}{problem}", rule.name))
     return Findings(tuple(problems), tuple(doubts))
 
 
@@ -73,7 +79,7 @@ def detector_findings(detector: Detector) -> Findings:
     return Findings((*problems, *map(str, source_problems(detector))))
 
 
-def newly_wrong(rule: EventRule, new: Detector, old: Detector | None) -> tuple[str, ...]:
+def newly_wrong(rule: EventRule, new: Detector, old: Detector | None) -> tuple[Finding, ...]:
     """What is wrong with a rule, which is in order as far as others are concerned, since its detector is as `new`.
 
     Nothing where the detector does not select it, or where all was wrong with the `old` one as well, None if it is new.
@@ -84,7 +90,7 @@ def newly_wrong(rule: EventRule, new: Detector, old: Detector | None) -> tuple[s
     if problems and old is not None and selects(old, rule):
         known = set(_compiled(rule, old, ()))
         problems = [each for each in problems if each not in known]
-    return tuple(f"EventRule {rule.name}, {problem}" for problem in problems)
+    return tuple(Finding(BROKEN_RULE.name, f"EventRule {rule.name}, {each}", rule.name) for each in problems)
 
 
 def _compiled(rule: EventRule, detector: Detector, known: Sequence[RuleProblem]) -> Sequence[RuleProblem]:

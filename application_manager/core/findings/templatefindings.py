@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 from application_manager.core.claims import claims, parameters
+from application_manager.core.findings.checks import FAILING_EXAMPLE
 from application_manager.core.findings.examples import Example, examples, is_open
 from application_manager.core.findings.findings import Findings, field_of
 from application_manager.core.objects.charts import ChartObjects, ChartOutcome, ChartRequest
@@ -22,6 +23,7 @@ from wayside.api.base import Metadata
 from wayside.api.parameter import Parameter, ParameterType
 from wayside.expressions import Environment, InterpolationError, Kind, compile_template
 from wayside.expressions.syntax import Path
+from wayside.findings import Finding, ignored_by
 
 _KINDS: Mapping[ParameterType, Kind] = {
     ParameterType.STRING: Kind.STRING,
@@ -88,7 +90,7 @@ def _texts(template: ApplicationTemplate) -> Iterator[tuple[str, Any]]:
 
 def _on_examples(template: ApplicationTemplate, policy: Policy) -> Findings:
     problems: list[str] = []
-    remarks: list[str] = []
+    remarks: list[Finding] = []
     loose = _without_patterns(template)
     renderer = Renderer(loose, policy)
     reads = [(each.path, each.expression.paths) for each in renderer.embedded]
@@ -99,7 +101,9 @@ def _on_examples(template: ApplicationTemplate, policy: Policy) -> Findings:
             if not read & example.made_up:
                 problems.append(problem)
             elif not read & unguessable & example.given.keys():
-                remarks.append(f"{problem}; so it is {example.said}")
+                remarks.append(Finding(FAILING_EXAMPLE.name, f"{problem}; so it is {example.said}"))
+    if FAILING_EXAMPLE.name in ignored_by(template.metadata.annotations):
+        remarks.clear()
     return Findings(tuple(dict.fromkeys(problems)), remarks=tuple(dict.fromkeys(remarks)))
 
 

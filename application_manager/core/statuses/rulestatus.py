@@ -19,6 +19,7 @@ from application_manager.core.statuses.running import RUNNING
 from wayside.api import Detector, EventRule
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
+from wayside.findings import Finding
 
 Status = TypeVar("Status", EventRuleStatus, DetectorStatus)
 
@@ -35,7 +36,7 @@ def rule_status(
     now: float,
     invalid: Sequence[str] = (),
     others: Sequence[EventRule] = (),
-    remarks: Sequence[str] = (),
+    remarks: Sequence[Finding] = (),
 ) -> EventRuleStatus:
     """The rule's status.
 
@@ -102,11 +103,11 @@ def unreadable_status(status: Status, reason: str, problem: str, generation: int
 def _rule_aspect(findings: Findings, selected: bool) -> Aspect:
     if selected or findings.problems:
         return _aspect(findings, RULE_INVALID)
-    return Aspect("Accepted", False, "NotSelected", "; ".join(findings.doubts))
+    return Aspect("Accepted", False, "NotSelected", "; ".join(map(str, findings.doubts)))
 
 
 def _aspect(findings: Findings, reason: str) -> Aspect:
     if findings.faults:
         return Aspect("Accepted", False, reason, "; ".join(findings.faults))
-    but = f"; but {'; '.join(findings.remarks)}" if findings.remarks else ""
+    but = f"; but {'; '.join(map(str, findings.remarks))}" if findings.remarks else ""
     return Aspect("Accepted", True, "Accepted", f"nothing is wrong, {_AS_FAR_AS}{but}")

@@ -294,7 +294,7 @@ def template_status(
     if findings.problems:
         accepted = Aspect("Accepted", False, TEMPLATE_INVALID, "; ".join(findings.problems))
     else:
-        but = f", but {'; '.join(findings.remarks)}" if findings.remarks else ""
+        but = f", but {'; '.join(map(str, findings.remarks))}" if findings.remarks else ""
         accepted = Aspect("Accepted", True, "Accepted", f"the template can be rendered{but}")
     return ApplicationTemplateStatus(
         observed_generation=generation,

@@ -202,12 +202,21 @@ def test_check_says_where_in_the_files_what_would_be_refused_is(
     code, _, said = command("check", str(file))
     assert code == 1
     assert f"{file}:5:8: ApplicationTemplate app: spec.key" in said
+    assert "[invalid-template]" in said
     assert "regoin" in said
     assert "warning: " in said
     assert "no valid Detector in namespace default selects the rule" in said
     file.write_text(file.read_text().replace("regoin", "region"))
     code, _, said = command("check", str(file))
     assert (code, said.splitlines()[-1]) == (0, "2 looked at: nothing that would be refused")
+    assert [line.rpartition(" ")[2] for line in said.splitlines()[:-1]] == ["[failing-example]", "[rule-not-selected]"]
+    alone = (0, "", "2 looked at: nothing that would be refused\n")
+    ignoring = ("--ignore", "rule-not-selected", "--ignore", "failing-example")
+    assert command("check", str(file), *ignoring) == alone
+    annotation = "annotations: {wayside.dev/ignore-findings: rule-not-selected}"
+    file.write_text(file.read_text().replace("{name: fast}", f"{{name: fast, {annotation}}}"))
+    assert command("check", str(file), *ignoring[2:]) == alone
+    assert command("check", str(file), "--ignore", "invalid-rule")[0] == 2
 
 
 def test_check_finds_nothing_that_would_be_refused_in_the_examples(

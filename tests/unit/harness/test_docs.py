@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Iterator
 
+from application_manager.core.findings import checks as manager_checks
 from detector import findings as detector_checks
 from tests.guides import ROOT, guide
 
+TROUBLES = guide("troubleshooting")
 DECISIONS = ROOT / "docs/decisions"
 STATUS = re.compile(r"(?:Accepted|Superseded by \[\d+\]\(\d{4}-[a-z0-9-]+\.md\)), \d{4}-\d\d-\d\d")
-LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
+LINK = re.compile(r"\]\((?!https?:)([^)#\s<]+)[)#]")
 
 
 def test_decisions_are_numbered_without_gaps_and_the_index_lists_each_with_its_status() -> None:
@@ -38,8 +42,65 @@ def test_links_between_pages_lead_to_files() -> None:
 
 
 def test_findings_are_documented_with_their_severities() -> None:
-    rows = [f"| `{each.name}` | {each.severity} | {each.meaning} |" for each in detector_checks.CHECKS]
-    section = guide("findings").partition("\n## `detector check`\n")[2].partition("\n## ")[0]
-    assert [line for line in section.splitlines() if line.startswith("| `")] == rows
-    names = [each.name for each in detector_checks.CHECKS]
-    assert len(set(names)) == len(names)
+    for command, checks in (
+        ("detector check", detector_checks.CHECKS),
+        ("application-manager check", manager_checks.CHECKS),
+    ):
+        rows = [f"| `{each.name}` | {each.severity} | {each.meaning} |" for each in checks]
+        section = guide("findings").partition(f"\n## `{command}`\n")[2].partition("\n## ")[0]
+        assert [line for line in section.splitlines() if line.startswith("| `")] == rows
+        assert len({each.name for each in checks}) == len(checks)
+
+
+def test_files_that_contributing_names_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:wayside|detector|application_manager|tests|docs|crds|benchmarks)/[\w./]*)`", text)
+    assert len(named) > 20
+    assert [each for each in named if not (ROOT / each).exists()] == []
+
+
+def test_what_troubleshooting_quotes_occurs_in_the_code() -> None:
+    """A quoted word is a whole string or a member of an enum; a quote with spaces or … is a part of one string."""
+    strings = set(_strings())
+    quotes = [
+        quote
+        for row in re.findall(r"^\| (?!you see)(.*?) \| ", TROUBLES, re.MULTILINE)
+        for quote in re.findall(r"`([^`]+)`", row)
+    ]
+    assert len(quotes) > 60
+    unknown = [quote for quote in quotes if not _occurs(quote, strings)]
+    assert not unknown
+
+
+def test_each_symptom_of_troubleshooting_has_commands_and_remedies_and_is_listed() -> None:
+    listed = re.findall(r"\[([^]]+)\]\(#([a-z-]+)\)", TROUBLES.partition("\n## ")[0])
+    sections = TROUBLES.split("\n## ")[1:]
+    assert [name for name, _ in listed] == [section.partition("\n")[0] for section in sections]
+    assert all(anchor == name.lower().replace(" ", "-") for name, anchor in listed)
+    for section in sections:
+        assert "```console\n$ " in section, section
+        assert "\n| you see | it means | do |\n" in section, section
+
+
+def _occurs(quote: str, strings: set[str]) -> bool:
+    if " " not in quote and "…" not in quote:
+        return quote.removesuffix("_total") in strings
+    parts = [part.strip() for part in quote.split("…")]
+    return any(all(part in each for part in parts) for each in strings)
+
+
+def _strings() -> Iterator[str]:
+    """All strings of the programs, with … for what an f-string inserts, and the members of all enums."""
+    for file in (
+        file for each in ("detector", "application_manager", "wayside") for file in (ROOT / each).rglob("*.py")
+    ):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            match node:
+                case ast.Constant(value=str(text)):
+                    yield text
+                case ast.JoinedStr(values=values):
+                    yield "".join(str(each.value) if isinstance(each, ast.Constant) else "…" for each in values)
+                case ast.ClassDef(body=body):
+                    for each in body:
+                        if isinstance(each, ast.Assign) and isinstance(each.targets[0], ast.Name):
+                            yield each.targets[0].id.lower()

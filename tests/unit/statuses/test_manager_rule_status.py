@@ -17,6 +17,7 @@ from application_manager.work.rulework import RuleWork
 from tests.inprocess import InProcess
 from tests.unit.manager_objects import NOW
 from wayside.api import API_VERSION, Detector, EventRule
+from wayside.findings import Finding
 
 
 def rule(**spec: Any) -> EventRule:
@@ -152,7 +153,9 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
 
 
 def test_what_may_go_wrong_with_a_good_rule_is_said_and_it_stays_accepted() -> None:
-    condition = rule_status(rule(), [detector()], NOW, remarks=["there is no template"]).conditions[0]
+    condition = rule_status(
+        rule(), [detector()], NOW, remarks=[Finding("unknown-template", "there is no template")]
+    ).conditions[0]
     assert condition.status == "True"
     assert condition.message.endswith("; but there is no template")
 

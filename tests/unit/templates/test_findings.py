@@ -14,6 +14,7 @@ from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import MOST_EXPRESSIONS
 from tests.unit.manager_objects import DEPLOYMENT, template
 from wayside.api import Detector, EventRule
+from wayside.findings import IGNORE_ANNOTATION
 
 REGION = {"region": {"type": "string", "required": True}}
 
@@ -50,7 +51,7 @@ def test_a_rule_that_a_detector_can_evaluate_has_nothing_wrong() -> None:
 def test_what_the_rule_alone_has_is_a_problem_also_without_a_detector() -> None:
     found = rule_findings(rule(when="sped > 3"), [])
     assert [part in found.problems[0] for part in ("spec.when", "column 1", "sped")] == [True] * 3
-    assert "create a Detector" in found.doubts[0]
+    assert "create a Detector" in str(found.doubts[0])
     assert not rule_findings(rule(), []).problems
 
 
@@ -75,13 +76,13 @@ def test_a_stream_that_no_selecting_detector_has_is_a_problem_and_one_that_some_
     assert "no stream pose" in rule_findings(rule(), [blind]).problems[0]
     found = rule_findings(rule(), [detector(), blind])
     assert not found.problems
-    assert found.doubts[0].startswith("with Detector blind: spec.signals[0].stream")
+    assert str(found.doubts[0]).startswith("with Detector blind: spec.signals[0].stream")
 
 
 def test_a_rule_that_is_not_there_yet_is_a_doubt_and_a_circle_a_problem() -> None:
     missing = rule_findings(counting("many", "fast"), [detector()])
     assert not missing.problems
-    assert "there is no rule fast" in missing.doubts[0]
+    assert "there is no rule fast" in str(missing.doubts[0])
     assert not rule_findings(counting("many", "fast"), [detector()], (), [rule()]).all
     circle = rule_findings(counting("many", "fast"), [detector()], (), [counting("fast", "many")])
     assert "circle" in circle.problems[0]
@@ -92,7 +93,7 @@ def test_what_stands_in_a_detectors_field_is_no_problem_of_the_rule() -> None:
     client = {"name": "car", "parameters": {"fast": {"limti": 3}}}
     found = rule_findings(rule(parameters={"limit": 2}), [detector(clients=[client])])
     assert not found.problems
-    assert found.doubts[0].startswith("Detector det: spec.clients[0].parameters.fast.limti")
+    assert str(found.doubts[0]).startswith("Detector det: spec.clients[0].parameters.fast.limti")
 
 
 def test_a_detectors_own_streams_are_looked_at() -> None:
@@ -138,13 +139,14 @@ def test_what_no_task_can_put_right_is_a_problem_of_the_template(spec: dict[str,
 
 def test_what_depends_on_what_tasks_give_is_a_remark_that_says_so() -> None:
     declared = {**REGION, "lane": {"type": "string"}}
-    found = template_findings(
-        template(parameters=declared, manifests=[container(args=["l=${parameters.lane}"])]), Policy()
-    )
+    made = template(parameters=declared, manifests=[container(args=["l=${parameters.lane}"])])
+    found = template_findings(made, Policy())
     assert not found.problems
     assert len(found.remarks) == 1
     for part in ("args[0]", "`parameters.lane` is null", "where tasks give only region"):
-        assert part in found.remarks[0]
+        assert part in str(found.remarks[0])
+    metadata = made.metadata.model_copy(update={"annotations": {IGNORE_ANNOTATION: "failing-example"}})
+    assert not template_findings(made.model_copy(update={"metadata": metadata}), Policy()).all
 
 
 @pytest.mark.parametrize(
@@ -208,7 +210,9 @@ def deploying(of: str = "app", operation: str = "Deploy", **parameters: Any) -> 
 def test_what_tasks_of_a_rule_would_be_refused_for_is_a_remark(asked: EventRule, parts: list[str]) -> None:
     app = template(parameters={**REGION, "rate": {"type": "number", "maximum": 50}})
     (found,) = deploy_remarks(asked, [app])
-    assert [part for part in parts if part not in found] == []
+    assert [part for part in parts if part not in str(found)] == []
+    metadata = asked.metadata.model_copy(update={"annotations": {IGNORE_ANNOTATION: f"x, {found.check}"}})
+    assert not deploy_remarks(asked.model_copy(update={"metadata": metadata}), [app])
 
 
 def test_what_a_template_takes_is_not_remarked_on() -> None:
