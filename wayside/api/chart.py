@@ -36,23 +36,26 @@ class Helm(Model):
         max_length=512,
         # No `-` at the beginning: it is an argument of a program.
         pattern=r"^(oci://[a-zA-Z0-9][^ ?#@]*|/[^ ]+|[a-zA-Z0-9][a-zA-Z0-9._-]*)$",
-        description="oci://… of a registry, a name in `repository`, or a path in the manager's image.",
+        description="The chart: an OCI reference (oci://…), the name of a chart in `repository`, or an absolute path "
+        "in the manager's image.",
     )
     version: str | None = Field(
         default=None,
         max_length=128,
         pattern=_VERSION,
-        description="The exact version, not a range: the same template must always give the same objects.",
+        description="The exact version of the chart. Ranges are not allowed: the same template must always render the "
+        "same objects. Required unless chart is a path.",
     )
     repository: str | None = Field(
         default=None,
         max_length=512,
         pattern=r"^https?://[^ ]+$",
-        description="The URL of the chart repository, for a chart given by its name.",
+        description="The URL of the chart repository. Only for a chart given by name.",
     )
     values: dict[str, Any] = Field(
         default_factory=dict,
-        description="The chart's values, with ${…} over parameters and instance (name, key, namespace, configMap).",
+        description="The values of the chart, with ${…} over parameters and instance (name, key, namespace, "
+        "configMap).",
         json_schema_extra={"x-kubernetes-preserve-unknown-fields": True},
     )
 

@@ -24,21 +24,19 @@ class Evaluation(Model):
 
     every: Duration | None = Field(
         default=None,
-        description="The rule is evaluated at each whole multiple of this; 10ms at the least. Default: 1s.",
+        description="Evaluate the rule at whole multiples of this period, 10ms or more. Default: 1s.",
     )
     on_sample: ObjectName | None = Field(
         default=None,
-        description="The rule is evaluated with each sample of this stream, for the subjects that its client belongs "
-        "to, and when a for, a cooldown or the unknownTimeout is over.",
+        description="Evaluate the rule at each sample of this stream, for the subjects of the sample's client, and "
+        "whenever a `for`, a cooldown or an unknownTimeout expires.",
     )
-    on_demand: bool | None = Field(
-        default=None, description="true: the rule is evaluated only when somebody asks for it."
-    )
+    on_demand: bool | None = Field(default=None, description="If true, evaluate the rule only on request.")
     priority: int = Field(
         default=0,
         ge=-1_000,
         le=1_000,
-        description="When the evaluation falls behind, rules of lower priority are evaluated less often first.",
+        description="Under overload, rules with a lower priority are the first to be evaluated less often.",
     )
 
     @property

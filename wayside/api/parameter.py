@@ -62,7 +62,7 @@ _MAKING = (Merge.UNION, Merge.INTERSECTION, Merge.SUM)
 
 
 class Parameter(Model):
-    """One input of the template."""
+    """One parameter of the template."""
 
     # What concerns `default`, and the items of `enum`, is said by the manager: to the CRD's CEL these have no type.
     model_config = validations(
@@ -94,35 +94,41 @@ class Parameter(Model):
         ),
     )
 
-    type: ParameterType = Field(description="The JSON type.")
-    items: ItemType | None = Field(default=None, description="The type of an array's items; any where absent.")
-    description: str = Field(default="", max_length=1024, description="What the parameter means, with its unit.")
-    required: bool = Field(default=False, description="Whether each task must give it.")
-    default: JsonValue = Field(default=None, description="The value where no task gives one.")
-    minimum: float | None = Field(default=None, description="The smallest value of a number.")
+    type: ParameterType = Field(description="The JSON type of the value; integer is a number without a fraction.")
+    items: ItemType | None = Field(default=None, description="The JSON type of an array's items. Default: any type.")
+    description: str = Field(default="", max_length=1024, description="The meaning of the parameter, with its unit.")
+    required: bool = Field(
+        default=False, description="If true, every task must set the parameter. A required parameter has no default."
+    )
+    default: JsonValue = Field(default=None, description="The value if no task sets the parameter.")
+    minimum: float | None = Field(
+        default=None, description="The minimum of a number. A task with a smaller value is refused."
+    )
     maximum: float | None = Field(
         default=None,
-        description="The largest value of a number. A merged Sum is capped at it, and the instance says so.",
+        description="The maximum of a number. A task with a larger value is refused. A larger merged Sum is capped, "
+        "and the condition Capped of the instance reports it.",
     )
     pattern: str | None = Field(
         default=None,
         min_length=1,
         max_length=256,
-        description="What a text, or each text of an array, must match (RE2 syntax), anywhere in it: "
-        "write ^…$ for the whole.",
+        description="A regular expression (RE2 syntax) for a text, or for each text of an array. It may match "
+        "anywhere in the text; use ^…$ to match the whole text.",
     )
     enum: list[JsonValue] | None = Field(
         default=None,
         min_length=1,
         max_length=64,
-        description="The values allowed. Not with merge Union, Intersection and Sum, which make values of their own.",
+        description="The allowed values. Not with merge Union, Intersection or Sum, whose results may be other values.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     merge: Merge = Field(
         default=Merge.SAME,
-        description="Same: tasks must agree; one that differs is refused, reason Conflict. Union, Intersection: the "
-        "items that are in any, or in all, of the arrays, sorted. Max, Min, Sum: of the numbers. All, Any: whether "
-        "all, or any, of the booleans are true. HighestPriority: the value of the first task by priority.",
+        description="How the values of several tasks become one. Same: tasks must agree; a task that differs is "
+        "refused with reason Conflict. Union, Intersection: the items of any array, or of all arrays, sorted. Max, "
+        "Min, Sum: the maximum, minimum or sum of the numbers. All, Any: true if all, or any, of the booleans are "
+        "true. HighestPriority: the value of the task with the highest priority.",
     )
 
     @model_validator(mode="after")

@@ -21,25 +21,27 @@ _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
 class Action(Model):
-    """What an episode leads to."""
+    """One action of an episode."""
 
     model_config = validations(
         (f"[{', '.join(f'has(self.{kind})' for kind in _KINDS)}].filter(given, given).size() == 1", _ONE)
     )
 
-    name: ObjectName = Field(description="Unique within the rule.")
+    name: ObjectName = Field(description="The name of the action, unique within the rule.")
     deploy: Deploy | None = Field(
-        default=None, description="Emit an ApplicationTask that holds while the episode lasts."
+        default=None, description="Emits an ApplicationTask that holds while the episode lasts."
     )
-    record: Record | None = Field(default=None, description="Record its samples as rosbag2 with MCAP files.")
-    trigger: Trigger | None = Field(default=None, description="Have another system record while the episode lasts.")
+    record: Record | None = Field(
+        default=None, description="Records the samples around the episode as rosbag2 with MCAP files."
+    )
+    trigger: Trigger | None = Field(default=None, description="Makes another system record while the episode lasts.")
     database: DatabaseAction | None = Field(
-        default=None, description="Write the samples around the episode to the Detector's database (MongoDB)."
+        default=None, description="Writes the samples around the episode to the Detector's database (MongoDB)."
     )
     notify: Notify | None = Field(
-        default=None, description="Tell somebody, over HTTP, by an Alertmanager or on a Zenoh key."
+        default=None, description="Sends notifications over HTTP, to an Alertmanager or on a Zenoh key."
     )
-    plugin: ActionPlugin | None = Field(default=None, description="What an installed package does about it.")
+    plugin: ActionPlugin | None = Field(default=None, description="Runs an action of an installed package.")
 
     @model_validator(mode="after")
     def _one_kind(self) -> Action:

@@ -25,32 +25,35 @@ HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+
 
 
 class SecretKey(Model):
-    """One value of a Secret that is mounted for the detector."""
+    """A key of a Secret that is mounted for the detector."""
 
-    name: ObjectName = Field(description="The Secret.")
+    name: ObjectName = Field(description="The name of the Secret.")
     key: str = Field(
-        min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="The key in it."
+        min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="The key in the Secret."
     )
 
 
 class HttpHeader(Model):
-    """A header of each request, and its value or where it is."""
+    """A header of each request, with its value or the source of its value."""
 
     model_config = validations(
         ("[has(self.value), has(self.variable), has(self.secret)].filter(given, given).size() == 1", _VALUE_ONCE)
     )
 
-    name: str = Field(min_length=1, max_length=128, pattern=_TOKEN, description="E.g. Authorization.")
+    name: str = Field(
+        min_length=1, max_length=128, pattern=_TOKEN, description="The name of the header, e.g. Authorization."
+    )
     value: str | None = Field(
-        default=None, max_length=2048, pattern=r"^[^\r\n\x00]*$", description="What is no secret, as it is."
+        default=None, max_length=2048, pattern=r"^[^\r\n\x00]*$", description="The literal value. Not for secrets."
     )
     variable: str | None = Field(
         default=None,
         max_length=255,
         pattern=_VARIABLE,
-        description="The environment variable of the detector that holds it; its name begins with WAYSIDE_.",
+        description="The environment variable of the detector that contains the value. Its name must begin with "
+        "WAYSIDE_.",
     )
-    secret: SecretKey | None = Field(default=None, description="The Secret that holds it.")
+    secret: SecretKey | None = Field(default=None, description="The Secret key that contains the value.")
 
     @model_validator(mode="after")
     def _coherent(self) -> HttpHeader:
@@ -62,27 +65,28 @@ class HttpHeader(Model):
 
 
 class HttpAccess(Model):
-    """How an endpoint is entered. Its certificate is always checked; redirects are never followed."""
+    """Access to an HTTP endpoint. Its certificate is always verified; redirects are never followed."""
 
     model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE))
 
     headers: list[HttpHeader] = Field(
         default_factory=list,
         max_length=32,
-        description="Further headers.",
+        description="Additional headers of each request.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     timeout: PositiveDuration = Field(
         default=PositiveDuration("10s"),
-        description="How long one attempt may take in all, from looking up the name to the end of the answer.",
+        description="The total timeout of one attempt, from name resolution to the end of the response.",
     )
-    tls: Tls | None = Field(default=None, description="Certificates in files.")
+    tls: Tls | None = Field(default=None, description="TLS certificates from files.")
     tls_secret: ObjectName | None = Field(
         default=None,
-        description="A Secret with ca.crt and, where the detector proves who it is, tls.crt and tls.key.",
+        description="A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and "
+        "tls.key.",
     )
     credentials_secret: ObjectName | None = Field(
-        default=None, description="A Secret with username and password, for HTTP's Basic authentication."
+        default=None, description="A Secret with the keys username and password, for HTTP Basic authentication."
     )
 
     @model_validator(mode="after")
