@@ -17,8 +17,8 @@ FilePath = Annotated[str, Field(min_length=1, max_length=1024)]
 Variable = Annotated[str, Field(min_length=1, max_length=255, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """The name of an environment variable."""
 
-_BOTH = "certificate and key belong together: give both or neither"
-_ONE = "give the password's place once: passwordVariable or passwordFile"
+_BOTH = "give both certificate and key, or neither"
+_ONE = "give exactly one of passwordVariable and passwordFile"
 
 
 class Tls(Model):

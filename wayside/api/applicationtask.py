@@ -178,13 +178,13 @@ class ApplicationTask(Kind):
             " && (!has(self.spec.event.classification)"
             " || self.spec.event.classification == oldSelf.spec.event.classification)))",
             # CEL does not see event.values, whose items may be of any type.
-            "message": "only spec.parameters may change, and spec.endTime be set (spec.event.values is not looked at): "
-            "end this task and create another",
+            "message": "only spec.parameters can change, and spec.endTime can be set once (spec.event.values is not "
+            "checked): end this task and create another",
         },
         {
             "rule": "!has(oldSelf.spec.endTime)"
             " || (has(self.spec.endTime) && self.spec.endTime == oldSelf.spec.endTime)",
-            "message": "spec.endTime is set once: a demand that ended does not come back; create another task",
+            "message": "spec.endTime is immutable once set, since an ended demand cannot resume: create another task",
         },
     ]
 

@@ -52,7 +52,7 @@ class FallbackTemplate(Model):
 
 
 FALLBACK_WITHOUT_TIMEOUT = (
-    "fallback needs readyTimeout, which says when an instance counts as not becoming ready: give it, e.g. 60s"
+    "fallback needs readyTimeout, after which an instance counts as not becoming ready: set it, e.g. 60s"
 )
 
 
@@ -91,8 +91,8 @@ class Lifecycle(Model):
 
 
 BASELINE_WITH_KEY = (
-    "baseline is for a template without a key, which has one instance: remove one of the two; with a key, a rule whose "
-    "`when` is true says which instances run always"
+    "baseline is only for a template without key, which has one instance: remove baseline or key; with key, use a rule "
+    "with `when: true` to select the instances that always run"
 )
 
 
@@ -237,7 +237,7 @@ class ApplicationTemplate(Kind):
         {
             "rule": "has(self.spec.key) == has(oldSelf.spec.key)"
             " && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
-            "message": "spec.key is immutable, also in being there: make a template of another name instead",
+            "message": "spec.key is immutable and can be neither added nor removed: create another template",
         },
         {
             "rule": "!has(self.spec.lifecycle) || !has(self.spec.lifecycle.fallback)"

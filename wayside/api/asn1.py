@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from wayside.api.base import Model, validations
 
-_ONE = "give either definition or file"
+_ONE = "give exactly one of definition and file"
 
 
 class Asn1Module(Model):

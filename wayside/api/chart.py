@@ -11,7 +11,7 @@ from wayside.api.base import Model, validations
 OCI = "oci://"
 
 _FORMS = (
-    "write oci://… of a registry with a version, the name of a chart with its repository and version, or the absolute "
+    "write oci://… with a version, the name of a chart with its repository and version, or the absolute "
     "path of a folder or archive in the manager's image"
 )
 _VERSION = r"^v?[0-9]+(\.[0-9]+){0,2}(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?$"
@@ -23,11 +23,11 @@ class Helm(Model):
     model_config = validations(
         (
             "self.chart.startsWith('/') ? !has(self.version) && !has(self.repository) : has(self.version)",
-            "a chart of a registry or repository needs a version, and a path has neither version nor repository",
+            "a chart from a registry or repository needs version; for a path, remove version and repository",
         ),
         (
             "self.chart.startsWith('/') || self.chart.startsWith('oci://') != has(self.repository)",
-            "a chart's name needs its repository, and oci://… has none",
+            "a chart name needs repository; for oci://…, remove repository",
         ),
     )
 
@@ -67,5 +67,5 @@ class Helm(Model):
         elif self.version is None:
             raise ValueError(f"chart {self.chart} needs an exact version: {_FORMS}")
         elif self.chart.startswith(OCI) == (self.repository is not None):
-            raise ValueError(f"chart {self.chart} does not say where it is: {_FORMS}")
+            raise ValueError(f"the location of chart {self.chart} is unclear: {_FORMS}")
         return self

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from wayside.api.access import FilePath, Variable
 from wayside.api.base import Model, ObjectName, PositiveQuantity, validations
 
-_ONE = "give the place of the database's URI once: uriSecret, uriVariable or uriFile"
+_ONE = "give exactly one of uriSecret, uriVariable and uriFile"
 
 
 class WriteConcern(StrEnum):

@@ -99,11 +99,10 @@ class RuleSelector(Model):
         return all(labels.get(key) == value for key, value in self.match_labels.items())
 
 
-_POD_WITHOUT_MODE = "pod says nothing without a mode: give mode Standalone or Sidecar, or remove pod"
-_ACCOUNTS_WITHOUT_SIDECAR = "serviceAccountNames says nothing without mode Sidecar: give it, or remove the names"
+_POD_WITHOUT_MODE = "pod has no effect without mode: set mode to Standalone or Sidecar, or remove pod"
+_ACCOUNTS_WITHOUT_SIDECAR = "serviceAccountNames has no effect without mode Sidecar: set mode: Sidecar, or remove it"
 _SIDECAR_ON_NODES = (
-    "pod.nodeSelector and pod.tolerations: with mode Sidecar the detector runs where the pod does that it is in: "
-    "remove them"
+    "pod.nodeSelector and pod.tolerations have no effect with mode Sidecar, which uses an existing pod: remove them"
 )
 
 
@@ -245,7 +244,7 @@ class DetectorSpec(Model):
         for field, path in self.folders.items():
             if not path.startswith("/") or path.strip("/") == "" or ":" in path or ".." in path.split("/"):
                 raise ValueError(
-                    f"{field}: {path!r} is no folder for a volume: in a pod, give an absolute path without .. and :, "
+                    f"{field}: {path!r} cannot be a volume path: in a pod, use an absolute path without .. and :, "
                     "such as /var/lib/wayside"
                 )
         return self
@@ -269,7 +268,7 @@ class DetectorSpec(Model):
         for name in (allowed.streams or ()) if allowed is not None else ():
             if self.stream(name) is None:
                 there = ", ".join(stream.name for stream in self.streams)
-                raise ValueError(f"recordings.onRequest.streams: there is no stream {name}, there is {there}")
+                raise ValueError(f"recordings.onRequest.streams: there is no stream {name}; the Detector has {there}")
         return self
 
     def stream(self, name: str) -> Stream | None:

@@ -31,7 +31,7 @@ MAXIMUM_BYTES = 256 * 1024
 
 _BOUNDED = ("ApplicationTemplate", "Detector", "EventRule")  # tasks and instances have bounds for their parameters
 
-_TOO_DEEP = f"is nested more than {_DEEPEST} deep: an alias may hold itself"
+_TOO_DEEP = f"is nested more than {_DEEPEST} levels deep: an alias may refer to itself"
 
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -143,7 +143,7 @@ def _files(paths: Iterable[str | Path], problems: list[Problem]) -> Iterator[Pat
         if path.is_dir():
             inside = sorted(child for child in path.iterdir() if child.suffix in (".yaml", ".yml", ".json"))
             if not inside:
-                problems.append(Problem(str(path), 0, 0, "", "the folder holds no .yaml, .yml or .json file"))
+                problems.append(Problem(str(path), 0, 0, "", "the folder contains no .yaml, .yml or .json file"))
             yield from inside
         elif path.exists():
             yield path
@@ -167,7 +167,7 @@ def _nodes(text: str, file: str, problems: list[Problem]) -> Iterator[yaml.Node]
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
         line, column = before.count("\n") + 1, error.position - before.rfind("\n")
-        reason = f"holds the character {text[error.position]!r}, which YAML does not allow: remove it"
+        reason = f"contains the character {text[error.position]!r}, which YAML does not allow: remove it"
         problems.append(Problem(file, line, column, "", reason))
     except RecursionError:
         problems.append(Problem(file, 0, 0, "", _TOO_DEEP))
@@ -180,10 +180,10 @@ def _remedy(line: str, column: int) -> str:
     if line[: column + 1].strip(" ").startswith("\t"):
         return "indent with spaces, not with tabs"
     if line.lstrip(" -").startswith("{") or value.startswith("{"):
-        return "inside {…} and […], quote each text that holds a bracket, a brace, a comma, or `: `"
+        return "inside {…} and […], quote each string that contains a bracket, a brace, a comma, or `: `"
     if value[:1] in _MEANINGFUL or ": " in value:
         quoted = value.replace("'", "''")
-        return f"an expression that means something to YAML must be quoted as a whole: '{quoted}'"
+        return f"an expression with special characters of YAML must be quoted as a whole: '{quoted}'"
     return "check the indentation and the quotes here and on the line above"
 
 
@@ -196,7 +196,9 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
         return None
     try:
         if not isinstance(raw, dict):
-            raise ValueError(f"is not an object but {raw!r}: each document needs apiVersion, kind, metadata and spec")
+            raise ValueError(
+                f"must be an object, but is {raw!r}: each document needs apiVersion, kind, metadata and spec"
+            )
         kind = _kind_of(raw)
     except ValueError as error:
         problems.append(Problem(file, *_mark(marks, ()), "", str(error)))
@@ -213,7 +215,7 @@ def _kind_of(raw: dict[str, Any]) -> type[Kind]:
     kind = KINDS.get(str(raw.get("kind")))
     if raw.get("apiVersion") != API_VERSION or kind is None:
         raise ValueError(
-            f"apiVersion {raw.get('apiVersion')!r}, kind {raw.get('kind')!r} is none of ours: "
+            f"apiVersion {raw.get('apiVersion')!r}, kind {raw.get('kind')!r} is not a Wayside kind: "
             f"write apiVersion: {API_VERSION} and one of the kinds {', '.join(KINDS)}"
         )
     return kind
@@ -235,7 +237,7 @@ def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, i
         raise _TagError(path[:3], mark, f"the object has more than {_MOST_FIELDS} fields: aliases may multiply them")
     if node.tag.startswith("!"):
         written = f"{node.tag} {node.value}".strip() if isinstance(node, yaml.ScalarNode) else node.tag
-        raise _TagError(path, mark, f"YAML takes {node.tag} for a tag: quote the expression, '{written}'")
+        raise _TagError(path, mark, f"YAML reads {node.tag} as a tag: quote the expression, '{written}'")
     if isinstance(node, yaml.MappingNode):
         result: dict[str, Any] = {}
         for key_node, child in node.value:

@@ -69,12 +69,11 @@ class Signal(Model):
         ),
         (
             "has(self.model) || has(self.plugin) || (self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
-            "give value, e.g. value: msg.speed; but none for the aggregates Count, Age and Active, "
-            "which look at no value",
+            "give value, e.g. value: msg.speed, except with the aggregates Count, Age and Active, which use no value",
         ),
         (
             "self.aggregate != 'Active' || (has(self.rule) && !has(self.over) && !has(self.where))",
-            "the aggregate Active is for a signal over a rule, and takes neither over nor where",
+            "aggregate Active is for a signal with rule, without over and where",
         ),
         (
             "[has(self.stream), has(self.rule), has(self.model), has(self.plugin)].filter(given, given).size() == 1",
@@ -134,11 +133,11 @@ class Signal(Model):
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
         if self.aggregate is Aggregate.ACTIVE and (self.rule is None or self.over or self.where):
-            raise ValueError("aggregate Active is for a signal over a rule, and takes neither over nor where")
+            raise ValueError("aggregate Active is for a signal with rule, without over and where")
         if self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:
-            raise ValueError(f"aggregate {self.aggregate} looks at no value: remove value (where picks samples)")
+            raise ValueError(f"aggregate {self.aggregate} uses no value: remove value (use where to select samples)")
         return self
 
 

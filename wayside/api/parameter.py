@@ -84,7 +84,7 @@ class Parameter(Model):
         ),
         (
             "!has(self.minimum) || !has(self.maximum) || self.minimum <= self.maximum",
-            "minimum is above maximum: no value would fit",
+            "minimum is above maximum: no value is valid",
         ),
         ("!has(self.items) || self.type == 'array'", "items needs type array"),
         (
@@ -144,13 +144,13 @@ class Parameter(Model):
         if self.type not in _NUMERIC and (self.minimum is not None or self.maximum is not None):
             yield f"minimum and maximum need type number or integer, not {self.type}"
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            yield f"minimum {self.minimum:g} is above maximum {self.maximum:g}: no value would fit"
+            yield f"minimum {self.minimum:g} is above maximum {self.maximum:g}: no value is valid"
         if self.items is not None and self.type is not ParameterType.ARRAY:
             yield f"items needs type array, not {self.type}"
         if self.pattern is not None and self.type is not ParameterType.STRING and self.items is not ItemType.STRING:
             yield f"pattern needs type string, or type array with items string, not {self.type}"
         if self.enum is not None and self.merge in _MAKING:
-            yield f"merge {self.merge} makes values of its own, which enum cannot list: remove one of merge and enum"
+            yield f"merge {self.merge} can produce values that enum does not list: remove one of merge and enum"
         for index, value in enumerate(self.enum or ()):
             if not _has_type(value, self.type):
                 yield f"enum: item {index}, {value!r}, is not of type {self.type}"
@@ -174,7 +174,7 @@ class Parameter(Model):
         if self.maximum is not None and value > self.maximum:
             return f"{value!r} is above the maximum of {self.maximum:g}"
         if self.enum is not None and value not in self.enum:
-            return f"{value!r} is none of {', '.join(map(repr, self.enum))}"
+            return f"{value!r} is not one of {', '.join(map(repr, self.enum))}"
         return None
 
 

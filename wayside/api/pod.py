@@ -11,12 +11,12 @@ from pydantic import Field, model_validator
 from wayside.api.base import Identifier, Model, ObjectName, PositiveQuantity, validations
 
 _ONE = "give claim or size, not both"
-_ONE_SOURCE = "give value or fromSecret, one of them"
-_ANY_KEY = "without a key, operator must be Exists; with operator Exists there is no value"
+_ONE_SOURCE = "give exactly one of value and fromSecret"
+_ANY_KEY = "without key, operator must be Exists; with operator Exists, remove value"
 
 RESERVED_VARIABLES = frozenset({"POD_NAME", "POD_NAMESPACE", "POD_UID"})
 """Environment variables by which the detector knows its pod."""
-_RESERVED = f"{', '.join(sorted(RESERVED_VARIABLES))} are set for each pod by itself: leave them out"
+_RESERVED = f"{', '.join(sorted(RESERVED_VARIABLES))} are set automatically in each pod: remove them"
 
 
 class DetectorMode(StrEnum):
@@ -83,7 +83,7 @@ class DetectorResources(Model):
             for name in amounts:
                 if name not in _RESOURCES and "/" not in name:
                     raise ValueError(
-                        f"{field}: {name!r} is no resource: give {', '.join(_RESOURCES)}, or one of the cluster's own, "
+                        f"{field}: {name!r} is not a resource: use {', '.join(_RESOURCES)}, or an extended resource, "
                         "such as example.com/gpu"
                     )
         for name, amount in self.requests.items():
@@ -91,7 +91,7 @@ class DetectorResources(Model):
             if limit is not None and _amount(amount) > _amount(limit):
                 raise ValueError(f"requests.{name}: {amount} is more than limits.{name}, {limit}: raise the limit")
             if "/" in name and (limit is None or _amount(amount) != _amount(limit)):
-                raise ValueError(f"requests.{name}: {amount} must be the same as limits.{name}: give both alike")
+                raise ValueError(f"requests.{name}: {amount} must equal limits.{name}: set both to the same amount")
         return self
 
 

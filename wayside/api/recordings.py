@@ -17,7 +17,7 @@ class WhenFull(StrEnum):
 
 
 class OnRequest(Model):
-    """Recordings that others request over Zenoh: a trigger of another detector, or any other peer that reaches this one."""
+    """Recordings that others request over Zenoh: a trigger of another detector, or any other peer."""
 
     streams: list[ObjectName] | None = Field(
         default=None,

@@ -8,7 +8,7 @@ from wayside.api.base import ClientName, Expression, Identifier, Model, ObjectNa
 
 _POSITION = "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees"
 _MAX_AGE = PositiveDuration("1s")
-_SCOPE = "exactly one of client, pairs and fleet must be given"
+_SCOPE = "give exactly one of client, pairs and fleet"
 
 
 class Position(Model):

@@ -87,11 +87,11 @@ class Stream(Model):
     model_config = validations(
         (
             "self.encoding == 'uper' || (self.encoding == 'cdr') == has(self.type)",
-            "type is for cdr streams, and they need it, e.g. geometry_msgs/msg/PoseStamped; and for uper streams",
+            "type is required with encoding cdr, optional with uper, and not allowed otherwise",
         ),
         (
             "!has(self.type) || (self.encoding == 'uper') == self.type.startsWith('etsi/')",
-            "the type of a cdr stream is a ROS 2 message, that of a uper stream an ETSI ITS message, e.g. etsi/cam",
+            "type must be a ROS 2 message with encoding cdr, and an ETSI ITS message with uper, e.g. etsi/cam",
         ),
         (
             "self.key.contains('${client:') != has(self.client)",
@@ -103,7 +103,7 @@ class Stream(Model):
         ),
         (
             "self.layout != 'RmwZenoh' || self.encoding in ['cdr', 'raw']",
-            "layout RmwZenoh is of ROS 2 messages: encoding must be cdr or raw",
+            "layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw",
         ),
         (
             "self.layout != 'RmwZenoh' || self.source == 'zenoh'",
@@ -200,7 +200,7 @@ class Stream(Model):
             raise ValueError(f"a {self.encoding} stream has no type: remove it")
         if self.layout is Layout.RMW_ZENOH and self.encoding not in (Encoding.CDR, Encoding.RAW):
             raise ValueError(
-                f"layout RmwZenoh is of ROS 2 messages: encoding must be cdr or raw, is {self.encoding}; "
+                f"layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw, but is {self.encoding}; "
                 "correct it, or remove layout"
             )
         if self.layout is Layout.RMW_ZENOH and self.source != ZENOH:
@@ -209,12 +209,12 @@ class Stream(Model):
             raise ValueError("domain is for streams with layout RmwZenoh: remove it")
         if self.type is not None and (self.encoding is Encoding.UPER) != self.type.startswith("etsi/"):
             example = "etsi/cam" if self.encoding is Encoding.UPER else "geometry_msgs/msg/PoseStamped"
-            raise ValueError(f"{self.type} is no type of {self.encoding} streams: give one such as {example}")
+            raise ValueError(f"{self.type} is not a message type of {self.encoding} streams: use one such as {example}")
         captures = "${client:" in self.key
         if captures and self.client is not None:
             raise ValueError("key captures the client and client names one: remove one of them")
         if not captures and self.client is None:
-            raise ValueError("key captures no client: write ${client:*} where its name stands, or give client")
+            raise ValueError("key does not capture the client: write ${client:*} in place of its name, or set client")
         if self.frame_prefix is not None and not self.carries_transforms:
             raise ValueError("framePrefix is for streams of type tf2_msgs/msg/TFMessage: remove it")
         if self.stale_after is not None and self.stale_after != "Never":

@@ -15,11 +15,9 @@ Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/
 
 _ENCRYPTED = ("tls/", "quic/")
 
-_NO_CLIENT = "liveliness captures no client: write ${client:*} where its name stands"
+_NO_CLIENT = "liveliness does not capture the client: write ${client:*} in place of its name"
 
-_NO_CERTIFICATE = (
-    "an endpoint to listen on with TLS needs a certificate: give tls.certificate and tls.key, or tlsSecret"
-)
+_NO_CERTIFICATE = "a TLS endpoint in listen needs a certificate: set tls.certificate and tls.key, or tlsSecret"
 
 
 class ZenohMode(StrEnum):

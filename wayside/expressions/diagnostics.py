@@ -35,9 +35,11 @@ _WORDS = {
     "nil": "CEL writes `null`",
 }
 _SIGNS = {"=": "CEL compares with `==`", "&": "CEL writes `&&`", "|": "CEL writes `||`", "'": "", '"': ""}
-_QUOTE = "a text is not closed, or YAML took its quotes: quote the whole expression and use the other quotes inside"
+_QUOTE = (
+    "a string is not closed, or YAML removed its quotes: quote the whole expression and use the other quotes inside"
+)
 _DEPTH = "at most 32 levels, where each operator of a chain like `a + b` is one: balance it with brackets"
-EMPTY = "YAML takes a leading `!`, `#` or quote for itself: put the whole expression in quotes, as in '!braking'"
+EMPTY = "YAML interprets a leading `!`, `#` or quote itself: put the whole expression in quotes, as in '!braking'"
 
 
 def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]) -> ExpressionError:

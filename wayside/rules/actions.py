@@ -56,7 +56,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
     if action.record is not None and compiler.detector.spec.recordings is None:
         compiler.problem(
             (*at, "record"),
-            f"Detector {compiler.detector.name} does not say where recordings go: give its spec.recordings, "
+            f"Detector {compiler.detector.name} has no spec.recordings: add it, "
             "e.g. {path: /var/lib/wayside/recordings}",
         )
     below, values = action.templates

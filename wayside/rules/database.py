@@ -15,10 +15,10 @@ def database_problems(action: DatabaseAction, detector: Detector) -> Iterator[tu
     if database is None:
         yield (
             ("database",),
-            f"Detector {detector.name} has no database: give it spec.database, e.g. {{uriVariable: MONGODB_URI}}",
+            f"Detector {detector.name} has no spec.database: add it, e.g. {{uriVariable: MONGODB_URI}}",
         )
     elif action.files is not None and database.files is None:
         yield (
             ("database", "files"),
-            f"Detector {detector.name} has no place for files: give it spec.database.files.path, or remove files",
+            f"Detector {detector.name} has no spec.database.files: add it with a path, or remove files",
         )

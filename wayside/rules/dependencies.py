@@ -44,7 +44,7 @@ def dependency_problems(rules: Sequence[EventRule]) -> dict[str, list[RuleProble
                 message = _unknown(other, [each for each in named if each != name])
             elif cycle := _way(other, name, named):
                 message = (
-                    f"rules cannot depend on each other in a circle: {' → '.join((name, *cycle))}; "
+                    f"rules must not depend on each other in a cycle: {' → '.join((name, *cycle))}; "
                     "remove one of these signals"
                 )
             else:

@@ -86,9 +86,9 @@ def _signal_problems(names: Iterable[str], by_name: Mapping[str, Signal]) -> Ite
             known = ", ".join(each for each, other in by_name.items() if other.model is None) or "none"
             yield ("signals", position), f"the rule has no signal {name}; it has {known}"
         elif signal.model is not None:
-            yield ("signals", position), f"{name} is computed by a model, which no other model can build on"
+            yield ("signals", position), f"{name} is computed by a model and cannot be the input of another model"
         elif signal.plugin is not None:
-            yield ("signals", position), f"{name} is computed by a plugin, which no model can build on"
+            yield ("signals", position), f"{name} is computed by a plugin and cannot be the input of a model"
 
 
 def _window_problems(window: ModelWindow, by_name: Mapping[str, Signal], detector: Detector) -> Iterator[Located]:

@@ -146,7 +146,7 @@ def element_problems(
             for name in names or ():
                 if name in own:
                     path: FieldPath = ("spec", "signals", model.index, "model", "inputs", index)
-                    yield path, f"{name} reads the element of each, and a model is run once for a client: leave it out"
+                    yield path, f"{name} reads the element of each, but a model runs once per client: remove it"
 
 
 def _reads(signal: CompiledSignal, variable: str) -> bool:
@@ -174,6 +174,6 @@ def closing_speed_problem(stream: Stream | None, kept: int) -> str | None:
     if stream is None or kept > CLOSING_NS:
         return None
     return (
-        f"closingSpeed looks 1 s back, and stream {stream.name} is kept for {kept / 1e9:g} s only: "
+        f"closingSpeed needs the samples of 1 s, but stream {stream.name} is kept for {kept / 1e9:g} s only: "
         "raise the stream's buffer.duration to 2s or more"
     )

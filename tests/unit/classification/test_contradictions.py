@@ -109,7 +109,7 @@ WAYS = [
         "contradicts the rule: it looks back 2500ms (spec.signals[0].over: 1500ms and spec.for: 1s): write ShortTerm",
         "ShortTerm", signals=[over("1500ms")], when="m > 1", **{"for": "1s"}),
     way("observationPeriod", "ShortTerm", "[0]: ShortTerm (the detection needs data of seconds to minutes) "
-        "contradicts the rule: it looks at the newest samples alone: write Immediate", "Immediate"),
+        "contradicts the rule: it uses only the newest samples: write Immediate", "Immediate"),
     way("observationPeriod", "ShortTerm", "[0]: ShortTerm (the detection needs data of seconds to minutes) "
         "contradicts the rule: it looks back 2h", "ShortTerm LongTerm", **DECIDING),
     way("observationPeriod", "LongTerm", "[0]: LongTerm (the detection needs data of hours or more) contradicts the "
@@ -133,10 +133,10 @@ WAYS = [
         "RuleBased"),
     way("typeOfAction", "Notification", ": spec.actions[0].deploy launches software: add Deployment (the action "
         "starts software that was not running)", "Deployment Notification", actions=act(DEPLOY)),
-    way("typeOfAction", "Other", ": spec.actions[0].deploy configures what runs, and starts nothing: add Reconfig",
+    way("typeOfAction", "Other", ": spec.actions[0].deploy reconfigures running applications, and starts none: add",
         "Reconfiguration Other", actions=act(RECONFIGURE)),
-    way("typeOfAction", "Notification", ": spec.actions[0].deploy stops what runs: add Reconfiguration (the action "
-        "changes the configuration of existing software) or Other (any other action)", "Reconfiguration",
+    way("typeOfAction", "Notification", ": spec.actions[0].deploy stops running applications: add Reconfiguration (the "
+        "action changes the configuration of existing software) or Other (any other action)", "Reconfiguration",
         actions=act(SUSPEND)),
     way("typeOfAction", "Other", ": spec.actions[0].record records data: add DataCollection (the act",
         "DataCollection",
@@ -147,7 +147,7 @@ WAYS = [
         actions=act(TRIGGER)),
     way("typeOfAction", "DataCollection", ": spec.actions[1].notify raises an alert: add Notification (the action inf",
         "DataCollection Notification", actions=act(RECORD, ALERT)),
-    way("typeOfAction", "DataCollection", ": spec.actions[0].notify tells somebody, or something: add Reconfiguration",
+    way("typeOfAction", "DataCollection", ": spec.actions[0].notify sends a notification: add Reconfiguration",
         "Reconfiguration", actions=act(TELL)),
     way("typeOfAction", "DataCollection Deployment", "[1]: Deployment (the action starts software that was not running)"
         " contradicts the rule: no action of the rule does that (spec.actions[0].record): remove it, or add the action",

@@ -95,7 +95,7 @@ class HttpAccess(Model):
             raise ValueError(TLS_ONCE)
         names = [header.name.lower() for header in self.headers]
         if len(set(names)) < len(names):
-            raise ValueError("headers: each name only once; upper and lower case are the same")
+            raise ValueError("headers: give each name only once (names are case-insensitive)")
         return self
 
     @property

@@ -15,8 +15,8 @@ _TLS_ONCE = "give tls or tlsSecret, not both"
 _URL_ONCE = "give exactly one of url and urlSecret"
 _TARGETS = ("http", "alertmanager", "zenoh")
 _ONE_TARGET = "give exactly one of http, alertmanager and zenoh"
-_ALERTS = "an Alertmanager groups by itself and is told of starts and ends: leave out grouping and events"
-_NO_LABEL = "grouping.by names a label that labels does not have"
+_ALERTS = "an Alertmanager groups alerts itself and receives all starts and ends: remove grouping and events"
+_NO_LABEL = "grouping.by refers to a label that labels does not contain: add it to labels, or remove it"
 
 Template = Annotated[str, Field(min_length=1, max_length=4096)]
 """Text with ${…} over the rule's variables at the start of the episode."""

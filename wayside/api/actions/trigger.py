@@ -32,12 +32,12 @@ ServiceType = Annotated[
 ]
 """What a ROS 2 service is of, e.g. rosbag2_interfaces/srv/Snapshot."""
 
-_CALL = "give start, stop or both: else nothing is called"
+_CALL = "give start, stop or both: otherwise nothing is called"
 _DOMAIN = "domain is for services with layout RmwZenoh: remove it"
 
 
 class TriggerDetector(Model):
-    """A recording by another detector in the same Zenoh network. That detector must allow it (spec.recordings.onRequest)."""
+    """A recording by another detector of the same Zenoh network, which must allow it (spec.recordings.onRequest)."""
 
     name: str = Field(
         min_length=1,
@@ -154,7 +154,7 @@ class HttpCall(Model):
     @classmethod
     def _fixed(cls, url: str) -> str:
         if "${" in url:
-            raise ValueError("takes no ${…}, since values could lead elsewhere: write {id}, and put values into body")
+            raise ValueError("must not contain ${…}, which could change the target: use {id}, and put values into body")
         return url
 
 

@@ -28,7 +28,7 @@ class Window(Model):
     )
     clients: WindowClients = Field(
         default=WindowClients.SUBJECTS,
-        description="Subjects: the clients of the episode (in a fleet scope: all members). All: every client.",
+        description="Subjects: the clients of the episode (in a fleet scope: all clients). All: every client.",
     )
     with_clients: list[ClientName] = Field(
         default_factory=list,

@@ -32,18 +32,18 @@ _LAUNCHES = Types(frozenset({TypeOfAction.DEPLOYMENT}), _ANY, "launches software
 _CONFIGURES = Types(
     frozenset({TypeOfAction.RECONFIGURATION}),
     _ANY - {TypeOfAction.DEPLOYMENT},
-    "configures what runs, and starts nothing",
+    "reconfigures running applications, and starts none",
 )
 _SUSPENDS = Types(
     frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
     frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
-    "stops what runs",
+    "stops running applications",
 )
 _RECORDS = Types(frozenset({TypeOfAction.DATA_COLLECTION}), frozenset({TypeOfAction.DATA_COLLECTION}), "records data")
 _TRIES_RECORDING = _RECORDS._replace(needed=frozenset())
-_ASKS = Types(frozenset(), _ANY, "asks another system")
+_ASKS = Types(frozenset(), _ANY, "calls another system")
 _ALERTS = Types(frozenset({TypeOfAction.NOTIFICATION}), frozenset({TypeOfAction.NOTIFICATION}), "raises an alert")
-_TELLS = Types(_TOLD, _ANY, "tells somebody, or something")
+_TELLS = Types(_TOLD, _ANY, "sends a notification")
 
 _OF_OPERATION = {
     Operation.DEPLOY: _LAUNCHES,

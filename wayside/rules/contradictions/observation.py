@@ -52,7 +52,7 @@ def _observation(rule: EventRule, others: Mapping[str, EventRule], above: frozen
         why.append(f"spec.for: {rule.spec.for_}")
     return Observation(
         longest.ns + rule.spec.for_.ns,
-        " and ".join(why) or "it looks at the newest samples alone",
+        " and ".join(why) or "it uses only the newest samples",
         any(reach.any_time for reach in reaches),
     )
 

@@ -97,7 +97,7 @@ def _one_and_external(case: Case) -> Iterator[RuleProblem]:
     if case.only(NumberOfParticipants.ONE) and case.only(external):
         yield case.against(
             external,
-            f"whose data it is and who detects the event are two that take part, and numberOfParticipants says "
+            f"an external entity that detects the event is a second participant, but numberOfParticipants is "
             f"{NumberOfParticipants.ONE.explained()}: correct one of them",
         )
 
@@ -157,8 +157,8 @@ def _algorithm(case: Case) -> Iterator[RuleProblem]:
     if case.only(DetectionAlgorithm.LEARNING_BASED) and not models and not plugins:
         yield case.against(
             DetectionAlgorithm.LEARNING_BASED,
-            "no signal that decides comes from a model or a plugin: write RuleBased, or add it where what the rule "
-            "looks at was learnt",
+            "no signal that decides comes from a model or a plugin: write RuleBased, or add it if the rule's input "
+            "comes from a learnt algorithm",
         )
 
 
