@@ -56,7 +56,7 @@ def test_the_built_in_action_asks_for_what_the_rule_has() -> None:
         ("{http: {}}", "give exactly one of url and urlSecret"),
         ("{http: {url: 'ftp://a'}}", "spec.actions[0].notify.http.url: must be like https://host:port/path"),
         ("{http: {url: 'http://ann:pass@a/'}}", "(give credentialsSecret)"),
-        ("{zenoh: {key: a}, labels: {a: b}, grouping: {by: [c]}}", "grouping.by names a label"),
+        ("{zenoh: {key: a}, labels: {a: b}, grouping: {by: [c]}}", "grouping.by refers to a label"),
         ("{alertmanager: {url: 'http://a'}, grouping: {}}", "an Alertmanager groups alerts itself"),
         ("{alertmanager: {url: 'http://a'}, events: [Started]}", "an Alertmanager groups alerts itself"),
         ("{zenoh: {key: a}, events: [Begun]}", "spec.actions[0].notify.events[0]"),
