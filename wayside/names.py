@@ -21,7 +21,7 @@ def encode(text: str) -> str:
 
 
 def decode(text: str) -> str:
-    """What `encode` was given. Raises ValueError where the bytes are not UTF-8."""
+    """The inverse of `encode`. Raises ValueError if the bytes are not UTF-8."""
     return unquote_to_bytes(text).decode()
 
 

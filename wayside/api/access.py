@@ -1,6 +1,6 @@
-"""How a network is entered: TLS and credentials. Secrets themselves never stand in a resource, only where they are.
+"""Access to a network: TLS and credentials. A resource never contains secrets, only references to them.
 
-In a cluster they come from a Secret that is mounted for the detector; beside one, from files or the environment.
+In a cluster, they come from a mounted Secret; outside a cluster, from files or environment variables.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ HOLDER_LABEL = "wayside.dev/holder"
 RULE_DIGEST_ANNOTATION = "wayside.dev/rule-digest"
 """Digest of the rule's semantics (see `EventRule.semantics`) under which the episode started."""
 TRACEPARENT_ANNOTATION = "wayside.dev/traceparent"
-"""Where the task stands in a trace, as W3C's header `traceparent` says it; absent where traces are off."""
+"""The position of the task in a trace, in the format of W3C's header `traceparent`; absent if tracing is off."""
 
 Holder = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")]
 

@@ -1,4 +1,4 @@
-"""What all kinds share: strict camelCase models, durations, quantities, names and metadata."""
+"""The common parts of all kinds: strict camelCase models, durations, quantities, names and metadata."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ Time = Annotated[
 """An RFC 3339 time, with up to nanoseconds."""
 
 JsonValue = Any
-"""Any JSON value; the schema says `x-kubernetes-preserve-unknown-fields`."""
+"""Any JSON value; the schema has `x-kubernetes-preserve-unknown-fields`."""
 
 
 def validations(*rules: tuple[str, str]) -> ConfigDict:

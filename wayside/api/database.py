@@ -1,4 +1,4 @@
-"""The database that a detector writes scenarios to: where it is, and what happens while it is away."""
+"""The database that a detector writes scenarios to: its connection, its spool and its files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class WriteConcern(StrEnum):
 
 
 class Spool(Model):
-    """Where documents wait while the database is away."""
+    """The buffer of documents on disk while the database is unavailable."""
 
     path: FilePath = Field(
         description="The spool folder, on a volume that outlives the process, e.g. /var/lib/wayside/spool. It is "

@@ -1,4 +1,4 @@
-"""Detector: which data a detector takes in, how long it keeps it, and which rules it evaluates."""
+"""Detector: the data that a detector receives, how long it is kept, and the rules to evaluate."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from wayside.api.stream import (
 from wayside.api.zenoh import Zenoh
 
 STALE_AFTER = PositiveDuration("5s")
-"""The default of a stream's `staleAfter`: what is sent once a second, as the slowest CAMs are, may fail a few times."""
+"""The default of a stream's `staleAfter`: a stream with one sample per second, such as slow CAMs, may miss a few."""
 
 
 class Client(Model):
@@ -280,7 +280,7 @@ class DetectorSpec(Model):
         return (stream.buffer.duration or self.buffer.duration).ns
 
     def stale_after_ns(self, stream: Stream) -> int | None:
-        """When a stream's newest sample is too old to be believed, in nanoseconds; None: never."""
+        """The age at which a stream's newest sample is stale, in nanoseconds; None: never."""
         if stream.never_stale:
             return None
         if stream.stale_after_ns is not None:
@@ -297,7 +297,7 @@ class DetectorStatus(Model):
     rules: int = Field(default=0, description="The number of EventRules that the detector selects.")
     conditions: list[Condition] = conditions_field(
         "Accepted: the specification can run. Running (only with a mode): the detector runs; otherwise the reason "
-        "tells why not. Ready: all of these are True. Stalled: the specification is invalid and must be corrected."
+        "explains why not. Ready: all of these are True. Stalled: the specification is invalid and must be corrected."
     )
 
 

@@ -1,4 +1,4 @@
-"""YAML files to kinds: every error names the file, the line and the field, and says what to do."""
+"""Parses YAML files into kinds. Every error names the file, the line, the field and the remedy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wayside.inputerror import InputError
 __all__ = ["Document", "DocumentError", "FieldPath", "Problem", "field_text", "load_documents", "parse_object"]
 
 _MEANINGFUL = frozenset("\"'![]{}&*%@`|>#,?")
-"""What begins with one of these means something to YAML."""
+"""The first characters that have a special meaning in YAML."""
 
 _DEEPEST = 100
 _MOST_FIELDS = 200_000
@@ -49,19 +49,19 @@ class Problem:
     """The name of the check that found it; empty for what makes a file unreadable."""
 
     def __str__(self) -> str:
-        return self._said("")
+        return self._text("")
 
     def as_warning(self) -> str:
-        """The same for what is doubtful, not wrong."""
-        return self._said("warning: ")
+        """The same for a warning."""
+        return self._text("warning: ")
 
-    def _said(self, how: str) -> str:
+    def _text(self, severity: str) -> str:
         where = f"{self.file}:{self.line}:{self.column}: " if self.line else f"{self.file}: "
-        return where + how + (f"{self.field}: " if self.field else "") + self.message
+        return where + severity + (f"{self.field}: " if self.field else "") + self.message
 
 
 class DocumentError(InputError):
-    """Files that cannot be used; `problems` has all that is wrong with them."""
+    """Files that cannot be used; `problems` has every problem."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         super().__init__("\n".join(map(str, problems)))
@@ -70,7 +70,7 @@ class DocumentError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """One object of a file, and where its fields stand."""
+    """One object of a file, with the positions of its fields."""
 
     object: Kind
     file: str
@@ -160,7 +160,7 @@ def _nodes(text: str, file: str, problems: list[Problem]) -> Iterator[yaml.Node]
         lines = text.splitlines()
         mark = error.problem_mark or error.context_mark
         if error.context_mark and mark and mark.line >= len(lines):
-            mark = error.context_mark  # found out at the end of the file: tell where what is not closed began
+            mark = error.context_mark  # detected at the end of the file: report the start of the unclosed part
         line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
         source = lines[line - 1] if 0 < line <= len(lines) else ""
         problems.append(Problem(file, line, column, "", f"is not YAML: {error.problem}; {_remedy(source, column)}"))
@@ -174,7 +174,7 @@ def _nodes(text: str, file: str, problems: list[Problem]) -> Iterator[yaml.Node]
 
 
 def _remedy(line: str, column: int) -> str:
-    """What to do about a line that is not YAML: mostly, an expression means something else to it and needs quotes."""
+    """The remedy for a line that is not YAML: mostly, an expression with special characters that needs quotes."""
     _, _, value = line.partition(": ")
     value = value.strip()
     if line[: column + 1].strip(" ").startswith("\t"):
@@ -228,7 +228,7 @@ class _TagError(Exception):
 
 
 def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, int]]) -> Any:
-    """The node as plain Python; notes where each field stands."""
+    """The node as plain Python; records the position of each field."""
     mark = (node.start_mark.line + 1, node.start_mark.column + 1)
     marks[path] = mark
     if len(path) > _DEEPEST:

@@ -1,4 +1,4 @@
-"""When a rule is evaluated: at whole multiples of a time, with each sample of a stream, or when somebody asks."""
+"""When a rule is evaluated: at whole multiples of a period, at each sample of a stream, or on request."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from wayside.api.base import Duration, Model, ObjectName, validations
 
 DEFAULT_PERIOD = Duration("1s")
-"""How often a rule is evaluated that does not say when."""
+"""The default period of a rule."""
 
 
 class Evaluation(Model):

@@ -1,4 +1,4 @@
-"""EventRule: what an event is (scope, signals, when, until, for) and what to do about it."""
+"""EventRule: the definition of an event (scope, signals, when, until, for), and its actions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ OF_A_SAMPLE = frozenset({Aggregate.LAST, Aggregate.FIRST, Aggregate.PREVIOUS})
 """The aggregates that are the value of one sample."""
 
 WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE, Aggregate.ACTIVE})
-"""The aggregates that look at no value."""
+"""The aggregates that use no value."""
 
 WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE, Aggregate.ACTIVE}
 """The aggregates that need `over`."""

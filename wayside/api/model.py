@@ -1,4 +1,4 @@
-"""A signal that an ONNX model computes: the file, what goes in and what comes out."""
+"""A signal that an ONNX model computes: the file, the inputs and the output."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class ModelWindow(Model):
 
 
 class Channels(StrEnum):
-    """What a pixel holds, in this order."""
+    """The channels of a pixel, in this order."""
 
     GRAY = "Gray"
     RGB = "Rgb"
@@ -118,7 +118,7 @@ class ModelImage(Model):
 
 
 class ModelPoints(Model):
-    """The newest sensor_msgs/msg/PointCloud2 of a stream: so many points, with the fields in this order."""
+    """The newest sensor_msgs/msg/PointCloud2 of a stream: `count` points, with the fields in this order."""
 
     stream: ObjectName = Field(description="A stream of type sensor_msgs/msg/PointCloud2.")
     fields: list[Annotated[str, Field(min_length=1, max_length=64)]] = Field(

@@ -1,4 +1,4 @@
-"""Parameters of a template: what tasks may say, of which type and within which bounds, and how it merges."""
+"""Parameters of a template: their types, their bounds, and how the values of several tasks merge."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _MAKING = (Merge.UNION, Merge.INTERSECTION, Merge.SUM)
 class Parameter(Model):
     """One parameter of the template."""
 
-    # What concerns `default`, and the items of `enum`, is said by the manager: to the CRD's CEL these have no type.
+    # The manager validates `default` and the items of `enum`, which have no type for the CRD's CEL.
     model_config = validations(
         (
             "!has(self.merge) || !(self.merge in ['Union', 'Intersection']) || self.type == 'array'",
@@ -162,7 +162,7 @@ class Parameter(Model):
                 yield f"default: {problem}"
 
     def problem(self, value: JsonValue) -> str | None:
-        """Why the value does not fit the parameter, or None if it does. Of `pattern` this says nothing."""
+        """Why the value does not fit the parameter, or None if it does. Does not check `pattern`."""
         if not _has_type(value, self.type):
             return f"{value!r} is not of type {self.type}"
         if self.items is not None:

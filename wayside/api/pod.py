@@ -1,4 +1,4 @@
-"""What a Detector says of its pod, or of its container in others' pods, which the application manager makes."""
+"""The detector's pod, or its container in other pods, which the application manager creates."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class DetectorResources(Model):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorResources:
-        """What the API server would refuse the whole pod for."""
+        """Checks for which the API server would refuse the whole pod."""
         for field, amounts in (("requests", self.requests), ("limits", self.limits)):
             for name in amounts:
                 if name not in _RESOURCES and "/" not in name:
@@ -191,7 +191,7 @@ class DetectorToleration(Model):
 class DetectorPod(Model):
     """The pod, or the container in others' pods.
 
-    A change of it, or of where the Detector keeps files and Secrets, starts a Standalone detector anew. Pods that have
+    A change of it, or of the paths of files and Secrets in the Detector, restarts a Standalone detector. Pods that have
     the detector as a sidecar keep it as it is.
     """
 

@@ -1,4 +1,4 @@
-"""Where a Detector's recordings go, and how much room they may take."""
+"""The storage of a Detector's recordings, and its limits."""
 
 from __future__ import annotations
 

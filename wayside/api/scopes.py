@@ -1,4 +1,4 @@
-"""Whom a rule is about: each client, pairs of clients, or the fleet; and the elements that it is evaluated for."""
+"""The subjects of a rule: each client, pairs of clients, or the fleet; and the elements of `each`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Position(Model):
     )
 
     def max_age_ns(self, *, never_stale: bool) -> int | None:
-        """When a position is too old to be believed, in nanoseconds; None: as long as its stream is not stale."""
+        """The maximum age of a position in nanoseconds; None: no limit while its stream is not stale."""
         if self.max_age is not None:
             return self.max_age.ns
         return None if never_stale else _MAX_AGE.ns

@@ -1,4 +1,4 @@
-"""What pydantic finds wrong with an object, in words for the one who wrote it."""
+"""Turns pydantic's validation errors into messages for the author of an object."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PATTERNS = {
 
 
 def field_text(path: FieldPath) -> str:
-    """A field's path as people write it, e.g. spec.signals[0].value."""
+    """A field's path in the usual notation, e.g. spec.signals[0].value."""
     text = ""
     for part in path:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
@@ -36,12 +36,12 @@ def field_text(path: FieldPath) -> str:
 
 
 def messages(error: ValidationError, raw: Any) -> Iterator[tuple[FieldPath, str]]:
-    """Pydantic's errors in our words, with the paths as the author wrote them, each once."""
-    told = set()
+    """The messages for pydantic's errors, each once, with the paths as the author wrote them."""
+    seen = set()
     for item in error.errors(include_url=False):
         found = _written(item["loc"], raw), _message(item)
-        if found not in told:
-            told.add(found)
+        if found not in seen:
+            seen.add(found)
             yield found
 
 

@@ -1,4 +1,4 @@
-"""What a database action asks of its Detector."""
+"""Checks that a Detector has what a database action needs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from wayside.api.wording import FieldPath
 
 
 def database_problems(action: DatabaseAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
-    """What is missing; the paths begin at the action."""
+    """The missing fields; the paths begin at the action."""
     database = detector.spec.database
     if database is None:
         yield (

@@ -1,4 +1,4 @@
-"""Names that a rule gives to signals and elements: which it cannot give, why, and what to write instead."""
+"""Checks the names of signals and elements, and proposes another name if one is not allowed."""
 
 from __future__ import annotations
 

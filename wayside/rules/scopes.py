@@ -1,4 +1,4 @@
-"""Compiles whom a rule is about: its scope, and the elements of `each`."""
+"""Compiles the scope of a rule, and the elements of `each`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from wayside.rules.variables import (
 )
 
 CLOSING_NS = 1_000_000_000
-"""Over so long the closing speed is measured, in nanoseconds."""
+"""The time over which the closing speed is measured, in nanoseconds."""
 
 
 class Expressions(Protocol):
@@ -53,14 +53,14 @@ class Expressions(Protocol):
         """The Detector's stream of that name; None where it has none."""
 
     def problem(self, path: FieldPath, message: str) -> None:
-        """Say what is wrong with a field."""
+        """Report a problem with a field."""
 
     def kept_ns(self, stream: Stream) -> int:
         """How long the Detector keeps the stream's samples, in nanoseconds."""
 
 
 def compile_subject(compiler: Expressions) -> CompiledSubject | None:
-    """The scope; None where problems forbid it. Whether `closingSpeed` is asked for is not known here yet."""
+    """The scope; None where problems forbid it. Whether `closingSpeed` is used is not known yet."""
     spec = compiler.rule.spec
     element = element_of(spec)
     if spec.scope.pairs is not None:

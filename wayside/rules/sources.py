@@ -1,4 +1,4 @@
-"""Whether a Detector's streams and sources fit together. What a plugin asks for, its own program checks."""
+"""Checks that the streams and sources of a Detector match. The parameters of a plugin are checked where it runs."""
 
 from __future__ import annotations
 

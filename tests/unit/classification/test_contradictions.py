@@ -273,7 +273,7 @@ def test_the_guide_lists_them_all() -> None:
     section = GUIDE.split("## Contradictions", 1)[1].split("\n## ", 1)[0]
     rows = [line for line in section.splitlines() if line.startswith("| `")]
     names = {dimension.values: dimension.name for dimension in SCHEME}
-    assert rows == [f"| `{names[each.dimension]}` | {each.says} |" for each in CONTRADICTIONS]
+    assert rows == [f"| `{names[each.dimension]}` | {each.description} |" for each in CONTRADICTIONS]
 
 
 RULES = """\

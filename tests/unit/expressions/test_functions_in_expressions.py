@@ -77,7 +77,7 @@ def test_the_checksum_is_crc_32_and_its_check_value_is_right() -> None:
 @pytest.mark.parametrize(
     ("source", "column", "message", "hint"),
     [
-        ("x > inside(1, 2)", 11, "`inside` does not take so many arguments", "(x, y, polygon): number, number, list"),
+        ("x > inside(1, 2)", 11, "wrong number of arguments for `inside`", "(x, y, polygon): number, number, list"),
         ("inside('1', 2, area)", 7, "`inside` does not take (string, double, dyn)", "number, number, list"),
         ("1 + allZero(area)", 3, "`+` does not take (double, bool)", None),
         ("timeToColision(1, 2) < 3", 15, "there is no function `timeToColision`", "did you mean `timeToCollision`?"),

@@ -51,17 +51,17 @@ class Action(Model):
 
     @property
     def field(self) -> str:
-        """The name of the field that says what to do."""
+        """The name of the field that is set, such as `deploy`."""
         return next(kind for kind in _KINDS if getattr(self, kind) is not None)
 
     @property
     def kind(self) -> str:
-        """What acts: the name of a built-in action, or of a plugin."""
+        """The name of the built-in action, or of the plugin."""
         return self.field if self.plugin is None else self.plugin.name
 
     @property
     def parameters(self) -> Model | Mapping[str, Any]:
-        """What it is to do: the model of a built-in action, or what is written for a plugin."""
+        """The configuration: the model of a built-in action, or the parameters of a plugin."""
         if self.plugin is not None:
             return self.plugin.parameters
         chosen: Model = getattr(self, self.field)
@@ -77,9 +77,9 @@ class Action(Model):
 
     @property
     def templates(self) -> tuple[tuple[str, ...], Mapping[str, JsonValue]]:
-        """What is rendered for each episode, by name, with ${…}; and the field of the action that they stand in.
+        """The path of the field with the values to render for each episode, and these values by name, with ${…}.
 
-        A built-in action says by its attribute `templates` which of its fields these are, and by `templates_in` where
+        A built-in action lists these fields in its attribute `templates`, and in `templates_in` the path where
         they are not its own but those of a field.
         """
         if self.plugin is not None:

@@ -51,5 +51,5 @@ class DatabaseAction(Window):
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode."""
+        """The values that are rendered for each episode."""
         return {"metadata": self.metadata} if self.metadata else {}

@@ -1,7 +1,7 @@
-"""How actions reach HTTP endpoints: headers, TLS and credentials, none of which stand in a rule where they are secret.
+"""Access of actions to HTTP endpoints: headers, TLS and credentials. A rule never contains the secret ones.
 
-Who writes rules is not always who runs the detector: a rule names Secrets that are mounted for it, and environment
-variables that are meant for rules, and no other files or variables.
+The authors of rules need not be those who run the detector: a rule can use Secrets that are mounted for it, and
+environment variables that are meant for rules, and no other files or variables.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _VALUE_ONCE = "give exactly one of value, variable and secret"
 
 
 HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$")]
-"""Where a request goes."""
+"""The URL of a request."""
 
 
 class SecretKey(Model):
@@ -100,5 +100,5 @@ class HttpAccess(Model):
 
     @property
     def access(self) -> Access:
-        """The same, as everything else that enters networks has it."""
+        """The same as an `Access`, as used for all networks."""
         return Access(tls=self.tls, tls_secret=self.tls_secret, credentials_secret=self.credentials_secret)

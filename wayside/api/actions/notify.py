@@ -1,4 +1,4 @@
-"""The notify action: somebody is told of a rule's episodes, over HTTP, by an Alertmanager or on a Zenoh key."""
+"""The notify action: notifications of a rule's episodes over HTTP, to an Alertmanager or on a Zenoh key."""
 
 from __future__ import annotations
 
@@ -172,11 +172,11 @@ class Notify(Model):
 
     @property
     def moments(self) -> frozenset[Moment]:
-        """The events of which somebody is told."""
+        """The events that cause a notification."""
         return frozenset(Moment if self.events is None else self.events)
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode, by field."""
+        """The values that are rendered for each episode, by field."""
         given = {"title": self.title, "text": self.text, "labels": self.labels or None}
         return {name: value for name, value in given.items() if value is not None}

@@ -51,5 +51,5 @@ class Record(Window):
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode."""
+        """The values that are rendered for each episode."""
         return self.metadata

@@ -30,7 +30,7 @@ ServiceName = Annotated[
 ServiceType = Annotated[
     str, Field(min_length=1, max_length=255, pattern=r"^[A-Za-z][A-Za-z0-9_]*/srv/[A-Za-z][A-Za-z0-9_]*$")
 ]
-"""What a ROS 2 service is of, e.g. rosbag2_interfaces/srv/Snapshot."""
+"""The type of a ROS 2 service, e.g. rosbag2_interfaces/srv/Snapshot."""
 
 _CALL = "give start, stop or both: otherwise nothing is called"
 _DOMAIN = "domain is for services with layout RmwZenoh: remove it"
@@ -123,7 +123,7 @@ class TriggerRos2(Model):
 
     @property
     def calls(self) -> Mapping[str, ServiceCall]:
-        """The calls by the field that says them."""
+        """The calls by field name, start and stop."""
         return {name: call for name, call in (("start", self.start), ("stop", self.stop)) if call is not None}
 
 
@@ -176,7 +176,7 @@ class TriggerHttp(HttpAccess):
 
     @property
     def calls(self) -> Mapping[str, HttpCall]:
-        """The calls by the field that says them."""
+        """The calls by field name, start and stop."""
         return {name: call for name, call in (("start", self.start), ("stop", self.stop)) if call is not None}
 
 
@@ -216,7 +216,7 @@ class Trigger(Model):
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode."""
+        """The values that are rendered for each episode."""
         if self.detector is not None:
             return {"detector": {"name": self.detector.name}}
         if self.ros2 is not None:

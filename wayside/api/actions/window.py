@@ -1,4 +1,4 @@
-"""Which samples an action gets of an episode: streams, clients, and how long before and after it."""
+"""The samples of an episode that an action receives: streams, clients, and the time before and after."""
 
 from __future__ import annotations
 
