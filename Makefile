@@ -50,8 +50,8 @@ test: $(BIN)/.installed-dev ## everything that CI runs
 	trap "kill $$! 2>/dev/null" EXIT; $(MAKE) --no-print-directory lint unit && \
 	{ wait $$! || { cat out/builds.log; exit 1; }; } && $(WAITING) tests/process tests/cluster tests/e2e
 
-lint: $(BIN)/.installed-dev ## style, types and the direction of the imports
-	@$(BIN)/ruff check . && $(BIN)/ruff format --check --quiet . && $(BIN)/mypy && $(BIN)/lint-imports
+lint: $(BIN)/.installed-dev ## style, words, types and the direction of the imports
+	@$(BIN)/ruff check . && $(BIN)/python -m tests.prose && $(BIN)/ruff format --check --quiet . && $(BIN)/mypy && $(BIN)/lint-imports
 
 unit: $(BIN)/.installed-dev ## the tests of what is pure, and of files
 	@$(BIN)/python -m pytest tests/unit -n 2 --dist worksteal

@@ -57,6 +57,6 @@ CHECKS = (
     DIVERGING_STAMPS,
     STALE_BETWEEN_SAMPLES,
     OLD_SAMPLES,
-    *(Check(each.check, Severity.WARNING, each.says) for each in CONTRADICTIONS),
+    *(Check(each.check, Severity.WARNING, each.description) for each in CONTRADICTIONS),
 )
 """All of them."""

@@ -1,10 +1,10 @@
-"""What our programs do before and while they import: become able to end, and put off looking for garbage.
+"""Process start: installs a signal handler before the imports, and defers garbage collection while they run.
 
-The first process of a container is spared every signal that it has no handler for. Without one, a container that is to
-end while its program still imports (a second and more) would go on for the whole grace period, and with it its pod: a
-Job that is over at once would take half a minute.
+The first process of a container receives no signal without a handler. Without one, a container that is stopped while
+its program still imports (a second or more) would run for the whole grace period, and its pod with it: a Job that ends
+immediately would take half a minute.
 
-What is imported stays for good. To look for garbage in it meanwhile costs a tenth of the start, and later on a pause of
+Imported objects are never freed. Collecting garbage during the imports costs a tenth of the start, and later a pause of
 a long-lived process each time.
 """
 
@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 ENDED = 128 + signal.SIGTERM
-"""The exit code of a program that ends before it has begun, as a shell tells it."""
+"""The exit code of a program that ends before it has started, as shells report it."""
 
 
 def end_on_sigterm() -> None:

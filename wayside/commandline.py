@@ -1,4 +1,4 @@
-"""What all our commands have in common: one clear line for what is wrong, and `--debug` for the trace.
+"""The common behaviour of all commands: an error is one clear line, and `--debug` prints the traceback.
 
 Bad usage and bad input end with exit code 2; `--debug` may stand before or after the command.
 """
@@ -27,16 +27,16 @@ INTERRUPTED = 130
 DEBUG = "--debug"
 
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
-"""The base of all that is said of a wrong command line, which typer does not export."""
+"""The base class of all usage errors, which typer does not export."""
 
 
 def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], arguments: Sequence[str]) -> int:
-    """Run the command line and tell what is wrong; the exit code.
+    """Run the command line and report errors; return the exit code.
 
     Args:
         app: the commands; its callback takes `--debug`.
         program: its name.
-        expected: errors of the input, which say all by themselves; any other error keeps its trace.
+        expected: errors of the input, printed without a traceback; any other error keeps its traceback.
         arguments: without the program's name.
     """
     debug = DEBUG in arguments

@@ -1,15 +1,15 @@
-"""What both programs know of a holder's Lease: how it is called, and how long a renewal of it holds."""
+"""The Lease of a holder, as both programs know it: its name and its default duration."""
 
 from __future__ import annotations
 
 PREFIX = "wayside-"
-"""What the names of all holders' Leases begin with."""
+"""The prefix of the names of all holders' Leases."""
 
 HOLDER_LEASE_LABEL = "wayside.dev/holder-lease"
 """On all holders' Leases, with the value `true`: the manager watches these alone, and not those of every node."""
 
 DEFAULT_DURATION = 15.0
-"""Seconds that a renewal holds, where the Lease does not say."""
+"""The default duration of a Lease, in seconds, if the Lease does not specify one."""
 
 
 def lease_name(holder: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 _READ_AS_BOOLEANS = re.compile(r"[yYnN]")
-"""What kubectl's YAML reads as booleans where it stands alone; PyYAML does not, and would leave it without quotes."""
+"""Scalars that kubectl's YAML reads as booleans. PyYAML does not, and would write them without quotes."""
 
 
 class _Dumper(yaml.SafeDumper):

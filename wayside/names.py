@@ -21,7 +21,7 @@ def encode(text: str) -> str:
 
 
 def decode(text: str) -> str:
-    """What `encode` was given. Raises ValueError where the bytes are not UTF-8."""
+    """The inverse of `encode`. Raises ValueError if the bytes are not UTF-8."""
     return unquote_to_bytes(text).decode()
 
 
@@ -45,5 +45,5 @@ def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
     clients = () if is_fleet else tuple(map(decode, head.split("+")))
     element = decode(tail) if mark else None
     if subject_text(clients, element) != text or "" in clients or element == "":
-        raise ValueError(f"{text!r} is no subject: expected car1, car1+car2 or {FLEET}, and perhaps ~element")
+        raise ValueError(f"{text!r} is not a subject: expected car1, car1+car2 or {FLEET}, and perhaps ~element")
     return clients, element

@@ -92,7 +92,7 @@ class Exporting:
 
     def __init__(self, service: str, *, export: bool) -> None:
         """`service` counts where OTEL_SERVICE_NAME or OTEL_RESOURCE_ATTRIBUTES name none."""
-        # What fails is counted, and said by whoever asks; the SDK would say it of every batch.
+        # Failures are counted and reported on request; the SDK would log each batch.
         logging.getLogger("opentelemetry.exporter").setLevel(logging.CRITICAL)
         own = {} if _names_service() else {"service.name": service}
         self._ids = _Ids()
@@ -163,4 +163,4 @@ def _capacity() -> int:
     try:
         return int(os.environ.get("OTEL_BSP_MAX_QUEUE_SIZE") or _QUEUE)
     except ValueError:
-        return _QUEUE  # as the SDK does, which says so
+        return _QUEUE  # as in the SDK, which logs it

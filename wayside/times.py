@@ -28,7 +28,7 @@ def format_time(ns: int) -> str:
     try:
         return f"{_whole(seconds)}.{fraction:09}Z"
     except (OverflowError, OSError, ValueError) as error:
-        raise ValueError(f"{ns} ns since the epoch is no time of the years 1 to 9999") from error
+        raise ValueError(f"{ns} ns since the epoch is not a time in the years 1 to 9999") from error
 
 
 @lru_cache(maxsize=256)  # times that are printed together mostly share few seconds
@@ -45,11 +45,11 @@ def parse_time(text: str) -> int:
     """
     match = _PATTERN.fullmatch(text)
     if match is None:
-        raise ValueError(f"{text!r} is no time: write it like 2026-01-01T00:00:00.123456789Z")
+        raise ValueError(f"{text!r} is not a time: write it like 2026-01-01T00:00:00.123456789Z")
     try:
         whole = datetime.fromisoformat(match["whole"] + match["zone"].replace("Z", "+00:00"))
     except ValueError as error:
-        raise ValueError(f"{text!r} is no time: {error}") from error
+        raise ValueError(f"{text!r} is not a time: {error}") from error
     # Not timestamp(): a float has no room for nanoseconds.
     since = whole - _EPOCH
     fraction = int((match["fraction"] or "").ljust(9, "0"))

@@ -1,6 +1,6 @@
-"""Where a span stands in its trace, as W3C's Trace Context writes it (https://www.w3.org/TR/trace-context/). Pure.
+"""The position of a span in its trace, in W3C's Trace Context format (https://www.w3.org/TR/trace-context/). Pure.
 
-The ids of what a detector does follow from the episode's id: a replay, a detector that restarts, and whoever is told of
+The ids of what a detector does follow from the episode's id: a replay, a restarted detector, and every receiver of
 the episode in another way, all come to the same trace.
 """
 
@@ -36,14 +36,14 @@ class TraceContext:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """What took some time, and is over. Times are nanoseconds since the epoch."""
+    """A completed span. Times are nanoseconds since the epoch."""
 
     name: str
     start: int
     end: int
     parent: TraceContext | None = None
     context: TraceContext | None = None
-    """Where it stands itself; None: anywhere in its parent's trace."""
+    """Its own position; None: any position in its parent's trace."""
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     links: Sequence[TraceContext] = ()
     """Spans, mostly of other traces, that have to do with this one."""

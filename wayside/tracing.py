@@ -3,7 +3,7 @@
     OTEL_EXPORTER_OTLP_ENDPOINT=http://collector:4318   (or OTEL_EXPORTER_OTLP_TRACES_ENDPOINT)
 
 All else is set by the standard variables too, e.g. OTEL_SERVICE_NAME, OTEL_RESOURCE_ATTRIBUTES, OTEL_TRACES_SAMPLER.
-Spans are told once they are over, with their times, and never wait: at most OTEL_BSP_MAX_QUEUE_SIZE (2048) wait for the
+Spans are exported after they end, with their times, and never wait: at most OTEL_BSP_MAX_QUEUE_SIZE (2048) wait for the
 exporter, which runs on a thread of its own; what finds them full is dropped and counted, and so is what was not taken.
 """
 
@@ -35,7 +35,7 @@ class Tracing:
         self._exporting = exporting
 
     def sampled(self, context: TraceContext, name: str) -> bool:
-        """Whether the trace that begins with this span is recorded; the same at each time that it is asked."""
+        """Whether the trace that begins with this span is recorded; the result is always the same for a trace."""
         return self._exporting.samples(context, name)
 
     def emit(self, span: Span) -> TraceContext:
@@ -54,7 +54,7 @@ class Tracing:
 
     @property
     def endpoint(self) -> str:
-        """Where they go, for messages."""
+        """The endpoint, for messages."""
         return next((os.environ[each] for each in ENDPOINTS if os.environ.get(each)), "")
 
     def close(self) -> None:
@@ -65,11 +65,11 @@ class Tracing:
 
 
 def tracing(service: str, *, export: bool = True) -> Tracing | None:
-    """What takes spans, or None where the environment names no endpoint; where it cannot be, the log says why.
+    """The exporter of spans; None without an endpoint in the environment. A failure to create it is logged.
 
     Args:
         service: the service's name where OTEL_SERVICE_NAME gives none.
-        export: False: nothing is sent, as in a replay, which only asks where spans would stand.
+        export: False: nothing is sent, as in a replay, which only needs the places of spans.
     """
     environment = os.environ
     endpoint = next((each for each in ENDPOINTS if environment.get(each)), None)

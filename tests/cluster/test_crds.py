@@ -120,7 +120,9 @@ class TestApplicationTask:
         stored = api.create(APPLICATION_TASK)
         ended = api.replace(changed(stored, {"spec.endTime": TIME}))
         for value in ("2026-01-02T04:00:00Z", ABSENT):
-            with pytest.raises(ApiError, match=r"spec\.endTime is set once: a demand that ended does not come back"):
+            with pytest.raises(
+                ApiError, match=r"spec\.endTime is immutable once set, since an ended demand cannot resume"
+            ):
                 api.replace(changed(ended, {"spec.endTime": value}))
 
     def test_a_persons_task_needs_only_a_template(self, api: Api) -> None:

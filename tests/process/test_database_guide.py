@@ -44,7 +44,7 @@ def test_the_examples_are_accepted(tmp_path: Path) -> None:
 def test_a_rule_whose_detector_has_no_database_is_refused_with_its_place(tmp_path: Path) -> None:
     without = {**DETECTOR, "spec": {"streams": DETECTOR["spec"]["streams"]}}
     (problem,) = checked(tmp_path, without, RECORD_ALL)
-    said = r"all\.yaml:\d+:\d+: spec\.actions\[0\]\.database: Detector d has no database: give it spec\.database"
+    said = r"all\.yaml:\d+:\d+: spec\.actions\[0\]\.database: Detector d has no spec\.database: add it"
     assert re.search(said, problem)
 
 
@@ -52,7 +52,7 @@ def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
     without = {**DETECTOR, "spec": {**DETECTOR["spec"], "database": {"uriVariable": "MONGODB_URI"}}}
     rule = {**RECORD_ALL, "spec": {**RECORD_ALL["spec"], "actions": [{"name": "a", "database": {"files": {}}}]}}
     (problem,) = checked(tmp_path, without, rule)
-    assert "spec.actions[0].database.files: Detector d has no place for files" in problem
+    assert "spec.actions[0].database.files: Detector d has no spec.database.files: add it" in problem
 
 
 @pytest.mark.parametrize(

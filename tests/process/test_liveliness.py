@@ -123,7 +123,7 @@ def _told(drive: Drive) -> list[str]:
 def test_a_pattern_that_is_none_is_told_with_its_field() -> None:
     with pytest.raises(DetectorError, match=r"spec\.zenoh\.liveliness: key 'a/x\$\{client:\*\}', column 3"):
         inlets(a_detector(zenoh={"liveliness": "a/x${client:*}"}))
-    with pytest.raises(ValueError, match="liveliness captures no client"):
+    with pytest.raises(ValueError, match="liveliness does not capture the client"):
         Zenoh(liveliness="alive/*")
 
 

@@ -284,10 +284,10 @@ def test_what_is_not_there_is_told_with_its_field(given: dict[str, Any], problem
 @pytest.mark.parametrize(
     ("given", "problem"),
     [
-        ({"tls": {"certificate": "a"}}, "certificate and key belong together"),
+        ({"tls": {"certificate": "a"}}, "give both certificate and key, or neither"),
         ({"tls": {}, "tlsSecret": "a"}, "give tls or tlsSecret"),
         ({"listen": ["tls/0.0.0.0:7447"]}, "needs a certificate"),
-        ({"credentials": {"username": "u"}}, "give the password's place once"),
+        ({"credentials": {"username": "u"}}, "give exactly one of passwordVariable and passwordFile"),
         ({"credentials": {"username": "u", "password": "secret"}}, "password"),
     ],
 )

@@ -235,9 +235,9 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
         ),
         (
             {"plugin": "once", "parameters": {"text": 1}},
-            "spec.sources[0].parameters.text: must be a text, is 1: put what you mean in quotes",
+            "spec.sources[0].parameters.text: must be a string, but is 1: put it in quotes",
         ),
-        ({"plugin": "once", "parameters": {"txt": "a"}}, "spec.sources[0].parameters.txt: there is no such field"),
+        ({"plugin": "once", "parameters": {"txt": "a"}}, "spec.sources[0].parameters.txt: unknown field"),
     ],
 )
 def test_what_is_wrong_with_a_source_is_told_with_its_field(source: dict[str, Any], problem: str) -> None:
@@ -254,8 +254,7 @@ def test_streams_and_sources_must_fit_together() -> None:
     with pytest.raises(DetectorError) as caught:
         inlets(detector)
     assert [str(problem) for problem in caught.value.problems] == [
-        "spec.sources[0].name: no stream comes from broker: write source: broker in those that do, or remove it",
-        "spec.sources[1].name: zenoh is the session of spec.zenoh, which is there without being named: "
-        "choose another name",
+        "spec.sources[0].name: no stream uses broker: set source: broker in a stream, or remove it",
+        "spec.sources[1].name: zenoh is the session of spec.zenoh, which always exists: choose another name",
         "spec.streams[0].source: Detector d has no source brokr; did you mean broker?",
     ]

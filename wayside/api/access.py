@@ -1,6 +1,6 @@
-"""How a network is entered: TLS and credentials. Secrets themselves never stand in a resource, only where they are.
+"""Access to a network: TLS and credentials. A resource never contains secrets, only references to them.
 
-In a cluster they come from a Secret that is mounted for the detector; beside one, from files or the environment.
+In a cluster, they come from a mounted Secret; outside a cluster, from files or environment variables.
 """
 
 from __future__ import annotations
@@ -17,24 +17,28 @@ FilePath = Annotated[str, Field(min_length=1, max_length=1024)]
 Variable = Annotated[str, Field(min_length=1, max_length=255, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """The name of an environment variable."""
 
-_BOTH = "certificate and key belong together: give both or neither"
-_ONE = "give the password's place once: passwordVariable or passwordFile"
+_BOTH = "give both certificate and key, or neither"
+_ONE = "give exactly one of passwordVariable and passwordFile"
 
 
 class Tls(Model):
-    """Files in PEM format. With all three, each side proves who it is (mTLS)."""
+    """TLS files in PEM format. With all three, both sides authenticate (mTLS)."""
 
     model_config = validations(("has(self.certificate) == has(self.key)", _BOTH))
 
     ca: FilePath | None = Field(
         default=None,
-        description="The certificates of the authorities that the other side's certificate is checked against. "
-        "Default: those of public authorities.",
+        description="The path of the CA certificates that verify the certificate of the other side. Default: the "
+        "public CAs.",
     )
-    certificate: FilePath | None = Field(default=None, description="The detector's own certificate.")
-    key: FilePath | None = Field(default=None, description="The private key of the certificate.")
+    certificate: FilePath | None = Field(
+        default=None, description="The path of the detector's own certificate. Requires key."
+    )
+    key: FilePath | None = Field(
+        default=None, description="The path of the private key of the certificate. Requires certificate."
+    )
     verify_name: bool = Field(
-        default=True, description="Whether the other side's certificate must be for the name in the endpoint."
+        default=True, description="If true, the certificate of the other side must match the host name of the endpoint."
     )
 
     @model_validator(mode="after")
@@ -45,16 +49,16 @@ class Tls(Model):
 
 
 class Credentials(Model):
-    """A username, and where the password is."""
+    """A username, and the source of its password."""
 
     model_config = validations(("has(self.passwordVariable) != has(self.passwordFile)", _ONE))
 
-    username: str = Field(min_length=1, max_length=255, description="Who the detector is.")
+    username: str = Field(min_length=1, max_length=255, description="The username of the detector.")
     password_variable: Variable | None = Field(
-        default=None, description="The environment variable that holds the password."
+        default=None, description="The environment variable that contains the password."
     )
     password_file: FilePath | None = Field(
-        default=None, description="The file that holds the password; a newline at its end does not count."
+        default=None, description="The file that contains the password. A trailing newline is ignored."
     )
 
     @model_validator(mode="after")
@@ -77,13 +81,16 @@ ACCESS_VALIDATIONS = (
 class Access(Model):
     """TLS and credentials, each by files or by a Secret."""
 
-    tls: Tls | None = Field(default=None, description="Certificates in files.")
+    tls: Tls | None = Field(default=None, description="TLS certificates from files.")
     tls_secret: ObjectName | None = Field(
         default=None,
-        description="A Secret with ca.crt and, where the detector proves who it is, tls.crt and tls.key.",
+        description="A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and "
+        "tls.key.",
     )
-    credentials: Credentials | None = Field(default=None, description="A username, and where its password is.")
-    credentials_secret: ObjectName | None = Field(default=None, description="A Secret with username and password.")
+    credentials: Credentials | None = Field(default=None, description="A username, and the source of its password.")
+    credentials_secret: ObjectName | None = Field(
+        default=None, description="A Secret with the keys username and password."
+    )
 
     @model_validator(mode="after")
     def _given_once(self) -> Access:

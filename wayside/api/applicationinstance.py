@@ -11,13 +11,14 @@ from wayside.api.base import Condition, Identifier, JsonValue, Kind, Model, Temp
 
 
 class ApplicationInstanceSpec(Model):
-    """What runs: a template with the values that the demands agree on."""
+    """The template, and the values that result from merging the demands."""
 
-    template: TemplateName = Field(description="The ApplicationTemplate, in the instance's namespace. Immutable.")
+    template: TemplateName = Field(description="The name of the ApplicationTemplate, in the same namespace. Immutable.")
     key: str | None = Field(
         default=None,
         max_length=1024,
-        description="The value of the template's key, lists and maps as JSON; absent where it has none. Immutable.",
+        description="The value of the template's key; a list or map is written as JSON. Absent if the template has no "
+        "key. Immutable.",
     )
     parameters: dict[Identifier, JsonValue] = Field(
         default_factory=dict,
@@ -27,7 +28,9 @@ class ApplicationInstanceSpec(Model):
         json_schema_extra={"nullable": True},
     )
     suspended: bool = Field(
-        default=False, description="true: its workloads are at zero, whoever demands it; status says what they were."
+        default=False,
+        description="If true, all workloads are scaled to zero regardless of Deploy tasks. status.suspendedReplicas "
+        "keeps their previous replica counts.",
     )
 
     @field_validator("parameters", mode="before")
@@ -37,39 +40,41 @@ class ApplicationInstanceSpec(Model):
 
 
 class ObjectReference(Model):
-    """An object that belongs to the instance."""
+    """A reference to an object of the instance."""
 
     api_version: str = Field(max_length=255, description="The object's apiVersion.")
     kind: str = Field(max_length=63, description="The object's kind.")
     name: str = Field(max_length=253, description="The object's name.")
     uid: str | None = Field(
-        default=None, max_length=63, description="The object's uid; absent until it was applied for the first time."
+        default=None,
+        max_length=63,
+        description="The object's uid. Absent until the object has been applied for the first time.",
     )
 
 
 class SuspendedReplicas(Model):
-    """A workload that is at zero, and how many replicas it goes back to."""
+    """A workload that is scaled to zero, and the replica count to restore."""
 
     api_version: str = Field(max_length=255, description="The workload's apiVersion.")
     kind: str = Field(max_length=63, description="The workload's kind.")
     name: str = Field(max_length=253, description="The workload's name.")
-    replicas: int = Field(ge=0, description="How many it had, or was to have.")
+    replicas: int = Field(ge=0, description="The replica count to restore when the suspension ends.")
 
 
 class Demands(Model):
     """The live tasks that the instance serves."""
 
-    count: int = Field(default=0, description="How many.")
+    count: int = Field(default=0, description="The number of live tasks.")
     names: list[Annotated[str, Field(max_length=253)]] = Field(
         default_factory=list,
         max_length=20,
-        description="The oldest 20.",
+        description="The names of the tasks, oldest first; at most 20.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
 
 
 class InstancePhase(StrEnum):
-    """An instance's state in one word."""
+    """A one-word summary of an instance's state."""
 
     PENDING = "Pending"
     APPLIED = "Applied"
@@ -80,44 +85,51 @@ class InstancePhase(StrEnum):
 
 
 class ApplicationInstanceStatus(Model):
-    """What the instance consists of and how it is."""
+    """The observed state of the instance."""
 
-    phase: InstancePhase | None = Field(default=None, description="The state in one word.")
+    phase: InstancePhase | None = Field(default=None, description="A one-word summary of the state.")
     message: str | None = Field(
-        default=None, max_length=512, description="What it waits for, or what keeps it; absent when all is as usual."
+        default=None,
+        max_length=512,
+        description="The reason why the instance is waiting or is being kept. Absent in normal operation.",
     )
-    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
+    observed_generation: int = Field(
+        default=0, description="The metadata.generation that the status was computed from."
+    )
     spec_hash: str | None = Field(
-        default=None, max_length=64, description="Digest of the manifests that were last applied in full."
+        default=None, max_length=64, description="The digest of the manifests at the last complete apply."
     )
     release_time: Time | None = Field(
-        default=None, description="When the instance is removed, if no new demand comes: the end of its linger."
+        default=None,
+        description="The end of the linger time. The instance is removed then unless a new demand arrives before.",
     )
     objects: list[ObjectReference] = Field(
         default_factory=list,
         max_length=128,
-        description="The objects that belong to it. What joins them later is written before it is applied; those of "
-        "a new instance are told by their label and their controller reference until this is written.",
+        description="The objects of the instance. An object that is added later is listed before it is applied. Until "
+        "the list of a new instance is written, its objects are identified by label and controller reference.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     suspended_replicas: list[SuspendedReplicas] = Field(
         default_factory=list,
         max_length=64,
-        description="What the workloads go back to; written before any is stopped, and removed once they are back.",
+        description="The replica counts to restore when the suspension ends. Written before any workload is scaled to "
+        "zero, removed once all are restored.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
-    demands: Demands = Field(default=Demands(), description="The live tasks that it serves.")
+    demands: Demands = Field(default=Demands(), description="The live tasks that the instance serves.")
     conditions: list[Condition] = conditions_field(
-        "Applied: all objects are as the template states. Ready: they are, and the workloads are ready. "
-        "Stalled: its objects are refused, or were not ready in time. Capped: a merged Sum is held "
-        "at its parameter's bound. Suspended: its workloads are at zero. Paused, Held: a person wants it left as it is "
-        "(annotation wayside.dev/pause), or kept without demand (wayside.dev/hold). TimedOut: it was not ready for its "
-        "template's readyTimeout. StandsIn: it serves tasks of instances that are."
+        "Applied: all objects match the template. Ready: the objects are applied and the workloads are ready. "
+        "Stalled: the objects were refused, or did not become ready in time. Capped: a merged Sum is limited to its "
+        "parameter's maximum. Suspended: the workloads are scaled to zero. Paused: the annotation wayside.dev/pause "
+        "stops changes to the instance. Held: the annotation wayside.dev/hold keeps the instance without demand. "
+        "TimedOut: the instance was not ready for the template's readyTimeout. StandsIn: the instance serves tasks of "
+        "instances that timed out, as their fallback."
     )
 
 
 class ApplicationInstance(Kind):
-    """One running (or lingering) instance of a template; the owner of all its objects."""
+    """One running (or lingering) instance of a template. It owns all objects of the application."""
 
     plural: ClassVar[str] = "applicationinstances"
     short_name: ClassVar[str] = "appinst"
@@ -140,5 +152,7 @@ class ApplicationInstance(Kind):
     ]
 
     kind: str = "ApplicationInstance"
-    spec: ApplicationInstanceSpec = Field(description="What runs.")
-    status: ApplicationInstanceStatus | None = Field(default=None, description="What it consists of and how it is.")
+    spec: ApplicationInstanceSpec = Field(description="The desired state: the template and its merged values.")
+    status: ApplicationInstanceStatus | None = Field(
+        default=None, description="The observed state: objects, demands and conditions."
+    )

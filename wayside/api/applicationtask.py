@@ -34,63 +34,78 @@ HOLDER_LABEL = "wayside.dev/holder"
 RULE_DIGEST_ANNOTATION = "wayside.dev/rule-digest"
 """Digest of the rule's semantics (see `EventRule.semantics`) under which the episode started."""
 TRACEPARENT_ANNOTATION = "wayside.dev/traceparent"
-"""Where the task stands in a trace, as W3C's header `traceparent` says it; absent where traces are off."""
+"""The position of the task in a trace, in the format of W3C's header `traceparent`; absent if tracing is off."""
 
 Holder = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")]
 
 
 class Requester(Model):
-    """On whose behalf the task was emitted, and by whom."""
+    """The subjects on whose behalf the task was emitted, and the holder that emitted it."""
 
-    detector: ObjectName | None = Field(default=None, description="The Detector; absent in a person's task.")
+    detector: ObjectName | None = Field(
+        default=None, description="The name of the Detector. Absent in a task that a person created."
+    )
     holder: Holder | None = Field(
         default=None,
-        description="Who emitted the task and keeps it alive by the Lease wayside-<holder>. "
-        "A task without a holder never lapses.",
+        description="The holder that emitted the task. It keeps the task alive by renewing the Lease "
+        "wayside-<holder>. A task without a holder never lapses.",
     )
     subjects: list[Annotated[str, Field(max_length=256)]] = Field(
         default_factory=list,
         max_length=1024,
-        description="The clients that the episode is about.",
+        description="The clients of the episode.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
 
 
 class TaskEvent(Model):
-    """The event that the task follows from."""
+    """The event that caused the task."""
 
-    id: str = Field(max_length=64, description="The episode's id.")
-    rule: ObjectName = Field(description="The EventRule.")
-    action: ObjectName = Field(description="The rule's action.")
-    subject: str = Field(max_length=512, description="The episode's subject, as in the event's key, e.g. car1+car2.")
-    onset_time: Time = Field(description="When the rule's condition began to hold.")
-    start_time: Time = Field(description="When the episode started.")
-    classification: Classification | None = Field(default=None, description="The rule's classification.")
+    id: str = Field(max_length=64, description="The ID of the episode.")
+    rule: ObjectName = Field(description="The name of the EventRule.")
+    action: ObjectName = Field(description="The name of the rule's action.")
+    subject: str = Field(
+        max_length=512, description="The subject of the episode, as in the event's key, e.g. car1+car2."
+    )
+    onset_time: Time = Field(description="The time at which the rule's condition began to hold.")
+    start_time: Time = Field(description="The start of the episode.")
+    classification: Classification | None = Field(default=None, description="The classification of the rule.")
     values: dict[str, Value] = Field(
-        default_factory=dict, max_length=256, description="The values of the rule's variables at the start."
+        default_factory=dict,
+        max_length=256,
+        description="The values of the rule's variables at the start of the episode.",
     )
 
 
 class ApplicationTaskSpec(Model):
-    """What is wanted and why."""
+    """One demand on an application, and its cause."""
 
-    template: TemplateName = Field(description="The ApplicationTemplate, in the task's namespace.")
+    template: TemplateName = Field(description="The name of the ApplicationTemplate, in the same namespace. Immutable.")
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
-    priority: int = Field(default=0, ge=-1_000_000, le=1_000_000, description="Tasks of higher priority come first.")
+    priority: int = Field(
+        default=0,
+        ge=-1_000_000,
+        le=1_000_000,
+        description="The priority of the task; the highest comes first. Ties are ordered by creation time, then by "
+        "name. Immutable.",
+    )
     parameters: dict[Identifier, Value] = Field(
         default_factory=dict,
         max_length=64,
-        description="Values for the template's parameters; at most 64 KiB in all. May change while the task lives.",
+        description="The values for the template's parameters, at most 64 KiB in total. Can change while the task is "
+        "live.",
     )
-    requester: Requester = Field(default=Requester(), description="On whose behalf, and by whom.")
-    event: TaskEvent | None = Field(default=None, description="The event that the task follows from.")
+    requester: Requester = Field(
+        default=Requester(), description="The holder that emitted the task, and the clients on whose behalf. Immutable."
+    )
+    event: TaskEvent | None = Field(default=None, description="The event that caused the task. Immutable.")
     end_time: Time | None = Field(
-        default=None, description="Absent while the demand holds; set once, when it has ended."
+        default=None, description="The end of the demand. Absent while the demand holds; immutable once set."
     )
 
 
 class TaskPhase(StrEnum):
-    """A task's state in one word."""
+    """A one-word summary of a task's state."""
 
     PENDING = "Pending"
     WAITING = "Waiting"
@@ -103,26 +118,34 @@ class TaskPhase(StrEnum):
 
 
 class ApplicationTaskStatus(Model):
-    """What became of the demand."""
+    """The observed state of the demand."""
 
-    phase: TaskPhase | None = Field(default=None, description="The state in one word.")
-    instance: str | None = Field(default=None, max_length=63, description="The ApplicationInstance that serves it.")
+    phase: TaskPhase | None = Field(default=None, description="A one-word summary of the state.")
+    instance: str | None = Field(
+        default=None, max_length=63, description="The name of the ApplicationInstance that serves the task."
+    )
     message: str | None = Field(
-        default=None, max_length=512, description="What it waits for or why it does not count; absent when all is well."
+        default=None,
+        max_length=512,
+        description="The reason why the task is waiting or does not count. Absent in normal operation.",
     )
-    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
+    observed_generation: int = Field(
+        default=0, description="The metadata.generation that the status was computed from."
+    )
     applied_time: Time | None = Field(
-        default=None, description="When its instance had its values applied for the first time."
+        default=None, description="The time at which the instance first had the task's values applied."
     )
-    ready_time: Time | None = Field(default=None, description="When its instance was ready for it for the first time.")
+    ready_time: Time | None = Field(
+        default=None, description="The time at which the instance was first ready for the task."
+    )
     conditions: list[Condition] = conditions_field(
-        "Accepted: the demand counts. Applied, Ready: its instance is, now. Stalled: it is refused, and waiting does "
-        "not help. Finished: it is over, and Applied and Ready are gone."
+        "Accepted: the demand counts. Applied, Ready: the current state of the task's instance. Stalled: the task is "
+        "refused, and waiting does not help. Finished: the task has ended; Applied and Ready are removed."
     )
 
 
 class ApplicationTask(Kind):
-    """A demand on an application that holds from its creation until its end."""
+    """A demand on an application. It holds from its creation until its end."""
 
     plural: ClassVar[str] = "applicationtasks"
     short_name: ClassVar[str] = "apptask"
@@ -155,16 +178,16 @@ class ApplicationTask(Kind):
             " && (!has(self.spec.event.classification)"
             " || self.spec.event.classification == oldSelf.spec.event.classification)))",
             # CEL does not see event.values, whose items may be of any type.
-            "message": "only spec.parameters may change, and spec.endTime be set (spec.event.values is not looked at): "
-            "end this task and create another",
+            "message": "only spec.parameters can change, and spec.endTime can be set once (spec.event.values is not "
+            "checked): end this task and create another",
         },
         {
             "rule": "!has(oldSelf.spec.endTime)"
             " || (has(self.spec.endTime) && self.spec.endTime == oldSelf.spec.endTime)",
-            "message": "spec.endTime is set once: a demand that ended does not come back; create another task",
+            "message": "spec.endTime is immutable once set, since an ended demand cannot resume: create another task",
         },
     ]
 
     kind: str = "ApplicationTask"
-    spec: ApplicationTaskSpec = Field(description="What is wanted and why.")
-    status: ApplicationTaskStatus | None = Field(default=None, description="What became of the demand.")
+    spec: ApplicationTaskSpec = Field(description="The demand and its cause.")
+    status: ApplicationTaskStatus | None = Field(default=None, description="The observed state of the demand.")

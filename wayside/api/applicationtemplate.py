@@ -26,58 +26,61 @@ from wayside.api.parameter import Parameter
 
 
 class LossPolicy(StrEnum):
-    """What becomes of demands whose holder is gone."""
+    """The treatment of demands after their holder was lost."""
 
     RELEASE = "Release"
     HOLD = "Hold"
 
 
 class OnDetectorLoss(Model):
-    """What becomes of demands whose holder's Lease lapsed."""
+    """The treatment of demands after their holder's Lease lapsed."""
 
     policy: LossPolicy = Field(
-        default=LossPolicy.RELEASE, description="Release: they no longer count. Hold: they count until they end."
+        default=LossPolicy.RELEASE,
+        description="Release: the demands stop counting. Hold: the demands count until they end.",
     )
     after: Duration = Field(
-        default=Duration("30s"), description="With Release: how long after the Lease's own duration they still count."
+        default=Duration("30s"),
+        description="With policy Release: how long the demands still count after the Lease has expired.",
     )
 
 
 class FallbackTemplate(Model):
-    """What serves where an application does not become ready."""
+    """The template that replaces an application which does not become ready."""
 
-    template: TemplateName = Field(description="An ApplicationTemplate of the same namespace, and another one.")
+    template: TemplateName = Field(description="The name of another ApplicationTemplate, in the same namespace.")
 
 
 FALLBACK_WITHOUT_TIMEOUT = (
-    "fallback needs readyTimeout, which says when an instance counts as not becoming ready: give it, e.g. 60s"
+    "fallback needs readyTimeout, after which an instance counts as not becoming ready: set it, e.g. 60s"
 )
 
 
 class Lifecycle(Model):
-    """How long instances live."""
+    """The lifetime of instances."""
 
     model_config = validations(("!has(self.fallback) || has(self.readyTimeout)", FALLBACK_WITHOUT_TIMEOUT))
 
     linger: Duration = Field(
-        default=Duration("30s"), description="How long an instance stays after its last demand has ended."
+        default=Duration("30s"), description="How long an instance keeps running after its last demand has ended."
     )
     minimum_uptime: Duration = Field(
         default=Duration("0s"),
-        description="How long an instance stays at least, from its creation: neither released nor preempted before.",
+        description="The minimum lifetime of an instance, from its creation. The instance is neither released nor "
+        "preempted before.",
     )
     ready_timeout: PositiveDuration | None = Field(
         default=None,
-        description="How long an instance may be not ready in one go; then its condition TimedOut is True, until it "
-        "was ready for as long. Absent: any time.",
+        description="How long an instance may continuously be not ready. After that, its condition TimedOut is True "
+        "until the instance has been ready for the same time. Default: no limit.",
     )
     fallback: FallbackTemplate | None = Field(
         default=None,
-        description="What serves the tasks of an instance that is beyond its readyTimeout, until it is ready again. It "
-        "gets those of their parameters that it has.",
+        description="The template that serves the tasks of an instance that exceeded its readyTimeout, until that "
+        "instance is ready again. It receives those task parameters that it defines. Needs readyTimeout.",
     )
     on_detector_loss: OnDetectorLoss = Field(
-        default=OnDetectorLoss(), description="What becomes of demands whose holder's Lease lapsed."
+        default=OnDetectorLoss(), description="The treatment of demands after their holder's Lease lapsed."
     )
 
     @model_validator(mode="after")
@@ -88,19 +91,19 @@ class Lifecycle(Model):
 
 
 BASELINE_WITH_KEY = (
-    "baseline is for a template without a key, which has one instance: remove one of the two; with a key, a rule whose "
-    "`when` is true says which instances run always"
+    "baseline is only for a template without key, which has one instance: remove baseline or key; with key, use a rule "
+    "with `when: true` to select the instances that always run"
 )
 
 
 class Baseline(Model):
-    """An instance that runs always, whether tasks demand it or not."""
+    """An instance that always runs, with or without tasks."""
 
     parameters: dict[Identifier, JsonValue] = Field(
         default_factory=dict,
         max_length=64,
-        description="Its values. With merge Same, tasks must agree with them; else they count as those of a task of "
-        "the lowest priority.",
+        description="The parameter values of the baseline. With merge Same, tasks must agree with them. With any "
+        "other merge, they count as the values of a task of the lowest priority.",
     )
 
 
@@ -121,49 +124,50 @@ class ApplicationTemplateSpec(Model):
         ("!has(self.baseline) || !has(self.key)", BASELINE_WITH_KEY),
     )
 
-    description: str = Field(default="", max_length=1024, description="What the application does, for people.")
+    description: str = Field(default="", max_length=1024, description="A description of the application, for people.")
     parameters: dict[Identifier, Parameter] = Field(
-        default_factory=dict, max_length=64, description="What tasks can or must say, and how their values merge."
+        default_factory=dict,
+        max_length=64,
+        description="The inputs of the template, by name: type, bounds, and how the values of several tasks merge.",
     )
     key: Expression | None = Field(
         default=None,
-        description="Tasks with the same key share one instance, e.g. ${parameters.region}. "
-        "Without a key the template has one instance. Immutable.",
+        description="The identity of an instance, e.g. ${parameters.region}. Tasks with the same key share one "
+        "instance. Without a key, the template has one instance. Immutable.",
     )
     baseline: Baseline | None = Field(
         default=None,
-        description="One instance that runs always, also without tasks. Not with a key: a rule with when: true then "
-        "says which instances run.",
+        description="One instance that always runs, with or without tasks. Only for a template without a key; with a "
+        "key, use a rule with `when: true` instead.",
     )
     max_instances: int | None = Field(
         default=None,
         ge=1,
         le=100_000,
-        description="How many instances there may be at once; further demands wait, or preempt what has a lower "
-        "priority. Absent: any number.",
+        description="The maximum number of instances. At the limit, a demand waits or preempts an instance of lower "
+        "priority. Default: no limit.",
     )
-    lifecycle: Lifecycle = Field(default=Lifecycle(), description="How long instances live.")
+    lifecycle: Lifecycle = Field(default=Lifecycle(), description="The lifetime of instances.")
     configuration: dict[FileName, JsonValue] = Field(
         default_factory=dict,
         max_length=64,
-        description="Files that the running application follows, by name, with ${…} as in manifests. They become a "
-        "ConfigMap, ${instance.configMap}, which changes without a rollout. A text is written as it is; a map or a "
-        "list as the extension says, .yaml or .json.",
+        description="Files that the running application follows, by name, with ${…} as in manifests. They are stored "
+        "in a ConfigMap, named by ${instance.configMap}, which changes without a rollout. A text is written "
+        "unchanged; a map or list is written in the format of the file extension, .yaml or .json.",
     )
     manifests: list[Manifest] = Field(
         default_factory=list,
         min_length=1,
         max_length=64,
         description="The objects of an instance, with ${…} over parameters and instance (name, key, namespace, and "
-        "configMap where there is a configuration). "
-        "apiVersion and kind are literal, the namespace is the template's, and with a key every name contains "
-        "${instance.name}.",
+        "configMap if there is a configuration). apiVersion and kind must be literal. The namespace is that of the "
+        "template. With a key, every name must contain ${instance.name}.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     helm: Helm | None = Field(
         default=None,
-        description="A Helm chart in place of manifests. Its objects are applied as manifests are, of the same kinds; "
-        "the release's name is the instance's.",
+        description="A Helm chart instead of manifests. The same kinds of object are allowed, and they are applied in "
+        "the same way. The release has the name of the instance.",
     )
 
     @model_validator(mode="after")
@@ -201,20 +205,22 @@ class TemplateManager(Model):
 
 
 class ApplicationTemplateStatus(Model):
-    """What the application manager says of the template."""
+    """The observed state of the template."""
 
-    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
-    instances: int = Field(default=0, description="How many instances there are.")
+    observed_generation: int = Field(
+        default=0, description="The metadata.generation that the status was computed from."
+    )
+    instances: int = Field(default=0, description="The number of instances.")
     manager: TemplateManager | None = Field(
         default=None, description="The application manager that looks after the namespace."
     )
     conditions: list[Condition] = conditions_field(
-        "Accepted, Ready: whether the template can be rendered. Stalled: it has to be corrected."
+        "Accepted, Ready: the template can be rendered. Stalled: the template is invalid and must be corrected."
     )
 
 
 class ApplicationTemplate(Kind):
-    """How an application is deployed, and how the demands on it merge."""
+    """The definition of an application: how it is deployed, and how the demands on it merge."""
 
     plural: ClassVar[str] = "applicationtemplates"
     short_name: ClassVar[str] = "apptpl"
@@ -231,7 +237,7 @@ class ApplicationTemplate(Kind):
         {
             "rule": "has(self.spec.key) == has(oldSelf.spec.key)"
             " && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
-            "message": "spec.key is immutable, also in being there: make a template of another name instead",
+            "message": "spec.key is immutable and can be neither added nor removed: create another template",
         },
         {
             "rule": "!has(self.spec.lifecycle) || !has(self.spec.lifecycle.fallback)"
@@ -241,7 +247,7 @@ class ApplicationTemplate(Kind):
     ]
 
     kind: str = "ApplicationTemplate"
-    spec: ApplicationTemplateSpec = Field(description="Parameters, identity and manifests.")
-    status: ApplicationTemplateStatus | None = Field(
-        default=None, description="What the application manager says of the template."
+    spec: ApplicationTemplateSpec = Field(
+        description="The parameters, identity, lifetime and objects of an application."
     )
+    status: ApplicationTemplateStatus | None = Field(default=None, description="The observed state of the template.")

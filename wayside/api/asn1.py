@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from wayside.api.base import Model, validations
 
-_ONE = "give either definition or file"
+_ONE = "give exactly one of definition and file"
 
 
 class Asn1Module(Model):
@@ -15,14 +15,14 @@ class Asn1Module(Model):
     model_config = validations(("has(self.definition) != has(self.file)", _ONE))
 
     definition: str | None = Field(
-        default=None, min_length=1, max_length=500_000, description="The modules as ASN.1 text."
+        default=None, min_length=1, max_length=500_000, description="The text of the modules."
     )
     file: str | None = Field(
         default=None,
         min_length=1,
         max_length=1024,
-        description="The file with the modules, as the detector sees it: relative to the folder that it runs in, or "
-        "where a volume is mounted.",
+        description="The path of a file with the modules, as the detector sees it: relative to its working directory, "
+        "or on a mounted volume.",
     )
 
     @model_validator(mode="after")

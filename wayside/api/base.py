@@ -1,4 +1,4 @@
-"""What all kinds share: strict camelCase models, durations, quantities, names and metadata."""
+"""The common parts of all kinds: strict camelCase models, durations, quantities, names and metadata."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ Time = Annotated[
 """An RFC 3339 time, with up to nanoseconds."""
 
 JsonValue = Any
-"""Any JSON value; the schema says `x-kubernetes-preserve-unknown-fields`."""
+"""Any JSON value; the schema has `x-kubernetes-preserve-unknown-fields`."""
 
 
 def validations(*rules: tuple[str, str]) -> ConfigDict:
@@ -182,14 +182,20 @@ class Metadata(BaseModel):
 
 
 class Condition(Model):
-    """One aspect of an object's state, in Kubernetes' usual form."""
+    """One condition of an object's state, in the standard form of Kubernetes."""
 
-    type: str = Field(description="The aspect, e.g. Ready.", max_length=63)
+    type: str = Field(description="The type of the condition, e.g. Ready.", max_length=63)
     status: str = Field(description="True, False or Unknown.", json_schema_extra={"enum": ["True", "False", "Unknown"]})
-    reason: str = Field(description="One word why, for programs.", max_length=63, pattern=r"^[A-Za-z][A-Za-z0-9]*$")
-    message: str = Field(default="", description="Why, for people.", max_length=4096)
-    observed_generation: int = Field(default=0, description="The generation of the spec that this speaks of.")
-    last_transition_time: Time = Field(description="When the status last changed.")
+    reason: str = Field(
+        description="The machine-readable reason for the status, in CamelCase.",
+        max_length=63,
+        pattern=r"^[A-Za-z][A-Za-z0-9]*$",
+    )
+    message: str = Field(default="", description="The human-readable explanation of the status.", max_length=4096)
+    observed_generation: int = Field(
+        default=0, description="The metadata.generation that the condition was computed from."
+    )
+    last_transition_time: Time = Field(description="The time of the last change of the status.")
 
 
 def conditions_field(description: str) -> Any:

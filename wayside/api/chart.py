@@ -11,7 +11,7 @@ from wayside.api.base import Model, validations
 OCI = "oci://"
 
 _FORMS = (
-    "write oci://… of a registry with a version, the name of a chart with its repository and version, or the absolute "
+    "write oci://… with a version, the name of a chart with its repository and version, or the absolute "
     "path of a folder or archive in the manager's image"
 )
 _VERSION = r"^v?[0-9]+(\.[0-9]+){0,2}(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?$"
@@ -23,11 +23,11 @@ class Helm(Model):
     model_config = validations(
         (
             "self.chart.startsWith('/') ? !has(self.version) && !has(self.repository) : has(self.version)",
-            "a chart of a registry or repository needs a version, and a path has neither version nor repository",
+            "a chart from a registry or repository needs version; for a path, remove version and repository",
         ),
         (
             "self.chart.startsWith('/') || self.chart.startsWith('oci://') != has(self.repository)",
-            "a chart's name needs its repository, and oci://… has none",
+            "a chart name needs repository; for oci://…, remove repository",
         ),
     )
 
@@ -36,23 +36,26 @@ class Helm(Model):
         max_length=512,
         # No `-` at the beginning: it is an argument of a program.
         pattern=r"^(oci://[a-zA-Z0-9][^ ?#@]*|/[^ ]+|[a-zA-Z0-9][a-zA-Z0-9._-]*)$",
-        description="oci://… of a registry, a name in `repository`, or a path in the manager's image.",
+        description="The chart: an OCI reference (oci://…), the name of a chart in `repository`, or an absolute path "
+        "in the manager's image.",
     )
     version: str | None = Field(
         default=None,
         max_length=128,
         pattern=_VERSION,
-        description="The exact version, not a range: the same template must always give the same objects.",
+        description="The exact version of the chart. Ranges are not allowed: the same template must always render the "
+        "same objects. Required unless chart is a path.",
     )
     repository: str | None = Field(
         default=None,
         max_length=512,
         pattern=r"^https?://[^ ]+$",
-        description="The URL of the chart repository, for a chart given by its name.",
+        description="The URL of the chart repository. Only for a chart given by name.",
     )
     values: dict[str, Any] = Field(
         default_factory=dict,
-        description="The chart's values, with ${…} over parameters and instance (name, key, namespace, configMap).",
+        description="The values of the chart, with ${…} over parameters and instance (name, key, namespace, "
+        "configMap).",
         json_schema_extra={"x-kubernetes-preserve-unknown-fields": True},
     )
 
@@ -64,5 +67,5 @@ class Helm(Model):
         elif self.version is None:
             raise ValueError(f"chart {self.chart} needs an exact version: {_FORMS}")
         elif self.chart.startswith(OCI) == (self.repository is not None):
-            raise ValueError(f"chart {self.chart} does not say where it is: {_FORMS}")
+            raise ValueError(f"the location of chart {self.chart} is unclear: {_FORMS}")
         return self

@@ -1,4 +1,4 @@
-"""Where a rule's use case stands in the scheme: in each dimension on one value, or on several."""
+"""The classification of a rule's use case in the scheme: one or more values per dimension."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _dimension(values: type[Value]) -> Any:
 
 
 class Classification(Model):
-    """Where the use case stands in the 13 dimensions of the classification scheme."""
+    """The classification of the use case in the 13 dimensions of the scheme."""
 
     overarching_purpose: list[OverarchingPurpose] = _dimension(OverarchingPurpose)
     type_of_participants: list[TypeOfParticipants] = _dimension(TypeOfParticipants)

@@ -1,4 +1,4 @@
-"""The database that a detector writes scenarios to: where it is, and what happens while it is away."""
+"""The database that a detector writes scenarios to: its connection, its spool and its files."""
 
 from __future__ import annotations
 
@@ -9,69 +9,70 @@ from pydantic import Field, model_validator
 from wayside.api.access import FilePath, Variable
 from wayside.api.base import Model, ObjectName, PositiveQuantity, validations
 
-_ONE = "give the place of the database's URI once: uriSecret, uriVariable or uriFile"
+_ONE = "give exactly one of uriSecret, uriVariable and uriFile"
 
 
 class WriteConcern(StrEnum):
-    """When a write counts as done."""
+    """When a write is acknowledged."""
 
     MAJORITY = "Majority"
     ONE = "One"
 
 
 class Spool(Model):
-    """Where documents wait while the database is away."""
+    """The buffer of documents on disk while the database is unavailable."""
 
     path: FilePath = Field(
-        description="A folder on a volume that outlives the process, e.g. /var/lib/wayside/spool. It is made where it "
-        "is missing, and belongs to one detector."
+        description="The spool folder, on a volume that outlives the process, e.g. /var/lib/wayside/spool. It is "
+        "created if missing. Each detector needs its own."
     )
     bytes: PositiveQuantity = Field(
         default=PositiveQuantity("1Gi"),
-        description="At most so much waits on the disk. Beyond it new documents are dropped and counted, so that the "
-        "scenarios that wait already stay whole.",
+        description="The maximum size of the spool. At the limit, new documents are dropped and counted, so that "
+        "scenarios already in the spool stay complete.",
     )
 
 
 class DatabaseFiles(Model):
-    """Where images, point clouds and other large data are written beside the database."""
+    """The storage of images, point clouds and other large data outside the database."""
 
-    path: FilePath = Field(description="A folder; documents refer to the files by their path below it.")
+    path: FilePath = Field(description="The folder. Documents refer to the files by their path relative to it.")
     bytes: PositiveQuantity | None = Field(
         default=None,
-        description="At most so much lies there: what is beyond is left out of the documents, and counted. Default: no "
-        "limit but the disk's.",
+        description="The maximum size of the folder. At the limit, further data is omitted from the documents and "
+        "counted. Default: no limit but the disk's.",
     )
 
 
 class Database(Model):
-    """A MongoDB server or replica set, and what is kept outside it."""
+    """A MongoDB server or replica set, with the storage beside it."""
 
     model_config = validations(
         ("[has(self.uriSecret), has(self.uriVariable), has(self.uriFile)].filter(given, given).size() == 1", _ONE)
     )
 
     uri_secret: ObjectName | None = Field(
-        default=None, description="A Secret whose key `uri` holds the connection string, mongodb://… with credentials."
+        default=None,
+        description="A Secret whose key `uri` contains the connection string, mongodb://… with credentials.",
     )
     uri_variable: Variable | None = Field(
-        default=None, description="The environment variable that holds the connection string."
+        default=None, description="The environment variable that contains the connection string."
     )
     uri_file: FilePath | None = Field(
-        default=None, description="The file that holds the connection string; a newline at its end does not count."
+        default=None, description="The file that contains the connection string. A trailing newline is ignored."
     )
     write_concern: WriteConcern = Field(
         default=WriteConcern.MAJORITY,
-        description="Majority: a document counts as written once most members of the replica set have it. One: once "
-        "the primary has it, which a change of the primary can undo.",
+        description="When a document counts as written. Majority: when most members of the replica set have it. One: "
+        "when the primary has it; a change of the primary can still undo the write.",
     )
     spool: Spool | None = Field(
         default=None,
-        description="Where documents wait while the database is away. Without it 64 MiB wait in memory, and are lost "
-        "with the process.",
+        description="Buffers documents on disk while the database is unavailable. Without a spool, up to 64 MiB are "
+        "buffered in memory and lost when the process ends.",
     )
     files: DatabaseFiles | None = Field(
-        default=None, description="Where large binary data goes. Without it, it stays in the documents."
+        default=None, description="Stores large binary data in files. Without it, the data stays in the documents."
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Detector: which data a detector takes in, how long it keeps it, and which rules it evaluates."""
+"""Detector: the data that a detector receives, how long it is kept, and the rules to evaluate."""
 
 from __future__ import annotations
 
@@ -32,62 +32,66 @@ from wayside.api.stream import (
 from wayside.api.zenoh import Zenoh
 
 STALE_AFTER = PositiveDuration("5s")
-"""The default of a stream's `staleAfter`: what is sent once a second, as the slowest CAMs are, may fail a few times."""
+"""The default of a stream's `staleAfter`: a stream with one sample per second, such as slow CAMs, may miss a few."""
 
 
 class Client(Model):
-    """What is known of a client beforehand."""
+    """A client that is known in advance."""
 
-    name: ClientName = Field(description="The client's name, as it appears in the streams' keys.")
+    name: ClientName = Field(description="The name of the client, as in the keys of the streams.")
     labels: dict[Annotated[str, Field(max_length=63)], Annotated[str, Field(max_length=256)]] = Field(
-        default_factory=dict, max_length=32, description="Facts for rules to use, e.g. labels.role."
+        default_factory=dict, max_length=32, description="Labels that rules can use, e.g. labels.role."
     )
     parameters: dict[ObjectName, Constants] = Field(
         default_factory=dict,
         max_length=64,
-        description="Values for this client of the parameters that rules have, by rule and name. In a pairs scope they "
-        "are those of a or b.",
+        description="Values for this client that replace a rule's parameters, by rule and parameter name. In a pairs "
+        "scope they apply to a or b.",
     )
     expected: bool = Field(
         default=False,
-        description="true: the client is known from the detector's start on, whether or not anything comes, and "
-        "is never lost. So a rule can tell that a roadside station is silent.",
+        description="If true, the client is known from the start of the detector, even without data, and is never "
+        "lost. A rule can then detect that, for example, a roadside station is silent.",
     )
 
 
 class Buffer(Model):
-    """How much is kept of all streams together, and of a stream that does not say."""
+    """The limits of the buffer of all streams."""
 
-    duration: PositiveDuration = Field(default=PositiveDuration("10s"), description="How long samples are kept.")
+    duration: PositiveDuration = Field(
+        default=PositiveDuration("10s"), description="How long samples are kept. A stream can set its own."
+    )
     bytes: PositiveQuantity = Field(
         default=PositiveQuantity("512Mi"),
-        description="The cap over all streams: beyond it, the oldest samples are forgotten.",
+        description="The maximum size of all streams together. At the limit, the oldest samples are dropped.",
     )
 
 
 class Clock(StrEnum):
-    """Which time is the detector's."""
+    """The time axis of the detector."""
 
     WALL = "Wall"
     DATA = "Data"
 
 
 class State(Model):
-    """Where open episodes are kept, so that a restart does not lose them."""
+    """The storage of open episodes, so that a restart does not lose them."""
 
     path: str = Field(
         min_length=1,
         max_length=1024,
-        description="A folder on a volume that outlives the process, e.g. /var/lib/wayside. It is made where it is "
+        description="The folder, on a volume that outlives the process, e.g. /var/lib/wayside. It is created if "
         "missing. A change takes effect at the next start.",
     )
 
 
 class RuleSelector(Model):
-    """Picks EventRules of the Detector's namespace by their labels."""
+    """Selects EventRules of the Detector's namespace by their labels."""
 
     match_labels: dict[Annotated[str, Field(max_length=317)], Annotated[str, Field(max_length=63)]] = Field(
-        default_factory=dict, max_length=16, description="All must match; an empty map selects every rule."
+        default_factory=dict,
+        max_length=16,
+        description="The labels that a rule must have, all of them. An empty map selects every rule.",
     )
 
     def matches(self, labels: dict[str, str]) -> bool:
@@ -95,11 +99,10 @@ class RuleSelector(Model):
         return all(labels.get(key) == value for key, value in self.match_labels.items())
 
 
-_POD_WITHOUT_MODE = "pod says nothing without a mode: give mode Standalone or Sidecar, or remove pod"
-_ACCOUNTS_WITHOUT_SIDECAR = "serviceAccountNames says nothing without mode Sidecar: give it, or remove the names"
+_POD_WITHOUT_MODE = "pod has no effect without mode: set mode to Standalone or Sidecar, or remove pod"
+_ACCOUNTS_WITHOUT_SIDECAR = "serviceAccountNames has no effect without mode Sidecar: set mode: Sidecar, or remove it"
 _SIDECAR_ON_NODES = (
-    "pod.nodeSelector and pod.tolerations: with mode Sidecar the detector runs where the pod does that it is in: "
-    "remove them"
+    "pod.nodeSelector and pod.tolerations have no effect with mode Sidecar, which uses an existing pod: remove them"
 )
 
 
@@ -121,82 +124,85 @@ class DetectorSpec(Model):
 
     mode: DetectorMode | None = Field(
         default=None,
-        description="Standalone: the application manager runs the detector, as a Deployment of this namespace. "
-        "Sidecar: it puts the detector into the pods of this namespace that are labelled wayside.dev/detector: <name>. "
-        "Default: somebody else runs it.",
+        description="Standalone: the application manager runs the detector as a Deployment in this namespace. "
+        "Sidecar: the application manager injects the detector into the pods of this namespace that have the label "
+        "wayside.dev/detector: <name>. Default: the detector is run by other means.",
     )
     pod: DetectorPod | None = Field(
         default=None,
-        description="With a mode: the detector's pod, or its container in others' pods. Default: all of its defaults.",
+        description="The detector's pod (Standalone), or its container in other pods (Sidecar). Only with a mode.",
     )
     service_account_names: list[ObjectName] | None = Field(
         default=None,
         max_length=64,
-        description="With mode Sidecar: the service accounts whose pods may run it. They, and no others, get the "
-        "rights of this detector.",
+        description="The service accounts whose pods may run the detector. Only these accounts get the detector's "
+        "permissions. Only with mode Sidecar.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
     zenoh: Zenoh = Field(default=Zenoh(), description="The Zenoh session.")
     sources: list[DataSource] = Field(
         default_factory=list,
         max_length=16,
-        description="Where streams come from that do not come over Zenoh.",
+        description="Sources of streams other than Zenoh.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     clients: list[Client] = Field(
         default_factory=list,
         max_length=1024,
-        description="What is known of clients beforehand; others appear with their first sample.",
+        description="Clients that are known in advance. Other clients appear with their first sample.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     streams: list[Stream] = Field(
         min_length=1,
         max_length=128,
-        description="The data to take in.",
+        description="The data that the detector receives.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     asn1: list[Asn1Module] = Field(
         default_factory=list,
         max_length=32,
-        description="ASN.1 modules for uper streams: of messages that no package defines, such as etsi/cpm, or of "
-        "other versions than the packages have. Give all modules that they import as well.",
+        description="ASN.1 modules for uper streams: for messages that no package defines, such as etsi/cpm, or to "
+        "replace the versions of the packages. All modules that they import must be included.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     messages: list[MessageDefinition] = Field(
         default_factory=list,
         max_length=256,
-        description="ROS 2 message types that are not of the common packages, or are other than there.",
+        description="Definitions of ROS 2 message types that the common packages lack or define differently.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
-    buffer: Buffer = Field(default=Buffer(), description="How much is kept.")
+    buffer: Buffer = Field(default=Buffer(), description="The limits of the buffer of samples.")
     client_timeout: PositiveDuration = Field(
         default=PositiveDuration("30s"),
-        description="A client from which nothing was received this long is lost: its episodes end, reason ClientLost. "
-        "Counted from the detector's start at the earliest.",
+        description="A client is lost after this time without data: its episodes end with reason ClientLost. The time "
+        "counts from the start of the detector at the earliest.",
     )
     clock: Clock = Field(
         default=Clock.WALL,
-        description="Wall: a sample's time is when it was received. Data: its stamp, for simulated time, recordings.",
+        description="The time of a sample. Wall: the time at which it was received. Data: its stamp, for simulated "
+        "time and recordings.",
     )
     lateness: Duration = Field(
         default=Duration("200ms"),
-        description="With clock Data: tick t runs once a stamp of at least t + lateness, and later than t, was seen.",
+        description="With clock Data: tick t runs after a stamp later than t, and at least t + lateness, was received.",
     )
     max_ahead: Duration = Field(
         default=Duration("1s"),
-        description="With clock Data: a sample whose stamp is further ahead of the rest is dropped and counted.",
+        description="With clock Data: a sample whose stamp is further ahead of all others is dropped and counted.",
     )
     state: State | None = Field(
         default=None,
-        description="Where open episodes are kept. Without it, a restart takes up only those that have a live task.",
+        description="Persists open episodes. Without it, a restart restores only those episodes that have a live task.",
     )
     recordings: Recordings | None = Field(
-        default=None, description="Where the recordings of record actions go. Rules that record need it."
+        default=None, description="The storage of record actions. Required by rules that record."
     )
     database: Database | None = Field(
-        default=None, description="The MongoDB that database actions write to. Those rules need it."
+        default=None, description="The MongoDB database of database actions. Required by rules that use them."
     )
-    rules: RuleSelector = Field(default=RuleSelector(), description="Which EventRules of the namespace are evaluated.")
+    rules: RuleSelector = Field(
+        default=RuleSelector(), description="Selects the EventRules of the namespace to evaluate."
+    )
 
     @model_validator(mode="after")
     def _unique_names(self) -> DetectorSpec:
@@ -238,7 +244,7 @@ class DetectorSpec(Model):
         for field, path in self.folders.items():
             if not path.startswith("/") or path.strip("/") == "" or ":" in path or ".." in path.split("/"):
                 raise ValueError(
-                    f"{field}: {path!r} is no folder for a volume: in a pod, give an absolute path without .. and :, "
+                    f"{field}: {path!r} cannot be a volume path: in a pod, use an absolute path without .. and :, "
                     "such as /var/lib/wayside"
                 )
         return self
@@ -262,7 +268,7 @@ class DetectorSpec(Model):
         for name in (allowed.streams or ()) if allowed is not None else ():
             if self.stream(name) is None:
                 there = ", ".join(stream.name for stream in self.streams)
-                raise ValueError(f"recordings.onRequest.streams: there is no stream {name}, there is {there}")
+                raise ValueError(f"recordings.onRequest.streams: there is no stream {name}; the Detector has {there}")
         return self
 
     def stream(self, name: str) -> Stream | None:
@@ -274,7 +280,7 @@ class DetectorSpec(Model):
         return (stream.buffer.duration or self.buffer.duration).ns
 
     def stale_after_ns(self, stream: Stream) -> int | None:
-        """When a stream's newest sample is too old to be believed, in nanoseconds; None: never."""
+        """The age at which a stream's newest sample is stale, in nanoseconds; None: never."""
         if stream.never_stale:
             return None
         if stream.stale_after_ns is not None:
@@ -283,18 +289,20 @@ class DetectorSpec(Model):
 
 
 class DetectorStatus(Model):
-    """What the application manager says of the detector."""
+    """The observed state of the detector."""
 
-    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
-    rules: int = Field(default=0, description="How many EventRules it selects.")
+    observed_generation: int = Field(
+        default=0, description="The metadata.generation that the status was computed from."
+    )
+    rules: int = Field(default=0, description="The number of EventRules that the detector selects.")
     conditions: list[Condition] = conditions_field(
-        "Accepted: whether the detector can run. Running, with a mode: whether it does, and if not, why. Ready: all of "
-        "these. Stalled: it has to be corrected."
+        "Accepted: the specification can run. Running (only with a mode): the detector runs; otherwise the reason "
+        "explains why not. Ready: all of these are True. Stalled: the specification is invalid and must be corrected."
     )
 
 
 class Detector(Kind):
-    """What a detector takes in, keeps and evaluates."""
+    """The configuration of a detector: the data that it receives, buffers and evaluates."""
 
     plural: ClassVar[str] = "detectors"
     short_name: ClassVar[str] = "det"
@@ -308,7 +316,5 @@ class Detector(Kind):
     ]
 
     kind: str = "Detector"
-    spec: DetectorSpec = Field(description="Streams, buffer, time and rules.")
-    status: DetectorStatus | None = Field(
-        default=None, description="What the application manager says of the detector."
-    )
+    spec: DetectorSpec = Field(description="The streams, buffer, clock and rules of the detector.")
+    status: DetectorStatus | None = Field(default=None, description="The observed state of the detector.")

@@ -1,4 +1,4 @@
-"""YAML files to kinds: every error names the file, the line and the field, and says what to do."""
+"""Parses YAML files into kinds. Every error names the file, the line, the field and the remedy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wayside.inputerror import InputError
 __all__ = ["Document", "DocumentError", "FieldPath", "Problem", "field_text", "load_documents", "parse_object"]
 
 _MEANINGFUL = frozenset("\"'![]{}&*%@`|>#,?")
-"""What begins with one of these means something to YAML."""
+"""The first characters that have a special meaning in YAML."""
 
 _DEEPEST = 100
 _MOST_FIELDS = 200_000
@@ -31,7 +31,7 @@ MAXIMUM_BYTES = 256 * 1024
 
 _BOUNDED = ("ApplicationTemplate", "Detector", "EventRule")  # tasks and instances have bounds for their parameters
 
-_TOO_DEEP = f"is nested more than {_DEEPEST} deep: an alias may hold itself"
+_TOO_DEEP = f"is nested more than {_DEEPEST} levels deep: an alias may refer to itself"
 
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -49,19 +49,19 @@ class Problem:
     """The name of the check that found it; empty for what makes a file unreadable."""
 
     def __str__(self) -> str:
-        return self._said("")
+        return self._text("")
 
     def as_warning(self) -> str:
-        """The same for what is doubtful, not wrong."""
-        return self._said("warning: ")
+        """The same for a warning."""
+        return self._text("warning: ")
 
-    def _said(self, how: str) -> str:
+    def _text(self, severity: str) -> str:
         where = f"{self.file}:{self.line}:{self.column}: " if self.line else f"{self.file}: "
-        return where + how + (f"{self.field}: " if self.field else "") + self.message
+        return where + severity + (f"{self.field}: " if self.field else "") + self.message
 
 
 class DocumentError(InputError):
-    """Files that cannot be used; `problems` has all that is wrong with them."""
+    """Files that cannot be used; `problems` has every problem."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         super().__init__("\n".join(map(str, problems)))
@@ -70,7 +70,7 @@ class DocumentError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """One object of a file, and where its fields stand."""
+    """One object of a file, with the positions of its fields."""
 
     object: Kind
     file: str
@@ -143,7 +143,7 @@ def _files(paths: Iterable[str | Path], problems: list[Problem]) -> Iterator[Pat
         if path.is_dir():
             inside = sorted(child for child in path.iterdir() if child.suffix in (".yaml", ".yml", ".json"))
             if not inside:
-                problems.append(Problem(str(path), 0, 0, "", "the folder holds no .yaml, .yml or .json file"))
+                problems.append(Problem(str(path), 0, 0, "", "the folder contains no .yaml, .yml or .json file"))
             yield from inside
         elif path.exists():
             yield path
@@ -160,30 +160,30 @@ def _nodes(text: str, file: str, problems: list[Problem]) -> Iterator[yaml.Node]
         lines = text.splitlines()
         mark = error.problem_mark or error.context_mark
         if error.context_mark and mark and mark.line >= len(lines):
-            mark = error.context_mark  # found out at the end of the file: tell where what is not closed began
+            mark = error.context_mark  # detected at the end of the file: report the start of the unclosed part
         line, column = (mark.line + 1, mark.column + 1) if mark else (0, 0)
         source = lines[line - 1] if 0 < line <= len(lines) else ""
         problems.append(Problem(file, line, column, "", f"is not YAML: {error.problem}; {_remedy(source, column)}"))
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
         line, column = before.count("\n") + 1, error.position - before.rfind("\n")
-        reason = f"holds the character {text[error.position]!r}, which YAML does not allow: remove it"
+        reason = f"contains the character {text[error.position]!r}, which YAML does not allow: remove it"
         problems.append(Problem(file, line, column, "", reason))
     except RecursionError:
         problems.append(Problem(file, 0, 0, "", _TOO_DEEP))
 
 
 def _remedy(line: str, column: int) -> str:
-    """What to do about a line that is not YAML: mostly, an expression means something else to it and needs quotes."""
+    """The remedy for a line that is not YAML: mostly, an expression with special characters that needs quotes."""
     _, _, value = line.partition(": ")
     value = value.strip()
     if line[: column + 1].strip(" ").startswith("\t"):
         return "indent with spaces, not with tabs"
     if line.lstrip(" -").startswith("{") or value.startswith("{"):
-        return "inside {…} and […], quote each text that holds a bracket, a brace, a comma, or `: `"
+        return "inside {…} and […], quote each string that contains a bracket, a brace, a comma, or `: `"
     if value[:1] in _MEANINGFUL or ": " in value:
         quoted = value.replace("'", "''")
-        return f"an expression that means something to YAML must be quoted as a whole: '{quoted}'"
+        return f"an expression with special characters of YAML must be quoted as a whole: '{quoted}'"
     return "check the indentation and the quotes here and on the line above"
 
 
@@ -196,7 +196,9 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
         return None
     try:
         if not isinstance(raw, dict):
-            raise ValueError(f"is not an object but {raw!r}: each document needs apiVersion, kind, metadata and spec")
+            raise ValueError(
+                f"must be an object, but is {raw!r}: each document needs apiVersion, kind, metadata and spec"
+            )
         kind = _kind_of(raw)
     except ValueError as error:
         problems.append(Problem(file, *_mark(marks, ()), "", str(error)))
@@ -213,7 +215,7 @@ def _kind_of(raw: dict[str, Any]) -> type[Kind]:
     kind = KINDS.get(str(raw.get("kind")))
     if raw.get("apiVersion") != API_VERSION or kind is None:
         raise ValueError(
-            f"apiVersion {raw.get('apiVersion')!r}, kind {raw.get('kind')!r} is none of ours: "
+            f"apiVersion {raw.get('apiVersion')!r}, kind {raw.get('kind')!r} is not a Wayside kind: "
             f"write apiVersion: {API_VERSION} and one of the kinds {', '.join(KINDS)}"
         )
     return kind
@@ -226,7 +228,7 @@ class _TagError(Exception):
 
 
 def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, int]]) -> Any:
-    """The node as plain Python; notes where each field stands."""
+    """The node as plain Python; records the position of each field."""
     mark = (node.start_mark.line + 1, node.start_mark.column + 1)
     marks[path] = mark
     if len(path) > _DEEPEST:
@@ -235,7 +237,7 @@ def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, i
         raise _TagError(path[:3], mark, f"the object has more than {_MOST_FIELDS} fields: aliases may multiply them")
     if node.tag.startswith("!"):
         written = f"{node.tag} {node.value}".strip() if isinstance(node, yaml.ScalarNode) else node.tag
-        raise _TagError(path, mark, f"YAML takes {node.tag} for a tag: quote the expression, '{written}'")
+        raise _TagError(path, mark, f"YAML reads {node.tag} as a tag: quote the expression, '{written}'")
     if isinstance(node, yaml.MappingNode):
         result: dict[str, Any] = {}
         for key_node, child in node.value:

@@ -10,7 +10,7 @@ from wayside.api.schema import crd
 
 
 def editor_schema() -> dict[str, Any]:
-    """The schema of a YAML document of any of the kinds: which one, `kind` says."""
+    """The schema of a YAML document of any of the kinds; the field `kind` selects one."""
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "title": "Wayside",

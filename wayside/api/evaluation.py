@@ -1,4 +1,4 @@
-"""When a rule is evaluated: at whole multiples of a time, with each sample of a stream, or when somebody asks."""
+"""When a rule is evaluated: at whole multiples of a period, at each sample of a stream, or on request."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from wayside.api.base import Duration, Model, ObjectName, validations
 
 DEFAULT_PERIOD = Duration("1s")
-"""How often a rule is evaluated that does not say when."""
+"""The default period of a rule."""
 
 
 class Evaluation(Model):
@@ -24,21 +24,19 @@ class Evaluation(Model):
 
     every: Duration | None = Field(
         default=None,
-        description="The rule is evaluated at each whole multiple of this; 10ms at the least. Default: 1s.",
+        description="Evaluate the rule at whole multiples of this period, 10ms or more. Default: 1s.",
     )
     on_sample: ObjectName | None = Field(
         default=None,
-        description="The rule is evaluated with each sample of this stream, for the subjects that its client belongs "
-        "to, and when a for, a cooldown or the unknownTimeout is over.",
+        description="Evaluate the rule at each sample of this stream, for the subjects of the sample's client, and "
+        "whenever a `for`, a cooldown or an unknownTimeout expires.",
     )
-    on_demand: bool | None = Field(
-        default=None, description="true: the rule is evaluated only when somebody asks for it."
-    )
+    on_demand: bool | None = Field(default=None, description="If true, evaluate the rule only on request.")
     priority: int = Field(
         default=0,
         ge=-1_000,
         le=1_000,
-        description="When the evaluation falls behind, rules of lower priority are evaluated less often first.",
+        description="Under overload, rules with a lower priority are the first to be evaluated less often.",
     )
 
     @property

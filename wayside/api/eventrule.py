@@ -1,4 +1,4 @@
-"""EventRule: what an event is (scope, signals, when, until, for) and what to do about it."""
+"""EventRule: the definition of an event (scope, signals, when, until, for), and its actions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ OF_A_SAMPLE = frozenset({Aggregate.LAST, Aggregate.FIRST, Aggregate.PREVIOUS})
 """The aggregates that are the value of one sample."""
 
 WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE, Aggregate.ACTIVE})
-"""The aggregates that look at no value."""
+"""The aggregates that use no value."""
 
 WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE, Aggregate.ACTIVE}
 """The aggregates that need `over`."""
@@ -69,12 +69,11 @@ class Signal(Model):
         ),
         (
             "has(self.model) || has(self.plugin) || (self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
-            "give value, e.g. value: msg.speed; but none for the aggregates Count, Age and Active, "
-            "which look at no value",
+            "give value, e.g. value: msg.speed, except with the aggregates Count, Age and Active, which use no value",
         ),
         (
             "self.aggregate != 'Active' || (has(self.rule) && !has(self.over) && !has(self.where))",
-            "the aggregate Active is for a signal over a rule, and takes neither over nor where",
+            "aggregate Active is for a signal with rule, without over and where",
         ),
         (
             "[has(self.stream), has(self.rule), has(self.model), has(self.plugin)].filter(given, given).size() == 1",
@@ -86,40 +85,41 @@ class Signal(Model):
         ),
     )
 
-    name: Identifier = Field(description="The variable by which expressions use the signal.")
-    stream: ObjectName | None = Field(default=None, description="The stream of the Detector that it is computed from.")
+    name: Identifier = Field(description="The name of the variable in expressions.")
+    stream: ObjectName | None = Field(default=None, description="The name of a stream of the Detector.")
     rule: ObjectName | None = Field(
         default=None,
-        description="Instead of a stream, another rule that the Detector selects: the samples are the starts of its "
-        "episodes that the client is a subject of. msg has episode, subject, subjects, onsetTime and startTime "
-        "(seconds since the epoch), and the values of the start.",
+        description="Instead of a stream: another rule that the Detector selects. Its samples are the starts of "
+        "episodes that have the client as a subject. msg contains episode, subject, subjects, onsetTime and startTime "
+        "(seconds since the epoch), and the values at the start.",
     )
     model: ModelSource | None = Field(
-        default=None, description="Instead of a stream, an ONNX model over other signals, an image or a point cloud."
+        default=None, description="Instead of a stream: an ONNX model over other signals, an image or a point cloud."
     )
     plugin: SignalPlugin | None = Field(
         default=None,
-        description="Instead of a stream, Python code that computes the value for the rule's subject at each "
-        "evaluation. In a pairs scope the value is the pair's: expressions use it by its name alone.",
+        description="Instead of a stream: Python code that computes the value for the rule's subject at each "
+        "evaluation. In a pairs scope, the value belongs to the pair: expressions use the bare name, without a or b.",
     )
     value: Expression | None = Field(
         default=None,
         description="CEL over msg (the decoded sample), key (the captured chunks), sample (stamp, received, latency, "
-        "size) and parameters. Not needed for Count, Age and Active.",
+        "size) and parameters. Required, except with the aggregates Count, Age and Active.",
     )
     where: Expression | None = Field(
-        default=None, description="CEL over msg, key, sample, parameters: only samples for which it is true count."
+        default=None, description="CEL over msg, key, sample and parameters. Only samples for which it is true count."
     )
     over: PositiveDuration | None = Field(
         default=None,
-        description="The window (t - over, t]. Needed by all aggregates but Last, First, Previous, Age and Active.",
+        description="The length of the window: at tick t it is (t - over, t]. Required, except with the aggregates "
+        "Last, First, Previous, Age and Active.",
     )
     aggregate: Aggregate = Field(
         default=Aggregate.LAST,
-        description="How the samples become one value. Last, Previous, First: the newest, the one before, the oldest. "
-        "Min, Max, Mean, Sum, StdDev (of the population): of numbers. Delta: last - first; Rate: that per second. "
-        "All, Any: of booleans. Distinct: the list of different values. Count: how many samples. Age: seconds since "
-        "the last one was received. Active, of a rule: whether an episode is open.",
+        description="How the samples become one value. Last, Previous, First: the newest, the second newest, the "
+        "oldest value. Min, Max, Mean, Sum, StdDev (of the population): of numbers. Delta: last - first. Rate: Delta "
+        "per second. All, Any: of booleans. Distinct: the list of distinct values. Count: the number of samples. Age: "
+        "seconds since the last sample was received. Active (only for a rule): whether an episode is open.",
     )
 
     @model_validator(mode="after")
@@ -133,66 +133,70 @@ class Signal(Model):
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
         if self.aggregate is Aggregate.ACTIVE and (self.rule is None or self.over or self.where):
-            raise ValueError("aggregate Active is for a signal over a rule, and takes neither over nor where")
+            raise ValueError("aggregate Active is for a signal with rule, without over and where")
         if self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:
-            raise ValueError(f"aggregate {self.aggregate} looks at no value: remove value (where picks samples)")
+            raise ValueError(f"aggregate {self.aggregate} uses no value: remove value (use where to select samples)")
         return self
 
 
 class EventRuleSpec(Model):
     """An event and its actions."""
 
-    description: str = Field(default="", max_length=1024, description="What the event is, for people.")
-    classification: Classification | None = Field(
-        default=None, description="Where the use case stands in the classification scheme."
-    )
+    description: str = Field(default="", max_length=1024, description="A description of the event, for people.")
+    classification: Classification | None = Field(default=None, description="The classification of the use case.")
     enabled: bool = Field(
-        default=True, description="false: the rule is loaded and checked, but not evaluated; open episodes end."
+        default=True,
+        description="If false, the rule is loaded and validated, but not evaluated, and its open episodes end.",
     )
     dry_run: bool = Field(
-        default=False, description="true: events are published, marked with dryRun, but no action runs."
+        default=False, description="If true, events are published with the mark dryRun, but no action runs."
     )
-    scope: Scope = Field(default=Scope(client=ClientScope()), description="Whom the rule is about.")
-    each: Each | None = Field(default=None, description="Evaluate the rule once for each of these elements.")
+    scope: Scope = Field(default=Scope(client=ClientScope()), description="The subjects of the rule.")
+    each: Each | None = Field(
+        default=None, description="The elements of the rule. The rule is evaluated once for each element."
+    )
     evaluation: Evaluation = Field(default=Evaluation(), description="When the rule is evaluated.")
     parameters: Constants = Field(
         default_factory=dict,
-        description="Constants that the expressions share, as parameters.<name>: numbers, texts, booleans, and lists "
-        "and maps of them, such as polygons. A Detector can set others for single clients.",
+        description="Constants for expressions, used as parameters.<name>: numbers, texts, booleans, and lists and "
+        "maps of them, such as polygons; at most 64 KiB in total. A Detector can override them per client.",
     )
     signals: list[Signal] = Field(
         default_factory=list,
         max_length=64,
-        description="The values that the conditions use. In a pairs scope each client has its own: a.speed, b.speed.",
+        description="The values that conditions use. In a pairs scope, each client has its own: a.speed, b.speed.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
-    when: Expression = Field(description="CEL, boolean: an episode starts when it holds.")
+    when: Expression = Field(description="CEL, boolean: the condition that starts an episode.")
     until: Expression | None = Field(
-        default=None, description="CEL, boolean: an open episode ends when it holds. Default: not `when`."
+        default=None,
+        description="CEL, boolean: the condition that ends an open episode. Default: the negation of `when`.",
     )
     for_: Duration = Field(
-        default=Duration("0s"), alias="for", description="`when` must hold this long before an episode starts."
+        default=Duration("0s"), alias="for", description="How long `when` must hold before an episode starts."
     )
     cooldown: Duration = Field(
-        default=Duration("0s"), description="After an episode its subject rests this long; no onset falls into it."
+        default=Duration("0s"),
+        description="The rest time of a subject after the end of an episode. No onset falls within it.",
     )
     max_episodes_per_hour: int | None = Field(
         default=None,
         ge=1,
         le=1_000_000,
-        description="So many episodes of a client may start within an hour; further ones are left out, and counted.",
+        description="The maximum number of episodes per client and hour. Further episodes are skipped and counted. "
+        "Default: no limit.",
     )
     unknown_timeout: Duration | None = Field(
         default=None,
-        description="An open episode whose condition stays unknown this long ends, reason Unknown. "
+        description="An open episode ends with reason Unknown after its condition has been unknown for this time. "
         "Default: the Detector's clientTimeout.",
     )
     actions: list[Action] = Field(
         default_factory=list,
         max_length=16,
-        description="What to do about it. Without any, the rule only publishes events.",
+        description="The actions of an episode. Without actions, the rule only publishes events.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
 
@@ -206,9 +210,11 @@ class EventRuleSpec(Model):
 
 
 class EventRuleStatus(Model):
-    """What the application manager says of the rule."""
+    """The observed state of the rule."""
 
-    observed_generation: int = Field(default=0, description="The generation that the status speaks of.")
+    observed_generation: int = Field(
+        default=0, description="The metadata.generation that the status was computed from."
+    )
     detectors: list[Annotated[str, Field(max_length=63)]] = Field(
         default_factory=list,
         max_length=256,
@@ -216,12 +222,12 @@ class EventRuleStatus(Model):
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     conditions: list[Condition] = conditions_field(
-        "Accepted, Ready: whether the rule can be evaluated. Stalled: it has to be corrected."
+        "Accepted, Ready: the rule can be evaluated. Stalled: the rule is invalid and must be corrected."
     )
 
 
 class EventRule(Kind):
-    """An event to detect in the data of vehicles and stations, and what to do about it."""
+    """An event to detect in the data of vehicles and stations, and the actions that follow from it."""
 
     plural: ClassVar[str] = "eventrules"
     short_name: ClassVar[str] = "er"
@@ -235,8 +241,8 @@ class EventRule(Kind):
     ]
 
     kind: str = "EventRule"
-    spec: EventRuleSpec = Field(description="The event and its actions.")
-    status: EventRuleStatus | None = Field(default=None, description="What the application manager says of the rule.")
+    spec: EventRuleSpec = Field(description="The definition of the event, and its actions.")
+    status: EventRuleStatus | None = Field(default=None, description="The observed state of the rule.")
 
     def semantics(self) -> dict[str, Any]:
         """The fields that decide which episodes there are; another value of any of them ends open episodes."""

@@ -1,4 +1,4 @@
-"""A signal that an ONNX model computes: the file, what goes in and what comes out."""
+"""A signal that an ONNX model computes: the file, the inputs and the output."""
 
 from __future__ import annotations
 
@@ -17,26 +17,31 @@ TensorName = Annotated[str, Field(min_length=1, max_length=128)]
 
 
 class ModelWindow(Model):
-    """The latest values of signals over a stream: the newest ones, or a time drawn again at equal steps."""
+    """The latest values of signals over a stream: the newest samples, or a time span resampled at equal steps."""
 
     signals: list[Identifier] = Field(
         min_length=1,
         max_length=64,
-        description="Signals of this rule over a stream, whose samples are taken; their aggregates say nothing here.",
+        description="Signals of this rule over a stream. The input is made of the values of their samples; their "
+        "aggregates are ignored.",
         json_schema_extra=_ATOMIC,
     )
     last: int | None = Field(
-        default=None, ge=1, le=10_000, description="The newest so many samples; unknown while there are fewer."
+        default=None,
+        ge=1,
+        le=10_000,
+        description="The number of newest samples. The signal is unknown while there are fewer.",
     )
     over: PositiveDuration | None = Field(
-        default=None, description="Instead of last: the time up to now, read at `samples` equal steps."
+        default=None, description="Instead of last: the time span up to now, resampled at `samples` equal steps."
     )
     samples: int | None = Field(
         default=None,
         ge=2,
         le=10_000,
-        description="With over: so many values, the last one at now. Between samples they lie on a straight line, "
-        "after the newest one they stay; unknown while no sample is as old as the first.",
+        description="With over: the number of values; the last one is at the current time. Values between two samples "
+        "are interpolated linearly; after the newest sample, its value is held. The signal is unknown while no sample "
+        "is as old as the first step.",
     )
 
     @model_validator(mode="after")
@@ -54,7 +59,7 @@ class ModelWindow(Model):
 
 
 class Channels(StrEnum):
-    """What a pixel holds, in this order."""
+    """The channels of a pixel, in this order."""
 
     GRAY = "Gray"
     RGB = "Rgb"
@@ -72,23 +77,30 @@ class ModelImage(Model):
     """The newest sensor_msgs/msg/Image of a stream: (pixel * scale - mean) / std of each channel."""
 
     stream: ObjectName = Field(description="A stream of type sensor_msgs/msg/Image.")
-    width: int = Field(ge=1, le=4096, description="Pixels. An image of another size is drawn again, nearest pixel.")
-    height: int = Field(ge=1, le=4096, description="Pixels.")
-    channels: Channels = Field(default=Channels.RGB, description="Gray, Rgb or Bgr; the image is converted.")
-    layout: Layout = Field(
-        default=Layout.CHW, description="Chw: channels, rows, columns. Hwc: rows, columns, channels."
+    width: int = Field(
+        ge=1, le=4096, description="The width in pixels. An image of another size is resampled (nearest pixel)."
     )
-    scale: float = Field(default=1.0, description="E.g. 0.00392157 for pixels of 0 to 255 as 0 to 1.")
+    height: int = Field(ge=1, le=4096, description="The height in pixels.")
+    channels: Channels = Field(
+        default=Channels.RGB, description="The channels of a pixel: Gray, Rgb or Bgr. The image is converted to them."
+    )
+    layout: Layout = Field(
+        default=Layout.CHW,
+        description="The order of the axes. Chw: channels, rows, columns. Hwc: rows, columns, channels.",
+    )
+    scale: float = Field(
+        default=1.0, description="The factor for each pixel value, e.g. 0.00392157 to map 0…255 to 0…1."
+    )
     mean: list[float] = Field(
         default_factory=list,
         max_length=3,
-        description="Subtracted after scaling, one for each channel; default 0.",
+        description="The values to subtract after scaling, one per channel. Default: 0.",
         json_schema_extra=_ATOMIC,
     )
     std: list[Annotated[float, Field(gt=0)]] = Field(
         default_factory=list,
         max_length=3,
-        description="Divided by, one for each channel; default 1.",
+        description="The values to divide by after subtracting the mean, one per channel. Default: 1.",
         json_schema_extra=_ATOMIC,
     )
 
@@ -106,7 +118,7 @@ class ModelImage(Model):
 
 
 class ModelPoints(Model):
-    """The newest sensor_msgs/msg/PointCloud2 of a stream: so many points, with the fields in this order."""
+    """The newest sensor_msgs/msg/PointCloud2 of a stream: `count` points, with the fields in this order."""
 
     stream: ObjectName = Field(description="A stream of type sensor_msgs/msg/PointCloud2.")
     fields: list[Annotated[str, Field(min_length=1, max_length=64)]] = Field(
@@ -119,13 +131,13 @@ class ModelPoints(Model):
     count: int = Field(
         ge=1,
         le=1_000_000,
-        description="Of more points, every so many-th is taken; fewer are filled up with zeros. Points with a NaN in a "
-        "field or in x, y, z are left out.",
+        description="The number of points. Of more points, every n-th is used; fewer are padded with zeros. Points "
+        "with a NaN in a field or in x, y, z are omitted.",
     )
     scale: list[float] = Field(
         default_factory=list,
         max_length=16,
-        description="What each field is multiplied by; default 1.",
+        description="The factors for the fields, one per field. Default: 1.",
         json_schema_extra=_ATOMIC,
     )
 
@@ -145,14 +157,16 @@ class ModelInput(Model):
     signals: list[Identifier] = Field(
         default_factory=list,
         max_length=64,
-        description="The current values of these signals of the rule, numbers or booleans, as a vector.",
+        description="Signals of the rule. The input is a vector of their current values, numbers or booleans.",
         json_schema_extra=_ATOMIC,
     )
     window: ModelWindow | None = Field(
-        default=None, description="The latest values of signals: a vector, or with several signals a matrix of rows."
+        default=None, description="The latest values of signals: a vector, or a matrix of rows with several signals."
     )
-    image: ModelImage | None = Field(default=None, description="A camera's newest image.")
-    points: ModelPoints | None = Field(default=None, description="A lidar's newest points, a matrix of rows.")
+    image: ModelImage | None = Field(default=None, description="The newest image of a camera.")
+    points: ModelPoints | None = Field(
+        default=None, description="The newest point cloud of a lidar, as a matrix with one row per point."
+    )
 
     @model_validator(mode="after")
     def _exactly_one(self) -> ModelInput:
@@ -176,26 +190,30 @@ class ModelInput(Model):
 
 
 class ModelSource(Model):
-    """An ONNX model. Its first axis is the clients', which are computed together."""
+    """An ONNX model. Its first axis is the batch of clients, which are computed together."""
 
     file: str = Field(
         min_length=1,
         max_length=1024,
-        description="The .onnx file, e.g. on a volume: /models/risk.onnx. Its sha256 is in the events.",
+        description="The path of the .onnx file, e.g. on a volume: /models/risk.onnx. Events contain its SHA-256 "
+        "digest.",
     )
     sha256: str | None = Field(
-        default=None, pattern=r"^[0-9a-f]{64}$", max_length=64, description="Refuse the file if it is another one."
+        default=None,
+        pattern=r"^[0-9a-f]{64}$",
+        max_length=64,
+        description="The expected SHA-256 digest of the file. Any other file is refused.",
     )
     inputs: list[ModelInput] = Field(
         min_length=1,
         max_length=16,
-        description="Every input that the model needs.",
+        description="The inputs of the model, all of them.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     output: TensorName | None = Field(
         default=None,
-        description="The output that is the signal: a number, or a list where it has several. "
-        "Default: the only one, or a map of all by name.",
+        description="The output to use as the signal: a number, or a list if it has several values. Default: the only "
+        "output, or a map of all outputs by name.",
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""What a task wants of an application: that it runs, runs otherwise, or does not run."""
+"""The operation of a task: deploy, reconfigure or suspend an application."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Operation(StrEnum):
-    """What a task does while it lives."""
+    """The effect of a task while it is live."""
 
     DEPLOY = "Deploy"
     RECONFIGURE = "Reconfigure"
@@ -14,8 +14,9 @@ class Operation(StrEnum):
 
 
 MEANING = (
-    "Deploy: the application runs while any such task lives. Reconfigure: the parameters given replace the merged ones "
-    "of what runs; nothing is started. Suspend: what runs is stopped, if no Deploy of higher priority demands it. The "
-    "last two need the parameters that the template's key is made from; without any of them they are for all instances."
+    "Deploy: the application runs while any such task is live. Reconfigure: the parameters replace the merged "
+    "parameters of running instances; nothing is started. Suspend: running instances are stopped, unless a Deploy task "
+    "of higher priority demands them. Reconfigure and Suspend select an instance by the parameters that the template's "
+    "key refers to; without any of these parameters they apply to all instances."
 )
 """The description of the field `operation`."""

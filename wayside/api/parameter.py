@@ -1,4 +1,4 @@
-"""Parameters of a template: what tasks may say, of which type and within which bounds, and how it merges."""
+"""Parameters of a template: their types, their bounds, and how the values of several tasks merge."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ _MAKING = (Merge.UNION, Merge.INTERSECTION, Merge.SUM)
 
 
 class Parameter(Model):
-    """One input of the template."""
+    """One parameter of the template."""
 
-    # What concerns `default`, and the items of `enum`, is said by the manager: to the CRD's CEL these have no type.
+    # The manager validates `default` and the items of `enum`, which have no type for the CRD's CEL.
     model_config = validations(
         (
             "!has(self.merge) || !(self.merge in ['Union', 'Intersection']) || self.type == 'array'",
@@ -84,7 +84,7 @@ class Parameter(Model):
         ),
         (
             "!has(self.minimum) || !has(self.maximum) || self.minimum <= self.maximum",
-            "minimum is above maximum: no value would fit",
+            "minimum is above maximum: no value is valid",
         ),
         ("!has(self.items) || self.type == 'array'", "items needs type array"),
         (
@@ -94,35 +94,41 @@ class Parameter(Model):
         ),
     )
 
-    type: ParameterType = Field(description="The JSON type.")
-    items: ItemType | None = Field(default=None, description="The type of an array's items; any where absent.")
-    description: str = Field(default="", max_length=1024, description="What the parameter means, with its unit.")
-    required: bool = Field(default=False, description="Whether each task must give it.")
-    default: JsonValue = Field(default=None, description="The value where no task gives one.")
-    minimum: float | None = Field(default=None, description="The smallest value of a number.")
+    type: ParameterType = Field(description="The JSON type of the value; integer is a number without a fraction.")
+    items: ItemType | None = Field(default=None, description="The JSON type of an array's items. Default: any type.")
+    description: str = Field(default="", max_length=1024, description="The meaning of the parameter, with its unit.")
+    required: bool = Field(
+        default=False, description="If true, every task must set the parameter. A required parameter has no default."
+    )
+    default: JsonValue = Field(default=None, description="The value if no task sets the parameter.")
+    minimum: float | None = Field(
+        default=None, description="The minimum of a number. A task with a smaller value is refused."
+    )
     maximum: float | None = Field(
         default=None,
-        description="The largest value of a number. A merged Sum is capped at it, and the instance says so.",
+        description="The maximum of a number. A task with a larger value is refused. A larger merged Sum is capped, "
+        "and the condition Capped of the instance reports it.",
     )
     pattern: str | None = Field(
         default=None,
         min_length=1,
         max_length=256,
-        description="What a text, or each text of an array, must match (RE2 syntax), anywhere in it: "
-        "write ^…$ for the whole.",
+        description="A regular expression (RE2 syntax) for a text, or for each text of an array. It may match "
+        "anywhere in the text; use ^…$ to match the whole text.",
     )
     enum: list[JsonValue] | None = Field(
         default=None,
         min_length=1,
         max_length=64,
-        description="The values allowed. Not with merge Union, Intersection and Sum, which make values of their own.",
+        description="The allowed values. Not with merge Union, Intersection or Sum, whose results may be other values.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     merge: Merge = Field(
         default=Merge.SAME,
-        description="Same: tasks must agree; one that differs is refused, reason Conflict. Union, Intersection: the "
-        "items that are in any, or in all, of the arrays, sorted. Max, Min, Sum: of the numbers. All, Any: whether "
-        "all, or any, of the booleans are true. HighestPriority: the value of the first task by priority.",
+        description="How the values of several tasks become one. Same: tasks must agree; a task that differs is "
+        "refused with reason Conflict. Union, Intersection: the items of any array, or of all arrays, sorted. Max, "
+        "Min, Sum: the maximum, minimum or sum of the numbers. All, Any: true if all, or any, of the booleans are "
+        "true. HighestPriority: the value of the task with the highest priority.",
     )
 
     @model_validator(mode="after")
@@ -138,13 +144,13 @@ class Parameter(Model):
         if self.type not in _NUMERIC and (self.minimum is not None or self.maximum is not None):
             yield f"minimum and maximum need type number or integer, not {self.type}"
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            yield f"minimum {self.minimum:g} is above maximum {self.maximum:g}: no value would fit"
+            yield f"minimum {self.minimum:g} is above maximum {self.maximum:g}: no value is valid"
         if self.items is not None and self.type is not ParameterType.ARRAY:
             yield f"items needs type array, not {self.type}"
         if self.pattern is not None and self.type is not ParameterType.STRING and self.items is not ItemType.STRING:
             yield f"pattern needs type string, or type array with items string, not {self.type}"
         if self.enum is not None and self.merge in _MAKING:
-            yield f"merge {self.merge} makes values of its own, which enum cannot list: remove one of merge and enum"
+            yield f"merge {self.merge} can produce values that enum does not list: remove one of merge and enum"
         for index, value in enumerate(self.enum or ()):
             if not _has_type(value, self.type):
                 yield f"enum: item {index}, {value!r}, is not of type {self.type}"
@@ -156,7 +162,7 @@ class Parameter(Model):
                 yield f"default: {problem}"
 
     def problem(self, value: JsonValue) -> str | None:
-        """Why the value does not fit the parameter, or None if it does. Of `pattern` this says nothing."""
+        """Why the value does not fit the parameter, or None if it does. Does not check `pattern`."""
         if not _has_type(value, self.type):
             return f"{value!r} is not of type {self.type}"
         if self.items is not None:
@@ -168,7 +174,7 @@ class Parameter(Model):
         if self.maximum is not None and value > self.maximum:
             return f"{value!r} is above the maximum of {self.maximum:g}"
         if self.enum is not None and value not in self.enum:
-            return f"{value!r} is none of {', '.join(map(repr, self.enum))}"
+            return f"{value!r} is not one of {', '.join(map(repr, self.enum))}"
         return None
 
 

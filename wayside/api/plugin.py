@@ -9,13 +9,14 @@ from wayside.api.source import PluginName
 
 
 class SignalPlugin(Model):
-    """A plugin that computes a signal, and how it is to do it."""
+    """A plugin that computes a signal, and its parameters."""
 
     name: PluginName = Field(
-        description="What computes it: unmatched-objects, or what an installed package offers as wayside.signals."
+        description="The plugin: unmatched-objects, or the name of a wayside.signals entry point of an installed "
+        "package."
     )
     parameters: dict[str, JsonValue] = Field(
         default_factory=dict,
-        description="What the plugin asks for; see its documentation.",
+        description="The parameters of the plugin; see its documentation.",
         json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
     )

@@ -1,4 +1,4 @@
-"""What a Detector says of its pod, or of its container in others' pods, which the application manager makes."""
+"""The detector's pod, or its container in other pods, which the application manager creates."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pydantic import Field, model_validator
 from wayside.api.base import Identifier, Model, ObjectName, PositiveQuantity, validations
 
 _ONE = "give claim or size, not both"
-_ONE_SOURCE = "give value or fromSecret, one of them"
-_ANY_KEY = "without a key, operator must be Exists; with operator Exists there is no value"
+_ONE_SOURCE = "give exactly one of value and fromSecret"
+_ANY_KEY = "without key, operator must be Exists; with operator Exists, remove value"
 
 RESERVED_VARIABLES = frozenset({"POD_NAME", "POD_NAMESPACE", "POD_UID"})
 """Environment variables by which the detector knows its pod."""
-_RESERVED = f"{', '.join(sorted(RESERVED_VARIABLES))} are set for each pod by itself: leave them out"
+_RESERVED = f"{', '.join(sorted(RESERVED_VARIABLES))} are set automatically in each pod: remove them"
 
 
 class DetectorMode(StrEnum):
-    """Who runs the detector."""
+    """How the detector is run."""
 
     STANDALONE = "Standalone"
     SIDECAR = "Sidecar"
@@ -40,17 +40,20 @@ Amounts = Annotated[
 
 
 class DetectorVolume(Model):
-    """A volume, and where it is in the pod."""
+    """A volume and its mount path."""
 
     model_config = validations(("!(has(self.claim) && has(self.size))", _ONE))
 
-    path: MountPath = Field(description="Where it is mounted, e.g. /var/lib/wayside.")
+    path: MountPath = Field(description="The mount path, e.g. /var/lib/wayside.")
     claim: ObjectName | None = Field(
         default=None,
-        description="A PersistentVolumeClaim of the namespace. Without it the volume lasts as long as the pod.",
+        description="The name of a PersistentVolumeClaim in the namespace. Without it, the volume is removed with the "
+        "pod.",
     )
     size: PositiveQuantity | None = Field(
-        default=None, description="Without a claim: at most so much; a pod that writes more is evicted. Default: any."
+        default=None,
+        description="Without a claim: the maximum size of the volume. A pod that writes more is evicted. Default: no "
+        "limit.",
     )
 
     @model_validator(mode="after")
@@ -61,26 +64,26 @@ class DetectorVolume(Model):
 
 
 class DetectorResources(Model):
-    """What is set aside for the detector, and what it may take at most."""
+    """The compute resources of the detector: requests and limits."""
 
     requests: Amounts = Field(
         default_factory=lambda: {"cpu": "100m", "memory": "256Mi"},
-        description="What a node must have free. Default: cpu 100m, memory 256Mi.",
+        description="The resources that a node must have available. Default: cpu 100m, memory 256Mi.",
     )
     limits: Amounts = Field(
         default_factory=lambda: {"memory": "1Gi"},
-        description="What it may take at most. Its memory must hold the buffer (spec.buffer.bytes) and some 200Mi. "
-        "Default: memory 1Gi.",
+        description="The maximum resources. The memory limit must cover the buffer (spec.buffer.bytes) plus some "
+        "200Mi. Default: memory 1Gi.",
     )
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorResources:
-        """What the API server would refuse the whole pod for."""
+        """Checks for which the API server would refuse the whole pod."""
         for field, amounts in (("requests", self.requests), ("limits", self.limits)):
             for name in amounts:
                 if name not in _RESOURCES and "/" not in name:
                     raise ValueError(
-                        f"{field}: {name!r} is no resource: give {', '.join(_RESOURCES)}, or one of the cluster's own, "
+                        f"{field}: {name!r} is not a resource: use {', '.join(_RESOURCES)}, or an extended resource, "
                         "such as example.com/gpu"
                     )
         for name, amount in self.requests.items():
@@ -88,7 +91,7 @@ class DetectorResources(Model):
             if limit is not None and _amount(amount) > _amount(limit):
                 raise ValueError(f"requests.{name}: {amount} is more than limits.{name}, {limit}: raise the limit")
             if "/" in name and (limit is None or _amount(amount) != _amount(limit)):
-                raise ValueError(f"requests.{name}: {amount} must be the same as limits.{name}: give both alike")
+                raise ValueError(f"requests.{name}: {amount} must equal limits.{name}: set both to the same amount")
         return self
 
 
@@ -104,11 +107,11 @@ def _amount(text: str) -> Decimal:
 
 
 class SecretKey(Model):
-    """An entry of a Secret."""
+    """A key of a Secret."""
 
-    name: ObjectName = Field(description="The Secret, of the Detector's namespace.")
+    name: ObjectName = Field(description="The name of the Secret, in the namespace of the Detector.")
     key: Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._A-Za-z0-9]+$")] = Field(
-        description="Its entry."
+        description="The key in the Secret."
     )
 
 
@@ -120,10 +123,11 @@ class DetectorVariable(Model):
         (f"!(self.name in {sorted(RESERVED_VARIABLES)})".replace("'", '"'), _RESERVED),
     )
 
-    name: Identifier = Field(description="Its name, e.g. OTEL_RESOURCE_ATTRIBUTES.")
-    value: Annotated[str, Field(max_length=4096)] | None = Field(default=None, description="What it says.")
+    name: Identifier = Field(description="The name of the variable, e.g. OTEL_RESOURCE_ATTRIBUTES.")
+    value: Annotated[str, Field(max_length=4096)] | None = Field(default=None, description="The literal value.")
     from_secret: SecretKey | None = Field(
-        default=None, description="Where to take it from. Without that Secret the detector does not start."
+        default=None,
+        description="The Secret key that contains the value. The detector does not start without that Secret.",
     )
 
     @model_validator(mode="after")
@@ -136,14 +140,14 @@ class DetectorVariable(Model):
 
 
 class TolerationOperator(StrEnum):
-    """How a taint's value is looked at."""
+    """How a toleration matches the value of a taint."""
 
     EQUAL = "Equal"
     EXISTS = "Exists"
 
 
 class TaintEffect(StrEnum):
-    """What a taint does to pods that do not tolerate it."""
+    """The effect of a taint on pods that do not tolerate it."""
 
     NO_SCHEDULE = "NoSchedule"
     PREFER_NO_SCHEDULE = "PreferNoSchedule"
@@ -151,7 +155,7 @@ class TaintEffect(StrEnum):
 
 
 class DetectorToleration(Model):
-    """A taint of nodes on which the detector may run nevertheless, as pods have it."""
+    """A toleration of a node taint, as in a PodSpec."""
 
     model_config = validations(
         (
@@ -162,15 +166,18 @@ class DetectorToleration(Model):
     )
 
     key: Annotated[str, Field(min_length=1, max_length=317)] | None = Field(
-        default=None, description="The taint's key. Default: any, with operator Exists."
+        default=None, description="The taint key. Default, with operator Exists: every key."
     )
     operator: TolerationOperator | None = Field(
-        default=None, description="Whether the value must be equal, or anything will do. Default: Equal."
+        default=None, description="Equal: the values must match. Exists: any value matches. Default: Equal."
     )
-    value: Annotated[str, Field(max_length=63)] | None = Field(default=None, description="The taint's value.")
-    effect: TaintEffect | None = Field(default=None, description="The taint's effect. Default: any.")
+    value: Annotated[str, Field(max_length=63)] | None = Field(
+        default=None, description="The taint value. Not with operator Exists."
+    )
+    effect: TaintEffect | None = Field(default=None, description="The taint effect. Default: every effect.")
     toleration_seconds: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = Field(
-        default=None, description="How long it stays on a node with effect NoExecute. Default: for ever."
+        default=None,
+        description="How long the pod stays on a node with effect NoExecute, in seconds. Default: forever.",
     )
 
     @model_validator(mode="after")
@@ -184,45 +191,47 @@ class DetectorToleration(Model):
 class DetectorPod(Model):
     """The pod, or the container in others' pods.
 
-    A change of it, or of where the Detector keeps files and Secrets, starts a Standalone detector anew. Pods that have
+    A change of it, or of the paths of files and Secrets in the Detector, restarts a Standalone detector. Pods that have
     the detector as a sidecar keep it as it is.
     """
 
     image: Annotated[str, Field(min_length=1, max_length=512, pattern=r"^[^\s]+$")] | None = Field(
-        default=None, description="The image. Default: that of the manager's option --detector-image."
+        default=None, description="The image. Default: the value of the manager's option --detector-image."
     )
     resources: DetectorResources = Field(
-        default_factory=DetectorResources, description="What is set aside for it, and what it may take at most."
+        default_factory=DetectorResources, description="The compute resources of the detector: requests and limits."
     )
     node_selector: dict[Annotated[str, Field(max_length=317)], Annotated[str, Field(max_length=63)]] = Field(
         default_factory=dict,
         max_length=16,
-        description="Labels of the nodes on which it may run. Not with mode Sidecar.",
+        description="The labels that a node must have. Not with mode Sidecar.",
     )
     tolerations: list[DetectorToleration] = Field(
         default_factory=list,
         max_length=16,
-        description="Taints of nodes on which it may run.",
+        description="The node taints that the pod tolerates. Not with mode Sidecar.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     env: list[DetectorVariable] = Field(
         default_factory=list,
         max_length=64,
-        description="Environment variables, beside and before those of the manager's option --detector-env.",
+        description="Environment variables. They are added to those of the manager's option --detector-env and take "
+        "precedence over them.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     volumes: list[DetectorVolume] = Field(
         default_factory=list,
         max_length=16,
-        description="Volumes for the folders of state, recordings and the database's spool and files: each of these "
-        "that is in none of them gets one that lasts as long as the pod.",
+        description="Volumes for the folders of the state, the recordings, the database spool and the database files. "
+        "A folder that is on none of these volumes gets one that is removed with the pod.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["path"]},
     )
     secrets: list[ObjectName] = Field(
         default_factory=list,
         max_length=32,
-        description="The Secrets that rules may use. Those that the Detector names for itself are not among them, "
-        "unless they stand here too. Who writes rules can send what they hold to others.",
+        description="The Secrets that rules may use. A Secret that the Detector itself refers to is available to "
+        "rules only if it is listed here as well. Anyone who can write rules can send the contents of these Secrets "
+        "elsewhere.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
 

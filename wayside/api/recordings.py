@@ -1,4 +1,4 @@
-"""Where a Detector's recordings go, and how much room they may take."""
+"""The storage of a Detector's recordings, and its limits."""
 
 from __future__ import annotations
 
@@ -10,55 +10,67 @@ from wayside.api.base import Model, ObjectName, PositiveDuration, PositiveQuanti
 
 
 class WhenFull(StrEnum):
-    """What gives way where a recording finds no room."""
+    """What happens when the storage is full."""
 
     DROP_OLDEST = "DropOldest"
     STOP = "Stop"
 
 
 class OnRequest(Model):
-    """Recordings that others ask for over Zenoh: a trigger of another detector, or anyone else who reaches it."""
+    """Recordings that others request over Zenoh: a trigger of another detector, or any other peer."""
 
     streams: list[ObjectName] | None = Field(
         default=None,
         min_length=1,
         max_length=128,
-        description="The streams that may be recorded; latched ones always come with them. Default: all.",
+        description="The streams that may be recorded. Latched streams are always included. Default: all.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
     maximum_duration: PositiveDuration = Field(
-        default=PositiveDuration("1h"), description="A recording ends after so long, even where more was asked for."
+        default=PositiveDuration("1h"),
+        description="The maximum duration of a recording. A recording ends after this time, even if the request "
+        "exceeds it.",
     )
-    maximum_recordings: int = Field(default=8, ge=1, le=100, description="So many at a time; further ones are refused.")
+    maximum_recordings: int = Field(
+        default=8,
+        ge=1,
+        le=100,
+        description="The maximum number of concurrent recordings on request. Further requests are refused.",
+    )
 
 
 class Recordings(Model):
-    """The folder of all recordings of a Detector, and its limits over all rules together."""
+    """The folder of all recordings of a Detector, with limits for all rules together."""
 
     path: str = Field(
         min_length=1,
         max_length=1024,
-        description="The folder, e.g. /var/lib/wayside/recordings, made where it is missing. Each detector needs one "
-        "of its own: the limits are for what one process writes, and finds there.",
+        description="The folder, e.g. /var/lib/wayside/recordings. It is created if missing. Each detector needs its "
+        "own, since the limits apply to everything in the folder and assume a single writer.",
     )
     bytes: PositiveQuantity = Field(
-        default=PositiveQuantity("16Gi"), description="The recordings take no more than this together."
+        default=PositiveQuantity("16Gi"),
+        description="The maximum size of all recordings together. At the limit, whenFull applies.",
     )
     files: int | None = Field(
-        default=None, ge=1, le=10_000_000, description="No more MCAP files than this. Default: no limit."
+        default=None,
+        ge=1,
+        le=10_000_000,
+        description="The maximum number of MCAP files. At the limit, whenFull applies. Default: no limit.",
     )
     age: PositiveDuration | None = Field(
         default=None,
-        description="Recordings that ended longer ago are deleted, whatever whenFull says. Default: never.",
+        description="Recordings are deleted this long after their end, regardless of whenFull. Default: never.",
     )
     reserve: Quantity = Field(
-        default=Quantity("1Gi"), description="So much of the disk is left free, whoever else writes to it."
+        default=Quantity("1Gi"),
+        description="The disk space that is left free, regardless of other writers. At the limit, whenFull applies.",
     )
     when_full: WhenFull = Field(
         default=WhenFull.DROP_OLDEST,
-        description="DropOldest: the oldest recordings are deleted for new ones, but none in progress. Stop: what "
-        "there is stays, and recordings that find no room end, marked as cut.",
+        description="DropOldest: the oldest recordings are deleted to make room, but none in progress. Stop: existing "
+        "recordings are kept; a recording that finds no room ends and is marked as cut.",
     )
     on_request: OnRequest | None = Field(
-        default=None, description="Lets others ask for recordings. Default: nobody can."
+        default=None, description="Allows others to request recordings. Default: not allowed."
     )

@@ -82,11 +82,11 @@ def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, 
         if "properties" in node:
             result["properties"] = {name: _structural(child, definitions) for name, child in node["properties"].items()}
         else:
-            # A map: the pattern of its keys cannot be said in a structural schema; the programs check it.
+            # A map: a structural schema cannot express the pattern of its keys; the programs check it.
             values = node.get("additionalProperties", {})
             patterned = node.get("patternProperties", {})
             values = next(iter(patterned.values())) if patterned else values
-            # `true` is how pydantic says that anything goes.
+            # pydantic writes `true` if any value is allowed.
             result["additionalProperties"] = _structural(values if isinstance(values, dict) else {}, definitions)
             if result.get("x-kubernetes-preserve-unknown-fields"):
                 result.pop("additionalProperties", None)
@@ -108,7 +108,7 @@ def _resolved(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, An
     """Follow `$ref`, and `anyOf` of one type and null; what stands beside the reference wins."""
     beside = {key: value for key, value in node.items() if key not in ("$ref", "anyOf", "allOf")}
     if "type" in beside and "anyOf" in node:
-        return beside  # the model says the schema by hand
+        return beside  # the model defines the schema by hand
     if "$ref" in node:
         target = _resolved(definitions[node["$ref"].rsplit("/", 1)[1]], definitions)
         return {**target, **beside}
@@ -116,6 +116,6 @@ def _resolved(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, An
         if combinator in node:
             choices = [choice for choice in node[combinator] if choice.get("type") != "null"]
             if len(choices) != 1:
-                raise ValueError(f"a structural schema cannot say a choice of types: {node}")
+                raise ValueError(f"a structural schema cannot express a choice of types: {node}")
             return {**_resolved(choices[0], definitions), **beside}
     return beside

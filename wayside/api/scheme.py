@@ -1,8 +1,8 @@
 """The scheme by which use cases of event detection are classified: 13 dimensions, 39 characteristic values.
 
-It is that of Table 1 of Reiher et al., "Event Detection in C-ITS: Classification, Use Cases, and Reference
-Implementation", with the definitions in our own words. Whatever names a dimension or a value takes it from here: the
-kinds, the catalog, the checks and docs/classification.md.
+The scheme is Table 1 of Reiher et al., "Event Detection in C-ITS: Classification, Use Cases, and Reference
+Implementation", with our own wording of the definitions. It is the single source of the names of dimensions and values
+for the kinds, the catalog, the checks and docs/classification.md.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Self
 
 
 class Value(StrEnum):
-    """A characteristic value: as files have it, as people say it, and what it means."""
+    """A characteristic value: its name in files, its name in prose, and its definition."""
 
     words: str
     definition: str
 
     def __new__(cls, value: str, words: str, definition: str) -> Self:
-        """The member is the text that files have."""
+        """The member's text is its name in files."""
         member = str.__new__(cls, value)
         member._value_ = value
         member.words = words
@@ -34,49 +34,49 @@ class Value(StrEnum):
 class OverarchingPurpose(Value):
     """The goal that the use case serves."""
 
-    SAFETY = "Safety", "safety", "road traffic becomes safer"
-    EFFICIENCY = "Efficiency", "efficiency", "something takes less time, energy or money"
-    USER_SATISFACTION = "UserSatisfaction", "user satisfaction", "people are better off with what they use"
+    SAFETY = "Safety", "safety", "to make road traffic safer"
+    EFFICIENCY = "Efficiency", "efficiency", "to save time, energy or money"
+    USER_SATISFACTION = "UserSatisfaction", "user satisfaction", "to improve the experience of the users"
 
 
 class TypeOfParticipants(Value):
-    """What kinds of entity take part directly in the processing of the data."""
+    """The kinds of entity that take part directly in the processing of the data."""
 
-    VEHICLE = "Vehicle", "vehicle", "a car, or another vehicle with a motor"
+    VEHICLE = "Vehicle", "vehicle", "a car or another motor vehicle"
     VRU = "VRU", "VRU", "a vulnerable road user: on foot, on a bicycle or on a motorcycle"
     ROAD_INFRASTRUCTURE = (
         "RoadInfrastructure",
         "road infrastructure",
-        "what stands at the road: signs, signals, roadside ITS stations",
+        "equipment at the road: signs, signals, roadside ITS stations",
     )
     REMOTE_INFRASTRUCTURE = (
         "RemoteInfrastructure",
         "remote infrastructure",
-        "what is far from the road: a control center, a cloud",
+        "equipment far from the road: a control center, a cloud",
     )
 
 
 class NumberOfParticipants(Value):
-    """How many entities take part directly in the processing of the data."""
+    """The number of entities that take part directly in the processing of the data."""
 
     ONE = "One", "one", "a single participant"
     TWO = "Two", "two", "exactly two participants"
-    MULTIPLE = "Multiple", "multiple", "three participants or more"
+    MULTIPLE = "Multiple", "multiple", "three or more participants"
 
 
 class DataSourceEntity(Value):
-    """Who first produces the data in which the event is detected."""
+    """The entity that originally produces the data in which the event is detected."""
 
     EVENT_SOURCE_ENTITY = (
         "EventSourceEntity",
         "event source entity",
         "the entity whose own change of state is the event produces the data",
     )
-    EXTERNAL = "External", "external", "another entity than the one whose state changes produces the data"
+    EXTERNAL = "External", "external", "another entity produces the data"
 
 
 class EventDetectionEntity(Value):
-    """Who finds the event in the data."""
+    """The entity that detects the event in the data."""
 
     EVENT_SOURCE_ENTITY = (
         "EventSourceEntity",
@@ -84,79 +84,83 @@ class EventDetectionEntity(Value):
         "the entity whose own change of state is the event detects it",
     )
     DATA_SOURCE_ENTITY = "DataSourceEntity", "data source entity", "the entity that produces the data detects the event"
-    EXTERNAL = "External", "external", "an entity detects the event that is neither its source nor that of the data"
+    EXTERNAL = (
+        "External",
+        "external",
+        "an entity that is neither the source of the event nor of the data detects the event",
+    )
 
 
 class ActingEntity(Value):
-    """Who carries out the action."""
+    """The entity that carries out the action."""
 
     EVENT_DETECTION_ENTITY = (
         "EventDetectionEntity",
         "event detection entity",
-        "the entity that detects the event acts itself",
+        "the entity that detects the event also acts",
     )
-    EXTERNAL = "External", "external", "another entity acts than the one that detects the event"
+    EXTERNAL = "External", "external", "another entity acts"
 
 
 class AffectedEntity(Value):
-    """Whom the consequences of the action reach directly."""
+    """The entity that the action affects directly."""
 
-    ACTING_ENTITY = "ActingEntity", "acting entity", "the action directly affects the entity that acts"
-    EXTERNAL = "External", "external", "the action directly affects another entity than the one that acts"
+    ACTING_ENTITY = "ActingEntity", "acting entity", "the action affects the entity that acts"
+    EXTERNAL = "External", "external", "the action affects another entity"
 
 
 class ScopeOfImpact(Value):
-    """How far the consequences of the action reach."""
+    """The reach of the consequences of the action."""
 
-    PARTICIPANT = "Participant", "participant", "the consequences stay with the participants"
-    ENVIRONMENT = "Environment", "environment", "the consequences reach the participants and what is around them"
+    PARTICIPANT = "Participant", "participant", "the consequences are limited to the participants"
+    ENVIRONMENT = "Environment", "environment", "the consequences reach the participants and their surroundings"
     BEYOND_ENVIRONMENT = (
         "BeyondEnvironment",
         "beyond environment",
-        "the consequences reach farther than the participants' surroundings, such as a whole fleet",
+        "the consequences reach beyond the participants' surroundings, such as a whole fleet",
     )
 
 
 class ObservationPeriod(Value):
-    """How much time the data covers in which the event is found."""
+    """The time span of the data that is needed to detect the event."""
 
-    IMMEDIATE = "Immediate", "immediate", "a certain sample is enough: the event follows at once"
-    SHORT_TERM = "ShortTerm", "short-term", "it takes the data of some seconds up to minutes"
-    LONG_TERM = "LongTerm", "long-term", "it takes the data of hours, or of longer"
+    IMMEDIATE = "Immediate", "immediate", "a single sample is enough to detect the event"
+    SHORT_TERM = "ShortTerm", "short-term", "the detection needs data of seconds to minutes"
+    LONG_TERM = "LongTerm", "long-term", "the detection needs data of hours or more"
 
 
 class TimeSensitivity(Value):
-    """How soon the action shows its consequences."""
+    """The time until the action has its consequences."""
 
-    IMMEDIATE = "Immediate", "immediate", "the action has its consequences at once"
-    SHORT_TERM = "ShortTerm", "short-term", "the consequences come within some seconds up to minutes"
-    LONG_TERM = "LongTerm", "long-term", "the consequences come after hours, or later"
+    IMMEDIATE = "Immediate", "immediate", "the consequences are immediate"
+    SHORT_TERM = "ShortTerm", "short-term", "the consequences follow within seconds to minutes"
+    LONG_TERM = "LongTerm", "long-term", "the consequences follow after hours or later"
 
 
 class Incidence(Value):
-    """How often the event and its action occur."""
+    """The frequency of the event and its action."""
 
-    FREQUENT = "Frequent", "frequent", "often: they belong to normal operation"
-    COMMON = "Common", "common", "not often, but they are bound to come"
-    RARE = "Rare", "rare", "seldom: it is something special"
-    UNEXPECTED = "Unexpected", "unexpected", "never, as far as anybody expects, though in theory they could"
+    FREQUENT = "Frequent", "frequent", "often, as part of normal operation"
+    COMMON = "Common", "common", "not often, but certain to occur"
+    RARE = "Rare", "rare", "seldom, as an exception"
+    UNEXPECTED = "Unexpected", "unexpected", "not expected to occur, though possible in theory"
 
 
 class DetectionAlgorithm(Value):
-    """What finds the event."""
+    """The kind of algorithm that detects the event."""
 
-    RULE_BASED = "RuleBased", "rule-based", "rules and heuristics find the event"
-    LEARNING_BASED = "LearningBased", "learning-based", "something that was learnt from data finds the event"
+    RULE_BASED = "RuleBased", "rule-based", "rules or heuristics detect the event"
+    LEARNING_BASED = "LearningBased", "learning-based", "an algorithm learnt from data detects the event"
 
 
 class TypeOfAction(Value):
-    """What the action does."""
+    """The kind of action."""
 
-    DATA_COLLECTION = "DataCollection", "data collection", "data is recorded"
-    RECONFIGURATION = "Reconfiguration", "reconfiguration", "software that is there already is configured anew"
-    DEPLOYMENT = "Deployment", "deployment", "software is launched that did not run before"
-    NOTIFICATION = "Notification", "notification", "somebody, or something, is told"
-    OTHER = "Other", "other", "anything else"
+    DATA_COLLECTION = "DataCollection", "data collection", "the action records data"
+    RECONFIGURATION = "Reconfiguration", "reconfiguration", "the action changes the configuration of existing software"
+    DEPLOYMENT = "Deployment", "deployment", "the action starts software that was not running"
+    NOTIFICATION = "Notification", "notification", "the action informs a person or a system"
+    OTHER = "Other", "other", "any other action"
 
 
 @dataclass(frozen=True)
@@ -164,14 +168,14 @@ class Dimension:
     """One of the dimensions."""
 
     name: str
-    """As files have it, e.g. typeOfAction."""
+    """The name in files, e.g. typeOfAction."""
     words: str
-    """As people say it, e.g. Type of Action."""
+    """The name in prose, e.g. Type of Action."""
     values: type[Value]
 
     @property
     def definition(self) -> str:
-        """What it tells of a use case."""
+        """The definition of the dimension."""
         return (self.values.__doc__ or "").strip()
 
     def described(self) -> str:

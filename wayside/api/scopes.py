@@ -1,4 +1,4 @@
-"""Whom a rule is about: each client, pairs of clients, or the fleet; and the elements that it is evaluated for."""
+"""The subjects of a rule: each client, pairs of clients, or the fleet; and the elements of `each`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from wayside.api.base import ClientName, Expression, Identifier, Model, ObjectNa
 
 _POSITION = "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees"
 _MAX_AGE = PositiveDuration("1s")
-_SCOPE = "exactly one of client, pairs and fleet must be given"
+_SCOPE = "give exactly one of client, pairs and fleet"
 
 
 class Position(Model):
-    """Where a client is: in metres of one common frame, or on the Earth."""
+    """The position of a client: in metres in a common frame, or in degrees on the Earth."""
 
     model_config = validations(
         (
@@ -22,26 +22,28 @@ class Position(Model):
         ),
     )
 
-    stream: ObjectName = Field(description="The stream whose newest sample tells the position.")
+    stream: ObjectName = Field(description="The stream whose newest sample contains the position.")
     x: Expression | None = Field(
-        default=None, description="CEL over msg: metres along the first axis, e.g. msg.pose.position.x."
+        default=None, description="CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."
     )
-    y: Expression | None = Field(default=None, description="CEL over msg: metres along the second axis.")
-    z: Expression | None = Field(default=None, description="CEL over msg: metres along the third axis; 0 where absent.")
+    y: Expression | None = Field(default=None, description="CEL over msg: the position on the second axis in metres.")
+    z: Expression | None = Field(
+        default=None, description="CEL over msg: the position on the third axis in metres. Default: 0."
+    )
     latitude: Expression | None = Field(
-        default=None, description="CEL over msg: degrees north (WGS 84), e.g. msg.latitude."
+        default=None, description="CEL over msg: the latitude in degrees north (WGS 84), e.g. msg.latitude."
     )
     longitude: Expression | None = Field(
-        default=None, description="CEL over msg: degrees east (WGS 84), e.g. msg.longitude."
+        default=None, description="CEL over msg: the longitude in degrees east (WGS 84), e.g. msg.longitude."
     )
     max_age: PositiveDuration | None = Field(
         default=None,
-        description="A client whose newest sample is older than this has no known position, as where the stream is "
-        "stale. Default: 1s; no limit where the stream never goes stale.",
+        description="The maximum age of the newest sample. The position of a client is unknown if the sample is "
+        "older, or if the stream is stale. Default: 1s; no limit if the stream never goes stale.",
     )
 
     def max_age_ns(self, *, never_stale: bool) -> int | None:
-        """When a position is too old to be believed, in nanoseconds; None: as long as its stream is not stale."""
+        """The maximum age of a position in nanoseconds; None: no limit while its stream is not stale."""
         if self.max_age is not None:
             return self.max_age.ns
         return None if never_stale else _MAX_AGE.ns
@@ -59,17 +61,17 @@ class ClientScope(Model):
 
     where: Expression | None = Field(
         default=None,
-        description="CEL over client, labels and streams: only clients for which it is true. "
-        "Turning false ends an open episode, reason OutOfScope.",
+        description="CEL over client, labels and streams. The rule applies only to clients for which it is true. An "
+        "open episode ends with reason OutOfScope when it becomes false.",
     )
 
 
 class Role(Model):
-    """Who can be the one or the other of a pair."""
+    """Selects the clients for one side of a pair."""
 
     where: Expression = Field(
-        description="CEL over client, labels and streams: only clients for which it is true. "
-        "Turning false ends an open episode, reason OutOfScope."
+        description="CEL over client, labels and streams. Only clients for which it is true can take this role. An "
+        "open episode ends with reason OutOfScope when it becomes false."
     )
 
 
@@ -79,52 +81,57 @@ class PairsScope(Model):
     Without roles, a is the one with the smaller name. With a role, each ordered pair of clients that fit is a subject.
     """
 
-    position: Position = Field(description="Where a client is.")
+    position: Position = Field(description="The position of a client.")
     within: float = Field(
         gt=0,
         le=1_000_000,
-        description="Metres. Only pairs at most this far apart can start an episode; a pair with an open episode "
+        description="The maximum distance in metres at which a pair can start an episode. A pair with an open episode "
         "is always evaluated.",
     )
     where: Expression | None = Field(
         default=None,
-        description="CEL over a, b, distance and closingSpeed: only pairs for which it is true. "
-        "Turning false ends an open episode, reason OutOfScope.",
+        description="CEL over a, b, distance (metres) and closingSpeed (m/s). The rule applies only to pairs for "
+        "which it is true. An open episode ends with reason OutOfScope when it becomes false.",
     )
     a: Role | None = Field(
-        default=None, description="Who can be a. With a role, pairs are ordered, and each that fits is a subject."
+        default=None,
+        description="Selects the clients that can be a. With a role, pairs are ordered, and each matching ordered "
+        "pair is a subject.",
     )
     b: Role | None = Field(
-        default=None, description="Who can be b. With a role, pairs are ordered, and each that fits is a subject."
+        default=None,
+        description="Selects the clients that can be b. With a role, pairs are ordered, and each matching ordered "
+        "pair is a subject.",
     )
     max_pairs: int = Field(
         default=10_000,
         ge=1,
         le=1_000_000,
-        description="At most so many pairs within reach are looked at in one evaluation: the nearest. The others are "
-        "left out and counted. Pairs with an open episode, or about to start one, always are.",
+        description="The maximum number of pairs in reach per evaluation. At the limit, the nearest pairs are "
+        "evaluated; the others are skipped and counted. Pairs with an open episode, or whose condition already holds, "
+        "are always evaluated.",
     )
 
 
 class FleetScope(Model):
-    """The rule is evaluated once for all clients together, also while there is none."""
+    """The rule is evaluated once for all clients together, even if there are none."""
 
     members: Expression = Field(
-        description="CEL over one client (client, labels, streams and the signals): those for which it is true are "
-        "members, those for which it is unknown are not."
+        description="CEL over one client (client, labels, streams and the signals). Clients for which it is true are "
+        "members; false and unknown are not."
     )
 
 
 class Scope(Model):
-    """Whom the rule is about: exactly one of the fields."""
+    """The subjects of the rule: exactly one of the fields."""
 
     model_config = validations(
         ("[has(self.client), has(self.pairs), has(self.fleet)].filter(given, given).size() == 1", _SCOPE),
     )
 
-    client: ClientScope | None = Field(default=None, description="Each client on its own. The default.")
-    pairs: PairsScope | None = Field(default=None, description="Each pair of clients near each other.")
-    fleet: FleetScope | None = Field(default=None, description="All clients that are members, together.")
+    client: ClientScope | None = Field(default=None, description="Each client is a subject. The default.")
+    pairs: PairsScope | None = Field(default=None, description="Each pair of clients near each other is a subject.")
+    fleet: FleetScope | None = Field(default=None, description="All member clients together are one subject.")
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Scope:
@@ -134,21 +141,23 @@ class Scope(Model):
 
 
 class Element(Model):
-    """One of the things that a rule is evaluated for: its name, and whatever expressions need to know of it."""
+    """One element of `each`: a name, and any fields that expressions use."""
 
     model_config = ConfigDict(extra="allow", json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})
 
-    name: ClientName = Field(description="Its name; it joins the subject, as in car1~north.")
+    name: ClientName = Field(description="The name of the element. It is part of the subject, as in car1~north.")
 
 
 class Each(Model):
     """The rule is evaluated once for each element."""
 
-    as_: Identifier = Field(alias="as", description="The variable by which expressions use the element, e.g. site.")
+    as_: Identifier = Field(
+        alias="as", description="The name of the variable for the element in expressions, e.g. site."
+    )
     of: list[Element] = Field(
         min_length=1,
         max_length=256,
-        description="The elements: a name each, and any other fields.",
+        description="The elements. Each has a name and any other fields.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
 

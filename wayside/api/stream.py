@@ -21,7 +21,7 @@ from wayside.api.source import ZENOH
 
 
 class Encoding(StrEnum):
-    """How the bytes of a stream are to be read."""
+    """The encoding of the payloads of a stream."""
 
     CDR = "cdr"
     JSON = "json"
@@ -31,7 +31,7 @@ class Encoding(StrEnum):
 
 
 class Layout(StrEnum):
-    """What the keys of a stream are made of."""
+    """The layout of the keys of a stream."""
 
     PLAIN = "Plain"
     RMW_ZENOH = "RmwZenoh"
@@ -42,32 +42,39 @@ MessageType = Annotated[str, Field(max_length=255, pattern=r"^[A-Za-z][A-Za-z0-9
 
 
 class MessageDefinition(Model):
-    """What a ROS 2 message type is made of."""
+    """The definition of a ROS 2 message type."""
 
     name: MessageType = Field(description="The type, e.g. my_package/msg/Track.")
     definition: str = Field(
         max_length=65_536,
-        description="As its .msg file holds it. What it refers to has a definition of its own in messages, or follows "
-        "behind a line of = and `MSG: <type>`, as `ros2 bag` records it.",
+        description="The definition in the format of .msg files. Types that it refers to need their own entry in "
+        "messages, or follow after a line of = and a line `MSG: <type>`, as `ros2 bag` records them.",
     )
 
 
 class History(Model):
-    """How much of what publishers remember is asked for; without limits, all of it."""
+    """How much history to request from publishers. Without limits: all of it."""
 
-    samples: int | None = Field(default=None, ge=1, le=100_000, description="The newest so many samples on each key.")
-    age: PositiveDuration | None = Field(default=None, description="Samples that are not older than this.")
+    samples: int | None = Field(
+        default=None, ge=1, le=100_000, description="The maximum number of samples per key; the newest."
+    )
+    age: PositiveDuration | None = Field(default=None, description="The maximum age of the samples.")
 
 
 class StreamBuffer(Model):
-    """How much of a stream is kept, per client."""
+    """The limits of the stream's buffer, per client."""
 
-    duration: PositiveDuration | None = Field(default=None, description="Samples older than this are forgotten.")
+    duration: PositiveDuration | None = Field(
+        default=None, description="How long samples are kept. Default: the Detector's buffer.duration."
+    )
     bytes: PositiveQuantity | None = Field(
-        default=None, description="The oldest samples beyond this size are forgotten."
+        default=None, description="The maximum size. At the limit, the oldest samples are dropped."
     )
     count: int | None = Field(
-        default=None, ge=1, le=1_000_000, description="The oldest samples beyond this number are forgotten."
+        default=None,
+        ge=1,
+        le=1_000_000,
+        description="The maximum number of samples. At the limit, the oldest samples are dropped.",
     )
 
 
@@ -75,16 +82,16 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 class Stream(Model):
-    """One kind of data of every client."""
+    """One kind of data that every client sends."""
 
     model_config = validations(
         (
             "self.encoding == 'uper' || (self.encoding == 'cdr') == has(self.type)",
-            "type is for cdr streams, and they need it, e.g. geometry_msgs/msg/PoseStamped; and for uper streams",
+            "type is required with encoding cdr, optional with uper, and not allowed otherwise",
         ),
         (
             "!has(self.type) || (self.encoding == 'uper') == self.type.startsWith('etsi/')",
-            "the type of a cdr stream is a ROS 2 message, that of a uper stream an ETSI ITS message, e.g. etsi/cam",
+            "type must be a ROS 2 message with encoding cdr, and an ETSI ITS message with uper, e.g. etsi/cam",
         ),
         (
             "self.key.contains('${client:') != has(self.client)",
@@ -96,7 +103,7 @@ class Stream(Model):
         ),
         (
             "self.layout != 'RmwZenoh' || self.encoding in ['cdr', 'raw']",
-            "layout RmwZenoh is of ROS 2 messages: encoding must be cdr or raw",
+            "layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw",
         ),
         (
             "self.layout != 'RmwZenoh' || self.source == 'zenoh'",
@@ -107,76 +114,82 @@ class Stream(Model):
 
     name: ObjectName = Field(description="The name by which rules refer to the stream.")
     key: Key = Field(
-        description="The Zenoh key expression in key-format notation: ${client:*} captures the client's name, "
-        "e.g. vehicles/${client:*}/pose. A ROS topic may be written with or without its leading slash.",
+        description="The Zenoh key expression in key-format notation. ${client:*} captures the name of the client, "
+        "e.g. vehicles/${client:*}/pose. The leading slash of a ROS topic is optional.",
     )
     source: ObjectName = Field(
-        default=ZENOH, description="Where the samples come from: zenoh, or the name of one of the Detector's sources."
+        default=ZENOH, description="The source of the samples: zenoh, or the name of one of the Detector's sources."
     )
     history: History | None = Field(
         default=None,
-        description="Over Zenoh: what was published before the detector or its publisher came is asked for, of "
-        "Advanced Publishers that remember it.",
+        description="Only with source zenoh: request samples that were published before the detector or its publisher "
+        "started. Needs Advanced Publishers with a cache.",
     )
     recover: bool = Field(
         default=False,
-        description="Over Zenoh: samples lost on the way are asked for again, of Advanced Publishers that number and "
-        "remember them; what stays lost is counted.",
+        description="Only with source zenoh: request lost samples again. Needs Advanced Publishers with sequence "
+        "numbers and a cache. Samples that cannot be recovered are counted.",
     )
     layout: Layout = Field(
         default=Layout.PLAIN,
-        description="Plain: samples come on the key itself, also with zenoh-bridge-ros2dds. RmwZenoh: on the keys of "
-        "rmw_zenoh nodes, which put the domain before the topic, and type and type hash after it; key is the topic.",
+        description="Plain: samples arrive on the key itself, also with zenoh-bridge-ros2dds. RmwZenoh: samples "
+        "arrive on the keys of rmw_zenoh nodes, which add the domain before the topic, and the type and type hash "
+        "after it; key is the topic.",
     )
     domain: int | None = Field(
         default=None,
         ge=0,
         le=232,
-        description="The ROS domain that a RmwZenoh stream is taken from. Default: every domain.",
+        description="The ROS domain ID of a stream with layout RmwZenoh. Default: every domain.",
     )
     client: str | None = Field(
         default=None,
         min_length=1,
         max_length=512,
         pattern=r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$",
-        description="The client that the data belongs to, where the key captures none: a name, or one made from the "
-        "message, as its-${msg.header.stationId}, with CEL over msg, and key for what the key captures.",
+        description="The client of the samples, if the key does not capture it: a name, or a template over the "
+        "message such as its-${msg.header.stationId}. The template is CEL over msg, and over key for the captures of "
+        "the key.",
     )
-    encoding: Encoding = Field(description="cdr (ROS 2 messages), json, cbor, uper (ETSI ITS messages), or raw: bytes.")
+    encoding: Encoding = Field(
+        description="The encoding of the payload: cdr (ROS 2 messages), json, cbor, uper (ETSI ITS messages), or raw "
+        "(bytes)."
+    )
     type: str | None = Field(
         default=None,
         max_length=255,
         pattern=r"^([A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*|etsi/[a-z]+)$",
-        description="The ROS 2 message type of a cdr stream, e.g. geometry_msgs/msg/PoseStamped; or which ETSI ITS "
-        "messages a uper stream has, e.g. etsi/cam (default: of all kinds).",
+        description="The message type. Required with encoding cdr: a ROS 2 type, e.g. geometry_msgs/msg/PoseStamped. "
+        "Optional with encoding uper: an ETSI ITS message, e.g. etsi/cam. Default: all ETSI ITS messages.",
     )
     stamp: Expression | None = Field(
         default=None,
         description="CEL over msg: the sender's time in seconds since the epoch, e.g. msg.time_ms / 1000; or "
-        "sample.received, the receive time (t of JSON lines). Default: header.stamp where the type has one, the time "
-        "of generation in an ETSI ITS message, else none.",
+        "sample.received, the receive time (t of JSON lines). Default: header.stamp if the type has one, the "
+        "generation time of an ETSI ITS message, otherwise none.",
     )
     stale_after: Duration | str | None = Field(
         default=None,
-        description="Signals of the stream are unknown when its newest sample is older than this. "
-        "Default: 5s, or clientTimeout if that is shorter. Never: not at all, for latched topics.",
+        description="The signals of the stream are unknown if its newest sample is older than this. Never: no limit, "
+        "for latched topics. Default: 5s, or clientTimeout if that is shorter; Never for latched streams.",
         json_schema_extra={"type": "string", "pattern": f"^({PositiveDuration.pattern}|Never)$", "maxLength": 20},
     )
     buffer: StreamBuffer = Field(
-        default=StreamBuffer(), description="How much is kept; the Detector's buffer where absent."
+        default=StreamBuffer(),
+        description="The limits of the stream's buffer, per client. Default: the limits of the Detector's buffer.",
     )
 
     latched: bool = Field(
         default=False,
-        description="What was said last holds until it is said anew, e.g. /tf_static, a map: the newest sample of each "
-        "key is kept beyond the buffer's duration, staleAfter is Never if not given, and a replay takes it first.",
+        description="If true, the last sample of each key stays valid until replaced, e.g. /tf_static or a map. It is "
+        "kept beyond the buffer's duration, staleAfter defaults to Never, and a replay delivers it first.",
     )
     frame_prefix: str | None = Field(
         default=None,
         min_length=1,
         max_length=128,
-        description="Of a tf2_msgs/msg/TFMessage stream: what its frames' names begin with and lose, so that they are "
-        "the same for every client; ${client} in it is the client's name, e.g. ${client}/.",
+        description="Only with type tf2_msgs/msg/TFMessage: a prefix to remove from the names of the frames, so that "
+        "they are the same for every client. ${client} stands for the client's name, e.g. ${client}/.",
     )
 
     @model_validator(mode="after")
@@ -187,7 +200,7 @@ class Stream(Model):
             raise ValueError(f"a {self.encoding} stream has no type: remove it")
         if self.layout is Layout.RMW_ZENOH and self.encoding not in (Encoding.CDR, Encoding.RAW):
             raise ValueError(
-                f"layout RmwZenoh is of ROS 2 messages: encoding must be cdr or raw, is {self.encoding}; "
+                f"layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw, but is {self.encoding}; "
                 "correct it, or remove layout"
             )
         if self.layout is Layout.RMW_ZENOH and self.source != ZENOH:
@@ -196,12 +209,12 @@ class Stream(Model):
             raise ValueError("domain is for streams with layout RmwZenoh: remove it")
         if self.type is not None and (self.encoding is Encoding.UPER) != self.type.startswith("etsi/"):
             example = "etsi/cam" if self.encoding is Encoding.UPER else "geometry_msgs/msg/PoseStamped"
-            raise ValueError(f"{self.type} is no type of {self.encoding} streams: give one such as {example}")
+            raise ValueError(f"{self.type} is not a message type of {self.encoding} streams: use one such as {example}")
         captures = "${client:" in self.key
         if captures and self.client is not None:
             raise ValueError("key captures the client and client names one: remove one of them")
         if not captures and self.client is None:
-            raise ValueError("key captures no client: write ${client:*} where its name stands, or give client")
+            raise ValueError("key does not capture the client: write ${client:*} in place of its name, or set client")
         if self.frame_prefix is not None and not self.carries_transforms:
             raise ValueError("framePrefix is for streams of type tf2_msgs/msg/TFMessage: remove it")
         if self.stale_after is not None and self.stale_after != "Never":

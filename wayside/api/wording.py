@@ -1,4 +1,4 @@
-"""What pydantic finds wrong with an object, in words for the one who wrote it."""
+"""Turns pydantic's validation errors into messages for the author of an object."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _PATTERNS = {
     r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$": "like https://host:port/path, without # and without a user and password "
     "before the host (give credentialsSecret)",
     r"^[^/*$#?]+(/[^/*$#?]+)*$": "a Zenoh key without wildcards, e.g. city/alerts",
-    r"^WAYSIDE_[A-Z0-9_]+$": "a name that begins with WAYSIDE_, in capitals: other variables are not for rules",
+    r"^WAYSIDE_[A-Z0-9_]+$": "a name that begins with WAYSIDE_, in capitals: rules cannot use other variables",
     r"^[a-z]+/.+$": "protocol/address:port, e.g. tcp/zenoh:7447",
 }
 """The models' patterns in words."""
 
 
 def field_text(path: FieldPath) -> str:
-    """A field's path as people write it, e.g. spec.signals[0].value."""
+    """A field's path in the usual notation, e.g. spec.signals[0].value."""
     text = ""
     for part in path:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
@@ -36,12 +36,12 @@ def field_text(path: FieldPath) -> str:
 
 
 def messages(error: ValidationError, raw: Any) -> Iterator[tuple[FieldPath, str]]:
-    """Pydantic's errors in our words, with the paths as the author wrote them, each once."""
-    told = set()
+    """The messages for pydantic's errors, each once, with the paths as the author wrote them."""
+    seen = set()
     for item in error.errors(include_url=False):
         found = _written(item["loc"], raw), _message(item)
-        if found not in told:
-            told.add(found)
+        if found not in seen:
+            seen.add(found)
             yield found
 
 
@@ -49,22 +49,22 @@ def _message(item: ErrorDetails) -> str:
     given = item["input"]
     match item["type"]:
         case "missing":
-            return "is missing: give it"
+            return "is missing: add it"
         case "extra_forbidden":
-            return "there is no such field: check its spelling and its place"
+            return "unknown field: check its spelling and position"
         case "value_error":
             return str(item["ctx"]["error"])
         case _ if given is None:
             return "is empty: give it a value, or remove it"
         case "string_type" if isinstance(given, bool | int | float):
             written = str(given).lower() if isinstance(given, bool) else str(given)
-            return f"must be a text, is {written}: put what you mean in quotes, e.g. '{written}'"
+            return f"must be a string, but is {written}: put it in quotes, e.g. '{written}'"
         case "string_type":
-            return f"must be a text; given: {_short(given)}: quote it as a whole"
+            return f"must be a string; given: {_short(given)}: quote it as a whole"
         case "bool_type" | "bool_parsing":
             return f"must be true or false; given: {_short(given)}"
         case "model_type" | "model_attributes_type" | "dict_type":
-            return f"must be a map of fields; given: {_short(given)}"
+            return f"must be an object; given: {_short(given)}"
         case "string_pattern_mismatch":
             pattern = item["ctx"]["pattern"]
             return f"must be {_PATTERNS.get(pattern, f'text like {pattern}')}; given: {_short(given)}"

@@ -15,11 +15,9 @@ Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/
 
 _ENCRYPTED = ("tls/", "quic/")
 
-_NO_CLIENT = "liveliness captures no client: write ${client:*} where its name stands"
+_NO_CLIENT = "liveliness does not capture the client: write ${client:*} in place of its name"
 
-_NO_CERTIFICATE = (
-    "an endpoint to listen on with TLS needs a certificate: give tls.certificate and tls.key, or tlsSecret"
-)
+_NO_CERTIFICATE = "a TLS endpoint in listen needs a certificate: set tls.certificate and tls.key, or tlsSecret"
 
 
 class ZenohMode(StrEnum):
@@ -44,33 +42,34 @@ class Zenoh(Access):
     )
 
     mode: ZenohMode = Field(
-        default=ZenohMode.PEER, description="client (of a router), peer, or router (others may connect through it)."
+        default=ZenohMode.PEER,
+        description="The mode of the session: client (of a router), peer, or router (others can connect through it).",
     )
     connect: list[Endpoint] = Field(
         default_factory=list,
         max_length=16,
-        description="Endpoints to connect to, e.g. tcp/zenoh:7447 or tls/zenoh:7447. "
-        "Lost connections are sought again.",
+        description="The endpoints to connect to, e.g. tcp/zenoh:7447 or tls/zenoh:7447. Lost connections are "
+        "re-established.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     listen: list[Endpoint] = Field(
         default_factory=list,
         max_length=16,
-        description="Endpoints to listen on, e.g. tcp/0.0.0.0:7447. Without any, a peer listens on a free port and a "
-        "router on 7447.",
+        description="The endpoints to listen on, e.g. tcp/0.0.0.0:7447. Default: a free port (peer) or port 7447 "
+        "(router).",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
-    scouting: bool = Field(default=False, description="Whether to look for others by multicast.")
+    scouting: bool = Field(default=False, description="If true, discovers other Zenoh nodes by multicast.")
     shared_memory: bool = Field(
         default=False,
-        description="Whether publishers on the same machine may hand samples over in shared memory; "
-        "the pods must then share /dev/shm.",
+        description="If true, publishers on the same machine can pass samples in shared memory. The pods must then "
+        "share /dev/shm.",
     )
 
     liveliness: Key | None = Field(
         default=None,
-        description="The key of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a token is "
-        "there, however long it sends nothing; once its last token is gone it is lost at once.",
+        description="The key expression of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a "
+        "token is present even if it sends no data. It is lost as soon as its last token disappears.",
     )
 
     @model_validator(mode="after")

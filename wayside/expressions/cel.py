@@ -3,8 +3,8 @@
 An `Environment` holds the declared variables and compiles; an `Expression` is evaluated as often as wanted, from any
 thread. Unknown values follow Kleene's logic: CEL carries an error through `&&`, `||`, `!` and `?:` exactly as Kleene
 carries the unknown, so what is unknown is left out of the values (see `projection`) and an error means unknown.
-(A NaN that arises inside an expression, by 0/0 or inf − inf, is not left out of anything: it compares false, as IEEE
-says, and is unknown only as the result.)
+(A NaN that arises inside an expression, by 0/0 or inf − inf, takes part in the evaluation: it compares false, as in
+IEEE 754, and is unknown only as the result.)
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from wayside.expressions.syntax import Constant, Node, Path, arguments, calls, n
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
 
 Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int | bool, "Value"]
-"""What an expression yields: plain data. An int is one beyond 2^53."""
+"""The result of an expression: plain data. An int is always beyond 2^53."""
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CACHE_SIZE = 1024
@@ -110,7 +110,7 @@ class Environment:
         return Environment(self.variables, {**self._members, **members}) if members else self
 
     def compile(self, source: str, *, result: Kind = Kind.DYN) -> Expression:
-        """Compiles `source`; where its type can be told only at evaluation, `result` is checked then.
+        """Compiles `source`; if its type is known only at evaluation, `result` is checked then.
 
         Raises ExpressionError, pointing into `source`, for what does not parse, has the wrong type or names what is
         not declared.
@@ -127,7 +127,7 @@ class Environment:
             program = self._env.compile(rewritten.text)
             parsed = parse(program.serialize())
             read, leaves = self._reads(parsed)
-            # `has(a.b)` asks for a member of a map: with `a.b` a variable of its own it would not be a question.
+            # `has(a.b)` tests for a member of a map; it would not if `a.b` were a variable.
             typed = program if self._typed is None or "has(" in rewritten.text else self._typed.compile(rewritten.text)
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
             raise diagnose(str(error), source, rewritten, self.variables) from None
@@ -206,8 +206,8 @@ class Expression:
     ) -> Value | Unknown:
         """The result on `values`, or UNKNOWN where it depends on what is absent, null or NaN, or the expression fails.
 
-        `on_unknown` is told the reason and a message. Never raises for what the values hold. Null being unknown,
-        `x == null` is never true: ask `has(msg.x)`, which is false for an absent, null or NaN field.
+        `on_unknown` receives the reason and a message. Never raises because of the values. Null being unknown,
+        `x == null` is never true: use `has(msg.x)`, which is false for an absent, null or NaN field.
         """
         value, why = self.explained(values)
         if why is not None and on_unknown is not None:

@@ -1,4 +1,4 @@
-"""Turns what CEL says about an expression into errors that point into the author's text and name the remedy."""
+"""Turns the diagnostics of CEL into errors that point into the author's text and name the remedy."""
 
 from __future__ import annotations
 
@@ -35,9 +35,11 @@ _WORDS = {
     "nil": "CEL writes `null`",
 }
 _SIGNS = {"=": "CEL compares with `==`", "&": "CEL writes `&&`", "|": "CEL writes `||`", "'": "", '"': ""}
-_QUOTE = "a text is not closed, or YAML took its quotes: quote the whole expression and use the other quotes inside"
+_QUOTE = (
+    "a string is not closed, or YAML removed its quotes: quote the whole expression and use the other quotes inside"
+)
 _DEPTH = "at most 32 levels, where each operator of a chain like `a + b` is one: balance it with brackets"
-EMPTY = "YAML takes a leading `!`, `#` or quote for itself: put the whole expression in quotes, as in '!braking'"
+EMPTY = "YAML interprets a leading `!`, `#` or quote itself: put the whole expression in quotes, as in '!braking'"
 
 
 def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]) -> ExpressionError:
@@ -90,7 +92,7 @@ def _undeclared(name: str, source: str, at: int, names: Collection[str]) -> tupl
     name = name.removeprefix(".").split(".")[0]
     if _is_call(source, at, name):
         if name in FUNCTIONS:
-            return f"`{name}` does not take so many arguments", _takes(name)
+            return f"wrong number of arguments for `{name}`", _takes(name)
         near = difflib.get_close_matches(name, FUNCTIONS, n=1)
         return f"there is no function `{name}`", f"did you mean `{near[0]}`?" if near else None
     message = f"`{name}` is not declared here"

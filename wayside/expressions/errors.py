@@ -1,4 +1,4 @@
-"""What can go wrong with an expression: it does not compile, it fails on its values, or a field cannot be rendered."""
+"""The errors of expressions: it does not compile, it fails on its values, or a field cannot be rendered."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ExpressionError(Exception):
 class EvaluationError(Exception):
     """An expression that failed on the values it was given.
 
-    `absent` tells a value that is not there (a variable, map key or list index) from a fault of the expression.
+    `absent` distinguishes an absent value (a variable, map key or list index) from a fault of the expression.
     """
 
     def __init__(self, message: str, *, absent: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Turns what CEL says of an evaluation that failed into words for the rule's author."""
+"""Turns CEL's errors of a failed evaluation into messages for the author of the rule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from wayside.expressions.numbers import DIGITS
 
 _NO_MEMBERS: Final = "a member is read of what has none"
 NO_MEMBERS: Final = frozenset({_NO_MEMBERS})
-"""What `clean` makes of a read of a member of a number, a text or a list."""
+"""The message of `clean` for reading a member of a number, a string or a list."""
 
 _ABSENT = ("no value for ", "no key ", "no index ")
 _OVERLOAD: Final = re.compile(r"^\w+: No matching overloads found : (.*)$")
@@ -47,7 +47,7 @@ def clean(message: str) -> str:
 
 
 def says_absent(message: str) -> bool:
-    """Whether a clean message says that something is not there."""
+    """Whether a clean message reports an absent value."""
     return message.startswith(_ABSENT)
 
 

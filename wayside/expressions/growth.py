@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from wayside.expressions.syntax import Call, Collection, Constant, Loop, Name, Node, Select
 
 MOST = 1000
-"""So many copies of its parts a value may hold. What people write has a handful."""
+"""The maximum number of copies of its parts in a value. Expressions in practice have a handful."""
 
 _ONE_OF = ("_?_:_", "_[_]", "_[?_]")
 _SCALARS = frozenset(
@@ -21,7 +21,7 @@ _SCALARS = frozenset(
         "_*_", "_/_", "_%_", "size", "bool", "double", "int", "uint", "contains", "startsWith", "endsWith", "matches",
     }
 )  # fmt: skip
-"""What gives a number or a truth, whatever it is given."""
+"""Operators and functions whose result is always a number or a truth."""
 
 
 def growth(node: Node) -> int:

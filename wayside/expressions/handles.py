@@ -33,7 +33,7 @@ def begin() -> list[object] | None:
 
 
 def end(before: list[object] | None) -> None:
-    """The evaluation has ended; one that it lay within goes on."""
+    """The evaluation has ended; an enclosing one continues."""
     _held.values = before
 
 

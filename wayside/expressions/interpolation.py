@@ -21,7 +21,7 @@ from wayside.expressions.numbers import MAX_EXACT
 from wayside.expressions.syntax import Path
 
 Json = None | bool | int | float | str | list["Json"] | dict[str, "Json"]
-"""What JSON and YAML hold."""
+"""A JSON or YAML value."""
 
 LITERAL: Final = "write `$${` for a literal `${`"
 
@@ -63,7 +63,7 @@ _Node = _Literal | Embedded | _Mixed | _Map | _List
 
 
 class _Dropped:
-    """What a null alone renders to: the field disappears."""
+    """The result of rendering a null: the field is removed."""
 
 
 _DROPPED: Final = _Dropped()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 
 class TokenKind(enum.Enum):
-    """The kinds of token that callers tell apart."""
+    """The kinds of token that callers distinguish."""
 
     SPACE = "space"
     COMMENT = "comment"
@@ -41,7 +41,7 @@ class Token:
 
 
 # Order matters: raw strings before plain ones before names, triple quotes before single, floats before integers.
-# An unterminated string is OTHER for its quote alone, so scanning goes on behind it.
+# An unterminated string is OTHER for its quote alone, so scanning continues after it.
 _TOKENS = re.compile(
     r"""
     (?P<space>\s+)

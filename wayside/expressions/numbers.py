@@ -45,7 +45,7 @@ class Doubled:
 
 
 def doubled(source: str) -> Doubled:
-    """Rewrites `source` as the module says. Never fails: what does not parse is left for CEL to report."""
+    """Rewrites `source` as described in the module. Never fails: CEL reports syntax errors."""
     scanned = list(tokens(source))
     significant = [token for token in scanned if token.kind not in (TokenKind.SPACE, TokenKind.COMMENT)]
     before, after, replaced = _edits(significant)
@@ -61,7 +61,7 @@ def doubled(source: str) -> Doubled:
 
 
 def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int, str]]:
-    """What to insert before and after, and what to replace, by the start of the token it concerns."""
+    """Insertions before and after a token, and its replacement, by the start of the token."""
     matches = _matches(line)
     before: dict[int, str] = {}
     after: dict[int, str] = {}

@@ -31,7 +31,7 @@ _ABSENT: Final = object()
 
 
 class Leaf(enum.Enum):
-    """What is read of a value, beside all of it."""
+    """The parts of a value that are read, unless all of it is."""
 
     HANDED = "handed"
     """Its handle, where it is a list, a map or bytes."""
@@ -40,13 +40,13 @@ class Leaf(enum.Enum):
 
 
 Tree = Mapping[Step, "Tree | Leaf | None"]
-"""What is read below a value; None: all of it."""
+"""The parts that are read below a value; None: all of it."""
 
 _FIELD_NAMES: Final[dict[type, frozenset[str]]] = {}
 
 
 def tree(paths: Iterable[Path], leaves: Mapping[Path, Leaf] | None = None) -> Tree:
-    """The tree of the given paths; a path swallows all that go on below it. `leaves` says how some of them are read."""
+    """The tree of the given paths; a path replaces all longer ones. `leaves` defines how some are read."""
     leaves = leaves or {}
     root: dict[Step, Tree | Leaf | None] = {}
     for path in sorted(paths, key=len):  # the shorter first: it swallows the longer
@@ -79,7 +79,7 @@ def normalise(value: object) -> object:
 
 
 def missing_path(paths: Iterable[Path], values: Mapping[str, object]) -> str | None:
-    """Says which of the paths leads nowhere in `values`, and what it may have meant; None if none does."""
+    """The message for a path that does not exist in `values`, with the closest match; None if all exist."""
     for path in sorted(paths, key=str):
         at: object = values
         for depth, step in enumerate(path):
@@ -94,7 +94,7 @@ def missing_path(paths: Iterable[Path], values: Mapping[str, object]) -> str | N
 
 
 def no_member(paths: Iterable[Path], values: Mapping[str, object]) -> str | None:
-    """Says which of the paths goes through what has no members, and what that is; None if none does."""
+    """The message for a path through a value without members, with its type; None if there is none."""
     for path in sorted(paths, key=str):
         at: object = values
         for depth, step in enumerate(path):
@@ -133,7 +133,7 @@ def _shown(value: object) -> str:
 def _remedy(value: object) -> str:
     if isinstance(value, bytes | bytearray | memoryview):
         return "read it with numberAt or utf8, or give the stream the encoding of its messages"
-    return "ask has(…) first, or correct the path" if value is None else "correct the path"
+    return "test with has(…) first, or correct the path" if value is None else "correct the path"
 
 
 def _project(below: Tree | Leaf | None, value: object, known: bool) -> object:
@@ -143,7 +143,7 @@ def _project(below: Tree | Leaf | None, value: object, known: bool) -> object:
         return _hand(value, known)
     if below is Leaf.ORDERED:
         return _ABSENT if isinstance(value, (bytes, bytearray, memoryview)) else _convert(value, known)
-    if type(value) is dict or isinstance(value, Mapping):  # the abstract class is slow to ask
+    if type(value) is dict or isinstance(value, Mapping):  # the check of the abstract class is slow
         return _members([(key, value[key], sub) for key, sub in below.items() if key in value], known)
     if isinstance(value, (list, tuple)) or _is_array(value):
         return _items(below, cast("list[object]", value), known)
@@ -206,7 +206,7 @@ def _convert_rare(value: object, known: bool) -> object:
     if _is_record(value):
         return _convert({name: getattr(value, name) for name in _field_names(value)}, known)
     for plain in (str, int, float):
-        if isinstance(value, plain):  # an enum's member, say
+        if isinstance(value, plain):  # such as a member of an enum
             return _convert(plain(plain.__str__(value)) if plain is str else plain(value), known)
     if isinstance(value, (list, tuple, set, frozenset)):
         return _convert(list(value), known)
@@ -243,7 +243,7 @@ def _key(key: object) -> object:
 
 
 def _is_array(value: object) -> bool:
-    """Whether it is numpy's, array or scalar: told by its methods, since nothing here needs numpy itself."""
+    """Whether it is a numpy array or scalar: detected by its methods, since nothing here needs numpy itself."""
     return hasattr(value, "tolist") and hasattr(value, "dtype")
 
 

@@ -1,4 +1,4 @@
-"""The third truth value: `UNKNOWN` is what an expression yields when it cannot tell.
+"""The third truth value: `UNKNOWN` is the result of an expression that is neither true nor false.
 
 It has no truth of its own: `if value:` on an unknown raises, so no caller takes it for false by accident.
 """

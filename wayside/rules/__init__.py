@@ -1,4 +1,4 @@
-"""Rules, checked and compiled against a Detector: the manager reports what is wrong, the engine runs what is right."""
+"""Rules, validated and compiled against a Detector: the manager reports the problems, the engine runs the result."""
 
 from wayside.rules.alone import own_problems
 from wayside.rules.compiled import (

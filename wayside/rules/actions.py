@@ -1,4 +1,4 @@
-"""Actions other than deploy: the samples that they get, and what is rendered for them."""
+"""Compiles actions other than deploy: their windows of samples, and their templates."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wayside.rules.database import database_problems
 
 
 class Compiler(Protocol):
-    """What of the rule's compiler is needed here."""
+    """The parts of the rule's compiler that are used here."""
 
     detector: Detector
     spec: EventRuleSpec
@@ -37,13 +37,13 @@ class Compiler(Protocol):
         """How long the Detector keeps the stream's samples, in nanoseconds."""
 
     def problem(self, path: FieldPath, message: str) -> None:
-        """Say what is wrong with a field."""
+        """Report a problem with a field."""
 
 
 def compile_actions(
     compiler: Compiler, actions: Iterable[tuple[int, Action]], environment: Environment
 ) -> list[CompiledAction]:
-    """The actions, each with its place among the rule's; problems are told to the compiler."""
+    """The actions, each with its place among the rule's; problems are reported to the compiler."""
     return [_compiled(compiler, ("spec", "actions", index), action, environment) for index, action in actions]
 
 
@@ -56,7 +56,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
     if action.record is not None and compiler.detector.spec.recordings is None:
         compiler.problem(
             (*at, "record"),
-            f"Detector {compiler.detector.name} does not say where recordings go: give its spec.recordings, "
+            f"Detector {compiler.detector.name} has no spec.recordings: add it, "
             "e.g. {path: /var/lib/wayside/recordings}",
         )
     below, values = action.templates
@@ -115,5 +115,5 @@ def window_of(
 
 
 def _of_one(stream: Stream) -> bool:
-    """Whether all its samples belong to a client whom the Detector names."""
+    """Whether all its samples belong to a client named by the Detector."""
     return stream.client is not None and not stream.names_by_message

@@ -1,4 +1,4 @@
-"""What is wrong with a rule whatever Detector is to evaluate it: its own expressions and names.
+"""The problems of a rule that do not depend on a Detector: its own expressions and names.
 
 The rule is compiled against a Detector that has every stream, keeps everything and takes every action. So what remains
 is the rule's alone, and no change of a Detector could put it right.
@@ -21,7 +21,7 @@ def own_problems(rule: EventRule) -> tuple[RuleProblem, ...]:
     try:
         compile_rule(rule, _taking_everything())
     except RuleError as error:
-        # Of a stream's type or messages a Detector says more than we make up here.
+        # The stream's type and messages depend on the Detector; the ones here are invented.
         return tuple(each for each in error.problems if each.path[-1:] != ("stream",))
     return ()
 

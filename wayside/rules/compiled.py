@@ -15,17 +15,17 @@ from wayside.rules.parameters import NO_PARAMETERS, Parameters
 
 @dataclass(frozen=True, slots=True)
 class CompiledSignal:
-    """How one signal is computed."""
+    """The definition of one signal."""
 
     name: str
     stream: str
-    """Of the Detector, or what `episode_stream` gives for `rule`."""
+    """A stream of the Detector, or the result of `episode_stream` for `rule`."""
     aggregate: Aggregate
     value: Expression | None
     where: Expression | None
     over_ns: int | None
     parameters: Parameters = NO_PARAMETERS
-    """What value and where see as `parameters`, by client."""
+    """The `parameters` of value and where, by client."""
     rule: str | None = None
     """The rule whose episode starts are the samples; None where they come from a stream."""
     element: CompiledElement | None = None
@@ -38,7 +38,7 @@ class CompiledSignal:
 
 
 def episode_stream(rule: str) -> str:
-    """What the episode starts of a rule are called where other samples have a stream; no stream has such a name."""
+    """The name of a rule's episode starts in place of a stream name; no stream can have such a name."""
     return f"rule/{rule}"
 
 
@@ -49,12 +49,12 @@ class CompiledPlugin:
     name: str
     plugin: str
     parameters: Mapping[str, Any] = field(hash=False)
-    """As written; the plugin's own model makes more of them."""
+    """As written; the plugin's own model validates them."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledPosition:
-    """How a client's position is computed."""
+    """The definition of a client's position."""
 
     stream: str
     axes: Mapping[str, Expression]
@@ -86,9 +86,9 @@ class PairSubject:
     a: Expression | None = None
     b: Expression | None = None
     maximum: int = 10_000
-    """At most so many pairs within reach are looked at in one evaluation."""
+    """The maximum number of pairs in reach per evaluation."""
     closing_speed: bool = False
-    """Whether any expression asks for it."""
+    """Whether any expression uses it."""
 
     @property
     def ordered(self) -> bool:
@@ -135,7 +135,7 @@ class CompiledDeploy:
 
     @property
     def fixed(self) -> tuple[str, Operation, int]:
-        """What of its tasks never changes while they live."""
+        """The fields that never change while its tasks are live."""
         return self.template, self.operation, self.priority
 
 
@@ -145,9 +145,9 @@ class CompiledWindow:
 
     streams: frozenset[str]
     latched: frozenset[str]
-    """Streams of which what was said last comes as well, however long ago."""
+    """Streams whose last samples are included, however old they are."""
     shared: frozenset[str]
-    """The latched streams that belong to one client whom the Detector names: they come with everybody's samples."""
+    """The latched streams that belong to one client named by the Detector: they are included for every client."""
     clients: frozenset[str] | None
     """Beside the episode's own; None: those of all clients."""
     before_ns: int
@@ -162,7 +162,7 @@ class CompiledAction:
 
     name: str
     templates: Mapping[str, CompiledTemplate] = field(compare=False)
-    """What is rendered over the rule's variables at the start of each episode."""
+    """The values that are rendered over the rule's variables at the start of each episode."""
     window: CompiledWindow | None
     source: str
     """The action as written, in canonical JSON: another action where this differs."""
@@ -176,7 +176,7 @@ class ModelRunner(Protocol):
         """Of the model's file."""
 
     def tensor(self, name: str, payload: bytes) -> Any:
-        """What the bytes of a camera's or lidar's message are as that input; raises the engine's DecodeError."""
+        """The bytes of a camera's or lidar's message as a tensor for that input; raises the engine's DecodeError."""
 
     def run(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
         """The signal's value for each row of inputs by name. Raises ValueError where the model fails."""
@@ -233,7 +233,7 @@ class CompiledRule:
     on_demand: bool = False
     priority: int = 0
     maximum_per_hour: int | None = None
-    """So many episodes of a client may start within an hour."""
+    """The maximum number of episodes per client and hour; None: no limit."""
 
     @property
     def has_actions(self) -> bool:
@@ -256,7 +256,7 @@ class CompiledRule:
 
 @dataclass(frozen=True, slots=True)
 class CompiledStream:
-    """How a sample of a stream tells the sender's time and whose it is, where the Detector says so."""
+    """The expressions of a stream for the sender's time and the client, if the Detector has them."""
 
     name: str
     stamp: Expression | None

@@ -1,4 +1,4 @@
-"""Compiles a rule against the Detector that is to evaluate it, and says all that is wrong with it."""
+"""Compiles a rule against the Detector that evaluates it, and reports all problems of the rule."""
 
 from __future__ import annotations
 
@@ -282,7 +282,7 @@ class _RuleCompiler:
                 self.problem(path, text)
 
     def _closing(self, subject: CompiledSubject, conditions: Iterable[Expression | None]) -> CompiledSubject:
-        """The subject, with the closing speed where any expression asks for it."""
+        """The subject, with the closing speed if any expression uses it."""
         if not isinstance(subject, PairSubject):
             return subject
         asking = [expression.names for expression in (*conditions, subject.where) if expression is not None]
@@ -294,7 +294,7 @@ class _RuleCompiler:
         return replace(subject, closing_speed=True)
 
     def problem(self, path: FieldPath, message: str) -> None:
-        """Say what is wrong with a field."""
+        """Report a problem with a field."""
         self.problems.append(RuleProblem(path, message))
 
 

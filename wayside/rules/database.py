@@ -1,4 +1,4 @@
-"""What a database action asks of its Detector."""
+"""Checks that a Detector has what a database action needs."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from wayside.api.wording import FieldPath
 
 
 def database_problems(action: DatabaseAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
-    """What is missing; the paths begin at the action."""
+    """The missing fields; the paths begin at the action."""
     database = detector.spec.database
     if database is None:
         yield (
             ("database",),
-            f"Detector {detector.name} has no database: give it spec.database, e.g. {{uriVariable: MONGODB_URI}}",
+            f"Detector {detector.name} has no spec.database: add it, e.g. {{uriVariable: MONGODB_URI}}",
         )
     elif action.files is not None and database.files is None:
         yield (
             ("database", "files"),
-            f"Detector {detector.name} has no place for files: give it spec.database.files.path, or remove files",
+            f"Detector {detector.name} has no spec.database.files: add it with a path, or remove files",
         )

@@ -1,4 +1,4 @@
-"""Rules over rules: which rule a rule's signals name, in which order they are evaluated, and what is wrong with that.
+"""Rules over rules: the dependencies of rules, their order of evaluation, and the problems of both.
 
 A signal's samples may be the episode starts of another rule. Within a tick a rule is evaluated after those it depends
 on: its depth is 0 where it names none, else one more than the greatest depth of those it names.
@@ -17,7 +17,7 @@ from wayside.rules.problems import RuleProblem
 def in_order(rules: Iterable[CompiledRule]) -> list[CompiledRule]:
     """The rules as they are evaluated within a tick: by depth, then by name.
 
-    What is named and not there is left out of account, and so is what closes a cycle (only rules that go on as they
+    Unknown rules are ignored, and so are dependencies that close a cycle (only rules that stay active as they
     last were can form one: `dependency_problems` refuses the others).
     """
     named = {rule.name: [signal.rule for signal in rule.signals if signal.rule is not None] for rule in rules}
@@ -44,7 +44,7 @@ def dependency_problems(rules: Sequence[EventRule]) -> dict[str, list[RuleProble
                 message = _unknown(other, [each for each in named if each != name])
             elif cycle := _way(other, name, named):
                 message = (
-                    f"rules cannot depend on each other in a circle: {' → '.join((name, *cycle))}; "
+                    f"rules must not depend on each other in a cycle: {' → '.join((name, *cycle))}; "
                     "remove one of these signals"
                 )
             else:

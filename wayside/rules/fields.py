@@ -1,4 +1,4 @@
-"""Which fields a message has: finds misspelt ones before any sample has come."""
+"""The fields of messages: finds misspelt fields before any sample arrives."""
 
 from __future__ import annotations
 

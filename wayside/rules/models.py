@@ -1,6 +1,6 @@
-"""Compiles signals that a model computes, as far as the rule and its Detector tell: the file is looked at elsewhere.
+"""Compiles signals that a model computes, from the rule and its Detector. The model file is checked elsewhere.
 
-A model's inputs are signals of the same rule over streams; models do not build on models.
+A model's inputs are signals of the same rule over streams; a model cannot be the input of a model.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ _IMAGE = "sensor_msgs/msg/Image"
 _POINTS = "sensor_msgs/msg/PointCloud2"
 
 Located = tuple[FieldPath, str]
-"""A field below the model, and what is wrong with it."""
+"""A field below the model, and its problem."""
 
 
 class Compiling(Protocol):
-    """What is being compiled, and where problems go."""
+    """The rule that is being compiled, and the receiver of its problems."""
 
     @property
     def spec(self) -> EventRuleSpec:
@@ -34,7 +34,7 @@ class Compiling(Protocol):
         """That is to evaluate it."""
 
     def problem(self, path: FieldPath, message: str) -> None:
-        """Say what is wrong with a field."""
+        """Report a problem with a field."""
 
 
 def compile_models(rule: Compiling, compiled: Sequence[CompiledSignal]) -> tuple[CompiledModel, ...]:
@@ -58,7 +58,7 @@ def compile_models(rule: Compiling, compiled: Sequence[CompiledSignal]) -> tuple
 
 
 def _problems(model: ModelSource, signals: Sequence[Signal], detector: Detector) -> Iterator[Located]:
-    """What is wrong with the model's inputs; `signals` are all of the rule."""
+    """The problems of the model's inputs; `signals` are all signals of the rule."""
     by_name = {signal.name: signal for signal in signals}
     for index, given in enumerate(model.inputs):
         at: FieldPath = ("inputs", index)
@@ -86,9 +86,9 @@ def _signal_problems(names: Iterable[str], by_name: Mapping[str, Signal]) -> Ite
             known = ", ".join(each for each, other in by_name.items() if other.model is None) or "none"
             yield ("signals", position), f"the rule has no signal {name}; it has {known}"
         elif signal.model is not None:
-            yield ("signals", position), f"{name} is computed by a model, which no other model can build on"
+            yield ("signals", position), f"{name} is computed by a model and cannot be the input of another model"
         elif signal.plugin is not None:
-            yield ("signals", position), f"{name} is computed by a plugin, which no model can build on"
+            yield ("signals", position), f"{name} is computed by a plugin and cannot be the input of a model"
 
 
 def _window_problems(window: ModelWindow, by_name: Mapping[str, Signal], detector: Detector) -> Iterator[Located]:

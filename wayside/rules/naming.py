@@ -1,4 +1,4 @@
-"""Names that a rule gives to signals and elements: which it cannot give, why, and what to write instead."""
+"""Checks the names of signals and elements, and proposes another name if one is not allowed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def element_name_problem(name: str, spec: EventRuleSpec) -> str | None:
     """Why the element of `each` cannot have the name, and which it could have; None where it can."""
     problem = _problem(name, spec, {**_given(spec), **_SAMPLE}, "element")
     if problem is None and any(signal.name == name for signal in spec.signals):
-        return f"{name} is a signal's name as well: call one of them {_free(name, spec, {}, 'element')}, say"
+        return f"{name} is also the name of a signal: rename one of them, e.g. to {_free(name, spec, {}, 'element')}"
     return problem
 
 
@@ -49,11 +49,11 @@ def _given(spec: EventRuleSpec) -> Mapping[str, str]:
 def _problem(name: str, spec: EventRuleSpec, given: Mapping[str, str], kind: str) -> str | None:
     if name in given:
         giver = "a sample" if name in _SAMPLE else f"the scope {_scope(spec)}"
-        why = f"{giver} gives this name to expressions: it is {given[name]}"
+        why = f"{giver} already defines the variable {name}: {given[name]}"
     elif name in RESERVED_WORDS:
-        why = f"{name} is a word of CEL: its grammar reserves it"
+        why = f"{name} is a reserved word of CEL"
     elif is_taken(name):
-        why = f"{name} is a word of CEL: it names a type there"
+        why = f"{name} is the name of a CEL type"
     else:
         return None
     return f"{why}; choose another name, such as {_free(name, spec, given, kind)}"

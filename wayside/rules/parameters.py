@@ -1,4 +1,4 @@
-"""The parameters of a rule: its own constants, and what the Detector sets for single clients instead."""
+"""The parameters of a rule: its own constants, and the Detector's overrides for individual clients."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What expressions see as `parameters`."""
+    """The values that expressions see as `parameters`."""
 
     own: Values = field(default_factory=dict)
     """As the rule has them."""
@@ -59,7 +59,7 @@ def kinds_of(rule: EventRule) -> Mapping[str, Kind]:
 
 
 def override_problems(rule: EventRule, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
-    """What is wrong with the Detector's values for the rule's parameters: the field of the Detector, and why."""
+    """The problems of the Detector's overrides for the rule's parameters: the Detector's field, and the message."""
     own = rule.spec.parameters
     for index, client in enumerate(detector.spec.clients):
         for name, value in client.parameters.get(rule.name, {}).items():
@@ -71,7 +71,7 @@ def override_problems(rule: EventRule, detector: Detector) -> Iterator[tuple[Fie
 
 
 def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[FieldPath, str]]:
-    """The Detector's values for rules that are not there: the field of the Detector, and what to do."""
+    """The Detector's overrides for unknown rules: the field of the Detector, and the remedy."""
     names = list(rules)
     for index, client in enumerate(detector.spec.clients):
         for rule in client.parameters:
@@ -82,7 +82,7 @@ def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[Fi
 
 
 def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
-    """Where the other value is of another kind than the rule's own; of lists, what their items are counts."""
+    """The differences of type between an override and the rule's own value; for lists, the items are compared."""
     wanted, given = _kind(own), _kind(other)
     if wanted != given:
         yield f"{name} of EventRule {rule} is a {wanted}, this is a {given}: {other!r:.60}"

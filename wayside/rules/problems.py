@@ -1,4 +1,4 @@
-"""What is wrong with a rule, and in which field."""
+"""Problems of a rule, with their fields."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from wayside.api.documents import FieldPath, field_text
 
 @dataclass(frozen=True, slots=True)
 class RuleProblem:
-    """Why a rule cannot be evaluated: the field, and what to do."""
+    """The reason why a rule cannot be evaluated: the field, and a message with the remedy."""
 
     path: FieldPath
     message: str
@@ -25,7 +25,7 @@ class RuleProblem:
 
 
 class RuleError(Exception):
-    """A rule that cannot be evaluated; `problems` has all reasons."""
+    """A rule that cannot be evaluated; `problems` has every problem."""
 
     def __init__(self, problems: Iterable[RuleProblem]) -> None:
         self.problems = tuple(problems)

@@ -1,4 +1,4 @@
-"""Compiles whom a rule is about: its scope, and the elements of `each`."""
+"""Compiles the scope of a rule, and the elements of `each`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from wayside.rules.variables import (
 )
 
 CLOSING_NS = 1_000_000_000
-"""Over so long the closing speed is measured, in nanoseconds."""
+"""The time over which the closing speed is measured, in nanoseconds."""
 
 
 class Expressions(Protocol):
@@ -53,14 +53,14 @@ class Expressions(Protocol):
         """The Detector's stream of that name; None where it has none."""
 
     def problem(self, path: FieldPath, message: str) -> None:
-        """Say what is wrong with a field."""
+        """Report a problem with a field."""
 
     def kept_ns(self, stream: Stream) -> int:
         """How long the Detector keeps the stream's samples, in nanoseconds."""
 
 
 def compile_subject(compiler: Expressions) -> CompiledSubject | None:
-    """The scope; None where problems forbid it. Whether `closingSpeed` is asked for is not known here yet."""
+    """The scope; None where problems forbid it. Whether `closingSpeed` is used is not known yet."""
     spec = compiler.rule.spec
     element = element_of(spec)
     if spec.scope.pairs is not None:
@@ -146,7 +146,7 @@ def element_problems(
             for name in names or ():
                 if name in own:
                     path: FieldPath = ("spec", "signals", model.index, "model", "inputs", index)
-                    yield path, f"{name} reads the element of each, and a model is run once for a client: leave it out"
+                    yield path, f"{name} reads the element of each, but a model runs once per client: remove it"
 
 
 def _reads(signal: CompiledSignal, variable: str) -> bool:
@@ -174,6 +174,6 @@ def closing_speed_problem(stream: Stream | None, kept: int) -> str | None:
     if stream is None or kept > CLOSING_NS:
         return None
     return (
-        f"closingSpeed looks 1 s back, and stream {stream.name} is kept for {kept / 1e9:g} s only: "
+        f"closingSpeed needs the samples of 1 s, but stream {stream.name} is kept for {kept / 1e9:g} s only: "
         "raise the stream's buffer.duration to 2s or more"
     )

@@ -1,4 +1,4 @@
-"""Whether a Detector's streams and sources fit together. What a plugin asks for, its own program checks."""
+"""Checks that the streams and sources of a Detector match. The parameters of a plugin are checked where it runs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def source_problems(detector: Detector) -> Iterator[RuleProblem]:
         if source.name == ZENOH:
             yield RuleProblem(
                 ("spec", "sources", index, "name"),
-                f"{ZENOH} is the session of spec.zenoh, which is there without being named: choose another name",
+                f"{ZENOH} is the session of spec.zenoh, which always exists: choose another name",
             )
         elif not any(stream.source == source.name for stream in detector.spec.streams):
             yield RuleProblem(
                 ("spec", "sources", index, "name"),
-                f"no stream comes from {source.name}: write source: {source.name} in those that do, or remove it",
+                f"no stream uses {source.name}: set source: {source.name} in a stream, or remove it",
             )
     for index, stream in enumerate(detector.spec.streams):
         if stream.source in (ZENOH, *names):

@@ -1,4 +1,4 @@
-"""The expressions of a Detector's streams: the sender's time, and whose a message is."""
+"""The expressions of a Detector's streams: the sender's time, and the client of a message."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> 
 
 
 def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
-    """What is wrong with a Detector's stream: its key, and its expressions."""
+    """The problems of a Detector's stream: of its key and its expressions."""
     try:
         KeyPattern.parse(stream.key)
     except KeyPatternError as error:
@@ -51,7 +51,7 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
 
 
 def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:
-    """What is wrong with a template that names the client by the message."""
+    """The problems of a `client` template over the message."""
     try:
         template = compile_template(stream.client, naming_environment())
     except InterpolationError as error:

@@ -13,7 +13,7 @@ MEMBER_OF_CLIENT = ("client", "labels", "streams", "parameters")
 EPISODE_MEMBERS: Fields = dict.fromkeys(
     ("episode", "subject", "subjects", "element", "onsetTime", "startTime", "values")
 )
-"""What msg has in a signal over a rule: an episode's start. Times are seconds since the epoch."""
+"""The fields of msg in a signal over a rule: the start of an episode. Times are seconds since the epoch."""
 
 SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 
@@ -73,7 +73,7 @@ def fleet_environment(element: str | None = None) -> Environment:
 
 
 def _with_element(variables: dict[str, Kind], name: str | None) -> dict[str, Kind]:
-    """And the element of `each`; one whose name cannot be is left out, and told of elsewhere."""
+    """Adds the element of `each`; an element with an invalid name is skipped, and reported elsewhere."""
     return variables if name is None or name in variables or is_taken(name) else {**variables, name: Kind.MAP}
 
 
@@ -100,7 +100,7 @@ def _with(environment: Environment, plugins: tuple[str, ...]) -> Environment:
 
 
 def _scope_environment(spec: EventRuleSpec) -> Environment:
-    """What the scope gives."""
+    """The variables of the scope."""
     element = element_of(spec)
     if spec.scope.pairs is not None:
         return pairs_environment(element)

@@ -64,9 +64,9 @@ def test_an_action_gets_its_parameters_as_its_model() -> None:
         ("parameters", {}, "which is no complete detector.actions.base.Action (docs/actions.md)"),
         ("bare", {}, "plugin.name: action bare: give tests.unit.actions.test_actions_registry:Bare a class Parameters"),
         ("deploy", {}, "plugin.name: deploy is no plugin: write deploy: {…} in place of plugin: {…}"),
-        ("lamp", {}, "plugin.parameters.colour: is missing: give it"),
+        ("lamp", {}, "plugin.parameters.colour: is missing: add it"),
         ("lamp", {"colour": "red", "seconds": 0}, "plugin.parameters.seconds: must be greater than 0; given: 0"),
-        ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: there is no such field"),
+        ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: unknown field"),
     ],
 )
 def test_what_is_wrong_with_an_action_is_told_with_its_field(
@@ -84,7 +84,7 @@ def test_check_tells_line_and_column(tmp_path: Path) -> None:
         "  actions:\n    - name: a\n      plugin: {name: lamp, parameters: {colour: 3}}\n"
     )
     (problem,) = check_documents(load_documents([tmp_path]))
-    assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a text, is 3" in str(problem)
+    assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a string, but is 3" in str(problem)
 
 
 def test_a_rule_whose_action_is_refused_goes_on_as_it_last_was() -> None:

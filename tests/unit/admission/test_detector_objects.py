@@ -169,20 +169,23 @@ def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str],
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ({"state": {"path": "state"}}, "state.path: 'state' is no folder for a volume"),
-        ({"recordings": {"path": "/"}}, "recordings.path: '/' is no folder"),
-        ({"recordings": {"path": "/data/../etc"}}, "give an absolute path"),
-        ({"mode": None, "pod": {}}, "give mode Standalone or Sidecar, or remove pod"),
+        ({"state": {"path": "state"}}, "state.path: 'state' cannot be a volume path"),
+        ({"recordings": {"path": "/"}}, "recordings.path: '/' cannot be a volume path"),
+        ({"recordings": {"path": "/data/../etc"}}, "use an absolute path"),
+        ({"mode": None, "pod": {}}, "set mode to Standalone or Sidecar, or remove pod"),
         ({"pod": {"volumes": [{"path": "/a", "claim": "b", "size": "1Gi"}]}}, "give claim or size, not both"),
         ({"pod": {"volumes": [{"path": "/a"}, {"path": "/a"}]}}, "volumes: /a is given twice"),
         ({"pod": {"env": [{"name": "A", "value": ""}, {"name": "A", "value": "b"}]}}, "env: A is given twice"),
-        ({"pod": {"env": [{"name": "A"}]}}, "give value or fromSecret, one of them"),
+        ({"pod": {"env": [{"name": "A"}]}}, "give exactly one of value and fromSecret"),
         (
             {"pod": {"env": [{"name": "POD_UID", "value": "1"}]}},
-            "POD_UID are set for each pod by itself",
+            "POD_UID are set automatically in each pod",
         ),
-        ({"pod": {"tolerations": [{"effect": "NoSchedule"}]}}, "without a key, operator must be Exists"),
-        ({"pod": {"tolerations": [{"key": "a", "operator": "Exists", "value": "b"}]}}, "there is no value"),
+        ({"pod": {"tolerations": [{"effect": "NoSchedule"}]}}, "without key, operator must be Exists"),
+        (
+            {"pod": {"tolerations": [{"key": "a", "operator": "Exists", "value": "b"}]}},
+            "with operator Exists, remove value",
+        ),
     ],
 )
 def test_what_is_no_pod_is_refused(spec: dict[str, Any], said: str) -> None:

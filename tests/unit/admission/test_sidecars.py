@@ -343,17 +343,20 @@ def test_pods_that_are_over_are_no_trouble() -> None:
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ({"mode": "Standalone"}, "serviceAccountNames says nothing without mode Sidecar"),
-        ({"mode": None}, "serviceAccountNames says nothing without mode Sidecar"),
-        ({"pod": {"nodeSelector": {"a": "b"}}}, "pod.nodeSelector and pod.tolerations: with mode Sidecar"),
+        ({"mode": "Standalone"}, "serviceAccountNames has no effect without mode Sidecar"),
+        ({"mode": None}, "serviceAccountNames has no effect without mode Sidecar"),
+        (
+            {"pod": {"nodeSelector": {"a": "b"}}},
+            "pod.nodeSelector and pod.tolerations have no effect with mode Sidecar",
+        ),
         ({"serviceAccountNames": ["a", "a"]}, "serviceAccountNames: a is given twice"),
-        ({"state": {"path": "state"}}, "state.path: 'state' is no folder for a volume"),
+        ({"state": {"path": "state"}}, "state.path: 'state' cannot be a volume path"),
         (
             {"pod": {"resources": {"requests": {"memory": "2Gi"}}}},
             "requests.memory: 2Gi is more than limits.memory, 1Gi",
         ),
-        ({"pod": {"resources": {"requests": {"x": "1"}}}}, "requests: 'x' is no resource"),
-        ({"pod": {"resources": {"requests": {"a.b/gpu": "1"}}}}, "requests.a.b/gpu: 1 must be the same as limits"),
+        ({"pod": {"resources": {"requests": {"x": "1"}}}}, "requests: 'x' is not a resource"),
+        ({"pod": {"resources": {"requests": {"a.b/gpu": "1"}}}}, "requests.a.b/gpu: 1 must equal limits"),
     ],
 )
 def test_what_makes_no_sense_is_refused_by_its_field(spec: Json, said: str) -> None:

@@ -35,7 +35,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
     [
         ('  when: "points" in a.streams', "f.yaml:5:18: is not YAML", ["quoted as a whole: '\"points\" in a.streams'"]),
         ("  when: 'a' == client", "f.yaml:5:", ["quoted as a whole: '''a'' == client'"]),
-        ("  when: !ready", "f.yaml:5:9: spec.when: YAML takes !ready for a tag", ["quote the expression, '!ready'"]),
+        ("  when: !ready", "f.yaml:5:9: spec.when: YAML reads !ready as a tag", ["quote the expression, '!ready'"]),
         ("  when: !a.b && c", "f.yaml:5:15: is not YAML", ["'!a.b && c'"]),
         ("  when: !(speed > 3)", "f.yaml:5:", ["quoted as a whole: '!(speed > 3)'"]),
         ("  when: !ready && !b", "f.yaml:5:", ["'!ready && !b'"]),
@@ -43,23 +43,27 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         ("  when: [1, 2] == x", "f.yaml:5:", ["quoted as a whole: '[1, 2] == x'"]),
         ("  when: *x", "f.yaml:5:9: is not YAML", ["quoted as a whole: '*x'"]),
         ("  when: `x`", "f.yaml:5:9: is not YAML", ["quoted as a whole: '`x`'"]),
-        ("  actions:\n  - {name: x, v: ${a.b}}", "f.yaml:6:", ["inside {…} and […], quote each text"]),
+        ("  actions:\n  - {name: x, v: ${a.b}}", "f.yaml:6:", ["inside {…} and […], quote each string"]),
         ("  when: x\n\tuntil: y", "f.yaml:6:1: is not YAML", ["indent with spaces, not with tabs"]),
         ('  when: "x', "f.yaml:5:9: is not YAML", ["unexpected end of stream"]),
         ("  when: x\n until: y", "f.yaml:6:2: is not YAML", ["check the indentation and the quotes here"]),
-        ('  when: "\x01"', "f.yaml:5:10: holds the character '\\x01'", ["remove it"]),
+        ('  when: "\x01"', "f.yaml:5:10: contains the character '\\x01'", ["remove it"]),
         ("  when: !!int abc", "f.yaml:5:9: spec.when: YAML cannot read 'abc' as int", ["put it in quotes"]),
         ("  when: !!python/object:os.system x", "f.yaml:5:9: spec.when: YAML cannot read 'x'", ["put it in quotes"]),
         ("  when: =", "f.yaml:5:9: spec.when: YAML cannot read '='", ["put it in quotes"]),
-        ("  when: &a [*a]", "f.yaml:5:9: spec.when[0]: is nested more than 100 deep", ["an alias may hold itself"]),
-        ("  when: {a: 1}", "f.yaml:5:9: spec.when: must be a text; given: {'a': 1}", ["quote it as a whole"]),
-        ("  when: true", "f.yaml:5:9: spec.when: must be a text, is true", ["in quotes, e.g. 'true'"]),
-        ("  when: 5", "f.yaml:5:9: spec.when: must be a text, is 5", ["in quotes"]),
+        (
+            "  when: &a [*a]",
+            "f.yaml:5:9: spec.when[0]: is nested more than 100 levels deep",
+            ["an alias may refer to itself"],
+        ),
+        ("  when: {a: 1}", "f.yaml:5:9: spec.when: must be a string; given: {'a': 1}", ["quote it as a whole"]),
+        ("  when: true", "f.yaml:5:9: spec.when: must be a string, but is true", ["in quotes, e.g. 'true'"]),
+        ("  when: 5", "f.yaml:5:9: spec.when: must be a string, but is 5", ["in quotes"]),
         ("  when:", "f.yaml:5:8: spec.when: is empty", ["give it a value"]),
-        ("  until: x", "f.yaml:5:3: spec.when: is missing", ["give it"]),
+        ("  until: x", "f.yaml:5:3: spec.when: is missing", ["add it"]),
         ("  when: a\n  when: b", "f.yaml:6:3: spec.when: is given twice", ["remove one"]),
-        ("  when: a\n  whem: b", "f.yaml:6:9: spec.whem: there is no such field", ["check its spelling"]),
-        ("  when: a\n  for: 2", "f.yaml:6:8: spec.for: must be a text, is 2", []),
+        ("  when: a\n  whem: b", "f.yaml:6:9: spec.whem: unknown field", ["check its spelling"]),
+        ("  when: a\n  for: 2", "f.yaml:6:8: spec.for: must be a string, but is 2", []),
         ("  when: a\n  for: 2 s", "f.yaml:6:8: spec.for: '2 s' is not a duration", ["such as 500ms, 10s"]),
         ("  when: a\n  evaluation: {every: 0s}", "f.yaml:6:15: spec.evaluation: every: 0s", ["give 10ms or more"]),
         ("  when: a\n  enabled: maybe", "f.yaml:6:12: spec.enabled: must be true or false; given: 'maybe'", []),
@@ -90,11 +94,11 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         ),
         (
             "  when: a\n  scope: {client: {}, pairs: {position: {stream: s, x: a, y: b}, within: 3}}",
-            "f.yaml:6:10: spec.scope: exactly one of client, pairs and fleet must be given",
+            "f.yaml:6:10: spec.scope: give exactly one of client, pairs and fleet",
             [],
         ),
         ("  when: a\n  evaluation: {every: 5ms}", "f.yaml:6:15: spec.evaluation: every: 5ms", ["give 10ms or more"]),
-        ("  - when", "f.yaml:5:3: spec: must be a map of fields; given: ['when']", []),
+        ("  - when", "f.yaml:5:3: spec: must be an object; given: ['when']", []),
     ],
 )
 def test_a_problem_names_its_place_the_value_and_the_remedy(
@@ -109,9 +113,12 @@ def test_a_problem_names_its_place_the_value_and_the_remedy(
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("foo", "f.yaml:1:1: is not an object but 'foo': each document needs apiVersion, kind, metadata and spec"),
-        ("apiVersion: v1\nkind: Pod", "f.yaml:1:1: apiVersion 'v1', kind 'Pod' is none of ours: write apiVersion: way"),
-        ("kind: EventRule", "f.yaml:1:1: apiVersion None, kind 'EventRule' is none of ours"),
+        ("foo", "f.yaml:1:1: must be an object, but is 'foo': each document needs apiVersion, kind, metadata and spec"),
+        (
+            "apiVersion: v1\nkind: Pod",
+            "f.yaml:1:1: apiVersion 'v1', kind 'Pod' is not a Wayside kind: write apiVersion: way",
+        ),
+        ("kind: EventRule", "f.yaml:1:1: apiVersion None, kind 'EventRule' is not a Wayside kind"),
         (b"\xff\xfe\x00", "f.yaml: cannot be read: is not UTF-8 text"),
         (DETECTOR + "  streams: {}", "f.yaml:5:12: spec.streams: must be a valid list; given: {}"),
         (
@@ -120,7 +127,7 @@ def test_a_problem_names_its_place_the_value_and_the_remedy(
         ),
         (
             DETECTOR + "  streams:\n  - {name: s, key: 'a/${client:*}', encoding: json, staleAfter: 3}",
-            "f.yaml:6:65: spec.streams[0].staleAfter: must be a text, is 3",
+            "f.yaml:6:65: spec.streams[0].staleAfter: must be a string, but is 3",
         ),
         (
             DETECTOR + "  streams:\n  - {name: s, key: 'a/${client:*}', encoding: json, staleAfter: 0s}",
@@ -167,7 +174,7 @@ def test_all_problems_of_all_files_are_told_in_order(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_files_of_ours_is_told(tmp_path: Path) -> None:
-    with pytest.raises(DocumentError, match=r"the folder holds no \.yaml"):
+    with pytest.raises(DocumentError, match=r"the folder contains no \.yaml"):
         load_documents([tmp_path])
 
 
@@ -219,9 +226,9 @@ def test_aliases_that_multiply_themselves_are_refused(tmp_path: Path) -> None:
 def test_an_object_of_the_api_server_is_told_by_its_fields() -> None:
     raw: dict[str, Any] = {"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": {"name": "r"}}
     assert parse_object(raw | {"spec": {"when": "a"}}).name == "r"
-    with pytest.raises(ValueError, match=r"spec\.when: is missing: give it; spec\.for: '2y' is not a duration"):
+    with pytest.raises(ValueError, match=r"spec\.when: is missing: add it; spec\.for: '2y' is not a duration"):
         parse_object(raw | {"spec": {"for": "2y"}})
-    with pytest.raises(ValueError, match="is none of ours"):
+    with pytest.raises(ValueError, match="is not a Wayside kind"):
         parse_object({"kind": "Pod"})
 
 

@@ -96,62 +96,64 @@ WAYS = [
     way("numberOfParticipants", "One", "[0]: One (a single participant) contradicts the rule: spec.scope.fleet",
         "Multiple", scope=FLEET, when="size(members) > 3.0"),
     Way({"numberOfParticipants": ["One"], "eventDetectionEntity": ["External"]}, {},
-        "spec.classification.eventDetectionEntity[0]: External (an entity detects the event that is neither its source",
+        "spec.classification.eventDetectionEntity[0]: External (an entity that is neither the source of the event nor",
         {"numberOfParticipants": ["Two"], "eventDetectionEntity": ["External"]}),
-    way("actingEntity", "External", "[0]: External (another entity acts than the one that detects the event) "
+    way("actingEntity", "External", "[0]: External (another entity acts) "
         "contradicts the rule: the detector itself carries out spec.actions[0].record, spec.actions[1].database: "
         "write EventDetectionEntity", "EventDetectionEntity", actions=act(RECORD, DATABASE)),
-    way("observationPeriod", "Immediate", "[0]: Immediate (a certain sample is enough: the event follows at once) "
+    way("observationPeriod", "Immediate", "[0]: Immediate (a single sample is enough to detect the event) "
         "contradicts the rule: it looks back 2h (spec.signals[0].over: 2h): write LongTerm", "LongTerm", **DECIDING),
-    way("observationPeriod", "Immediate", "[0]: Immediate (a certain sample is enough: the event follows at once) "
+    way("observationPeriod", "Immediate", "[0]: Immediate (a single sample is enough to detect the event) "
         "contradicts the rule: it looks back 2s (spec.for: 2s): write ShortTerm", "ShortTerm", **{"for": "2s"}),
-    way("observationPeriod", "Immediate", "[0]: Immediate (a certain sample is enough: the event follows at once) "
+    way("observationPeriod", "Immediate", "[0]: Immediate (a single sample is enough to detect the event) "
         "contradicts the rule: it looks back 2500ms (spec.signals[0].over: 1500ms and spec.for: 1s): write ShortTerm",
         "ShortTerm", signals=[over("1500ms")], when="m > 1", **{"for": "1s"}),
-    way("observationPeriod", "ShortTerm", "[0]: ShortTerm (it takes the data of some seconds up to minutes) "
-        "contradicts the rule: it looks at the newest samples alone: write Immediate", "Immediate"),
-    way("observationPeriod", "ShortTerm", "[0]: ShortTerm (it takes the data of some seconds up to minutes) "
+    way("observationPeriod", "ShortTerm", "[0]: ShortTerm (the detection needs data of seconds to minutes) "
+        "contradicts the rule: it uses only the newest samples: write Immediate", "Immediate"),
+    way("observationPeriod", "ShortTerm", "[0]: ShortTerm (the detection needs data of seconds to minutes) "
         "contradicts the rule: it looks back 2h", "ShortTerm LongTerm", **DECIDING),
-    way("observationPeriod", "LongTerm", "[0]: LongTerm (it takes the data of hours, or of longer) contradicts the "
+    way("observationPeriod", "LongTerm", "[0]: LongTerm (the detection needs data of hours or more) contradicts the "
         "rule: it looks back 1m (spec.signals[0].over: 1m): write ShortTerm", "ShortTerm",
         signals=[over("1m")], when="m > 1"),
-    way("timeSensitivity", "Immediate", "[0]: Immediate (the action has its consequences at once) contradicts the "
+    way("timeSensitivity", "Immediate", "[0]: Immediate (the consequences are immediate) contradicts the "
         "rule: it is evaluated every 10s (spec.evaluation.every): shorten it", "ShortTerm",
         evaluation={"every": "10s"}),
-    way("timeSensitivity", "Immediate", "[0]: Immediate (the action has its consequences at once) contradicts the "
+    way("timeSensitivity", "Immediate", "[0]: Immediate (the consequences are immediate) contradicts the "
         "rule: spec.actions[0].notify.grouping.wait: 5s: shorten it", "ShortTerm", actions=act(LATER)),
-    way("timeSensitivity", "ShortTerm", "[0]: ShortTerm (the consequences come within some seconds up to minutes) "
+    way("timeSensitivity", "ShortTerm", "[0]: ShortTerm (the consequences follow within seconds to minutes) "
         "contradicts the rule: it is evaluated every 1h (spec.evaluation.every): shorten it, or write LongTerm",
         "LongTerm", evaluation={"every": "1h"}),
-    way("incidence", "Rare", "[0]: Rare (seldom: it is something special) contradicts the rule: spec.when: true always "
-        "holds: write Frequent", "Frequent", when="true"),
-    way("detectionAlgorithm", "RuleBased", "[0]: RuleBased (rules and heuristics find the event) contradicts the rule: "
-        "spec.signals[1].model is a learnt model: add LearningBased", "RuleBased LearningBased",
+    way("incidence", "Rare", "[0]: Rare (seldom, as an exception) contradicts the rule: spec.when: true "
+        "always holds: write Frequent", "Frequent", when="true"),
+    way("detectionAlgorithm", "RuleBased", "[0]: RuleBased (rules or heuristics detect the event) contradicts the "
+        "rule: spec.signals[1].model is a learnt model: add LearningBased", "RuleBased LearningBased",
         signals=[SPEED, a_model()], when="risk > 0.5"),
-    way("detectionAlgorithm", "LearningBased", "[0]: LearningBased (something that was learnt from data finds the "
+    way("detectionAlgorithm", "LearningBased", "[0]: LearningBased (an algorithm learnt from data detects the "
         "event) contradicts the rule: no signal that decides comes from a model or a plugin: write RuleBased",
         "RuleBased"),
-    way("typeOfAction", "Notification", ": spec.actions[0].deploy launches software: add Deployment (software is "
-        "launched that did not run before)", "Deployment Notification", actions=act(DEPLOY)),
-    way("typeOfAction", "Other", ": spec.actions[0].deploy configures what runs, and starts nothing: add Reconfig",
+    way("typeOfAction", "Notification", ": spec.actions[0].deploy launches software: add Deployment (the action "
+        "starts software that was not running)", "Deployment Notification", actions=act(DEPLOY)),
+    way("typeOfAction", "Other", ": spec.actions[0].deploy reconfigures running applications, and starts none: add",
         "Reconfiguration Other", actions=act(RECONFIGURE)),
-    way("typeOfAction", "Notification", ": spec.actions[0].deploy stops what runs: add Reconfiguration (software that "
-        "is there already is configured anew) or Other (anything else)", "Reconfiguration", actions=act(SUSPEND)),
-    way("typeOfAction", "Other", ": spec.actions[0].record records data: add DataCollection (data is", "DataCollection",
+    way("typeOfAction", "Notification", ": spec.actions[0].deploy stops running applications: add Reconfiguration (the "
+        "action changes the configuration of existing software) or Other (any other action)", "Reconfiguration",
+        actions=act(SUSPEND)),
+    way("typeOfAction", "Other", ": spec.actions[0].record records data: add DataCollection (the act",
+        "DataCollection",
         actions=act(RECORD)),
     way("typeOfAction", "Other", ": spec.actions[0].database records data: add DataCollection", "DataCollection",
         actions=act(DATABASE)),
     way("typeOfAction", "Other", ": spec.actions[0].trigger records data: add DataCollection", "DataCollection",
         actions=act(TRIGGER)),
-    way("typeOfAction", "DataCollection", ": spec.actions[1].notify raises an alert: add Notification (somebody, or",
+    way("typeOfAction", "DataCollection", ": spec.actions[1].notify raises an alert: add Notification (the action inf",
         "DataCollection Notification", actions=act(RECORD, ALERT)),
-    way("typeOfAction", "DataCollection", ": spec.actions[0].notify tells somebody, or something: add Reconfiguration",
+    way("typeOfAction", "DataCollection", ": spec.actions[0].notify sends a notification: add Reconfiguration",
         "Reconfiguration", actions=act(TELL)),
-    way("typeOfAction", "DataCollection Deployment", "[1]: Deployment (software is launched that did not run before) "
-        "contradicts the rule: no action of the rule does that (spec.actions[0].record): remove it, or add the action",
+    way("typeOfAction", "DataCollection Deployment", "[1]: Deployment (the action starts software that was not running)"
+        " contradicts the rule: no action of the rule does that (spec.actions[0].record): remove it, or add the action",
         "DataCollection", actions=act(RECORD)),
-    way("typeOfAction", "Reconfiguration Deployment", "[1]: Deployment (software is launched that did not run before) "
-        "contradicts the rule: no action of the rule does that (spec.actions[0].deploy)", "Reconfiguration",
+    way("typeOfAction", "Reconfiguration Deployment", "[1]: Deployment (the action starts software that was not run"
+        "ning) contradicts the rule: no action of the rule does that (spec.actions[0].deploy)", "Reconfiguration",
         actions=act(RECONFIGURE)),
 ]  # fmt: skip
 
@@ -268,10 +270,10 @@ def test_each_warning_is_at_a_value_that_is_given_and_has_its_definition(
 
 
 def test_the_guide_lists_them_all() -> None:
-    section = GUIDE.split("## What contradicts a rule", 1)[1].split("\n## ", 1)[0]
+    section = GUIDE.split("## Contradictions", 1)[1].split("\n## ", 1)[0]
     rows = [line for line in section.splitlines() if line.startswith("| `")]
     names = {dimension.values: dimension.name for dimension in SCHEME}
-    assert rows == [f"| `{names[each.dimension]}` | {each.says} |" for each in CONTRADICTIONS]
+    assert rows == [f"| `{names[each.dimension]}` | {each.description} |" for each in CONTRADICTIONS]
 
 
 RULES = """\
@@ -304,7 +306,7 @@ def test_check_tells_where_it_is_and_only_strict_fails(tmp_path: Path, capsys: p
     assert check(tmp_path) == 0
     lines = capsys.readouterr().err.splitlines()
     rules = tmp_path / "rules.yaml"
-    assert lines[0].startswith(f"{rules}:6:25: warning: spec.classification.observationPeriod[0]: ShortTerm (it takes")
+    assert lines[0].startswith(f"{rules}:6:25: warning: spec.classification.observationPeriod[0]: ShortTerm (the det")
     assert lines[1].startswith(
         f"{rules}:8:7: warning: spec.classification.typeOfAction: spec.actions[0].deploy launches"
     )

@@ -141,10 +141,10 @@ def test_where_all_must_agree_those_that_take_part_do(said: list[tuple[str, Any]
         ({"type": "string", "merge": "Sum"}, "merge Sum needs type number or integer, not string"),
         ({"type": "number", "merge": "All"}, "merge All needs type boolean, not number"),
         ({"type": "array", "merge": "Any"}, "merge Any needs type boolean, not array"),
-        ({"type": "number", "minimum": 2, "maximum": 1}, "minimum 2 is above maximum 1: no value would fit"),
+        ({"type": "number", "minimum": 2, "maximum": 1}, "minimum 2 is above maximum 1: no value is valid"),
         ({"type": "number", "pattern": "a"}, "pattern needs type string"),
         ({"type": "array", "pattern": "a"}, "pattern needs type string, or type array with items string, not array"),
-        ({"type": "number", "merge": "Sum", "enum": [1, 2]}, "makes values of its own"),
+        ({"type": "number", "merge": "Sum", "enum": [1, 2]}, "can produce values"),
         ({"type": "number", "enum": [1, "2"]}, "enum: item 1, '2', is not of type number"),
         ({"type": "integer", "minimum": 2, "default": 1}, "default: 1 is below the minimum of 2"),
         ({"type": "string", "default": "a", "required": True}, "remove one of required and default"),
@@ -166,7 +166,7 @@ REGIONS = {"type": "array", "items": "string", "pattern": "^[a-z]+$", "merge": "
         ({"type": "string", "pattern": "a"}, "b\0a", "does not match"),
         (REGIONS, ["north", "south"], None),
         (REGIONS, ["north", "S"], 'item 1, "S", does not match the pattern ^[a-z]+$: give a value of type array'),
-        ({"type": "string", "enum": ["x", "y"]}, "z", "'z' is none of 'x', 'y': give a value of type string one of"),
+        ({"type": "string", "enum": ["x", "y"]}, "z", "'z' is not one of 'x', 'y': give a value of type string one of"),
     ],
 )
 def test_a_value_is_matched_with_pattern_and_enum(spec: dict[str, Any], value: Any, problem: str | None) -> None:

@@ -60,4 +60,4 @@ def test_the_ways_to_evaluate() -> None:
         "each-sample car Until 0.95",
         "every-100-ms car Until 1",
     ]
-    assert [each.when for each in drive.engine.evaluate_now("when-asked")[1]] == [False]
+    assert [each.when for each in drive.engine.evaluate_now("on-request")[1]] == [False]

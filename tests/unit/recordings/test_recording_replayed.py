@@ -84,7 +84,7 @@ def problems(tmp_path: Path, detector: str, rule: str) -> list[str]:
 
 def test_a_rule_that_records_needs_to_know_where(tmp_path: Path) -> None:
     (found,) = problems(tmp_path, DETECTOR, RULE)
-    assert "spec.actions[0].record: Detector d does not say where recordings go: give its spec.recordings" in found
+    assert "spec.actions[0].record: Detector d has no spec.recordings: add it" in found
     assert found.startswith("19:15: ")
     assert problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", RULE) == []
 

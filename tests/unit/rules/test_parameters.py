@@ -112,7 +112,7 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
         (
             {"signals": [{**SPEED, "name": "parameters"}]},
             "spec.signals[0].name",
-            ["it is the rule's parameters", "such as parametersValue"],
+            ["variable parameters: the rule's parameters", "such as parametersValue"],
         ),
         (
             {"actions": [a_deploy("go", parameters={"x": "${parameters.y}"})]},
@@ -187,8 +187,8 @@ def test_has_asks_for_a_parameter_as_for_any_member() -> None:
         (None, "m is null: give it a value"),
         ([1, None], "m[1] is null"),
         ({"a": float("nan")}, "m.a is nan: give a finite number"),
-        ([[[[[[[[[[1]]]]]]]]]], "nested more than 8 deep"),
-        ("x" * 70_000, "bytes in all are too many: 65536 at most"),
+        ([[[[[[[[[[1]]]]]]]]]], "nested more than 8 levels deep"),
+        ("x" * 70_000, "bytes exceeds the limit of 65536"),
     ],
 )
 def test_what_no_expression_could_take_is_refused(value: object, text: str) -> None:

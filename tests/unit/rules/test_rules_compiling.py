@@ -41,29 +41,37 @@ def problems(fields: dict[str, Fields] | None = None, **spec: Any) -> dict[str, 
         (
             {"signals": [SPEED | {"name": "client"}]},
             "spec.signals[0].name",
-            ["the scope client gives this name", "the client's name", "choose another name, such as clientValue"],
+            [
+                "the scope client already defines the variable",
+                "the client's name",
+                "choose another name, such as clientValue",
+            ],
         ),
         (
             {"signals": [SPEED | {"name": "distance"}], "scope": PAIRS},
             "spec.signals[0].name",
-            ["the scope pairs gives this name", "the metres between the two", "such as distanceValue"],
+            ["the scope pairs already defines the variable", "the metres between the two", "such as distanceValue"],
         ),
         (
             {"signals": [SPEED | {"name": "members"}, SPEED | {"name": "membersValue"}], "scope": FLEET},
             "spec.signals[0].name",
-            ["the scope fleet gives this name", "such as membersValue2"],
+            ["the scope fleet already defines the variable", "such as membersValue2"],
         ),
         (
             {"signals": [SPEED | {"name": "for"}]},
             "spec.signals[0].name",
-            ["for is a word of CEL", "reserves", "such as forValue"],
+            ["for is a reserved word of CEL", "such as forValue"],
         ),
         (
             {"signals": [SPEED | {"name": "list"}]},
             "spec.signals[0].name",
-            ["list is a word of CEL", "names a type", "such as listValue"],
+            ["list is the name of a CEL type", "such as listValue"],
         ),
-        ({"signals": [SPEED | {"name": "in"}], "scope": PAIRS}, "spec.signals[0].name", ["in is a word of CEL"]),
+        (
+            {"signals": [SPEED | {"name": "in"}], "scope": PAIRS},
+            "spec.signals[0].name",
+            ["in is a reserved word of CEL"],
+        ),
         ({"signals": [SPEED | {"value": "mgs.v"}]}, "spec.signals[0].value", ["column 1", "did you mean `msg`?"]),
         (
             {"signals": [SPEED | {"value": "sample.siz"}]},

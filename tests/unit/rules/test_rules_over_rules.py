@@ -175,7 +175,7 @@ def test_a_circle_is_told_with_its_way_and_an_unknown_rule_with_the_nearest() ->
         a_rule("braking", when="true"),
     ]
     told = {name: [str(problem) for problem in problems] for name, problems in dependency_problems(rules).items()}
-    circle = "rules cannot depend on each other in a circle: {}; remove one of these signals"
+    circle = "rules must not depend on each other in a cycle: {}; remove one of these signals"
     assert told == {
         "a": ["spec.signals[0].rule: " + circle.format("a → b → c → a")],
         "b": ["spec.signals[1].rule: " + circle.format("b → c → a → b")],
@@ -198,9 +198,9 @@ def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None
     [
         ({"name": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream, rule, model and plugin"),
         ({"name": "s", "rule": "r", "stream": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream"),
-        ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active is for a signal over a rule"),
-        ({"name": "s", "rule": "r", "aggregate": "Active", "over": "1s"}, "takes neither over nor where"),
-        ({"name": "s", "rule": "r", "aggregate": "Active", "value": "msg.episode"}, "looks at no value"),
+        ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active is for a signal with rule"),
+        ({"name": "s", "rule": "r", "aggregate": "Active", "over": "1s"}, "without over and where"),
+        ({"name": "s", "rule": "r", "aggregate": "Active", "value": "msg.episode"}, "uses no value"),
     ],
 )
 def test_what_a_signal_over_a_rule_cannot_be(fields: Any, message: str) -> None:

@@ -53,10 +53,14 @@ def in_pairs(**fields: Any) -> dict[str, Any]:
             "spec.scope.pairs.position.x",
             "site",
         ),
-        ({"each": {**EACH, "as": "labels"}, "when": "true"}, "spec.each.as", "the scope client gives this name"),
-        ({"each": {**EACH, "as": "for"}, "when": "true"}, "spec.each.as", "for is a word of CEL"),
-        ({"each": {**EACH, "as": "speed"}, "signals": [SPEED], "when": "true"}, "spec.each.as", "a signal's name"),
-        ({"each": {**EACH, "as": "msg"}, "when": "true"}, "spec.each.as", "a sample gives this name"),
+        (
+            {"each": {**EACH, "as": "labels"}, "when": "true"},
+            "spec.each.as",
+            "the scope client already defines the variable",
+        ),
+        ({"each": {**EACH, "as": "for"}, "when": "true"}, "spec.each.as", "for is a reserved word of CEL"),
+        ({"each": {**EACH, "as": "speed"}, "signals": [SPEED], "when": "true"}, "spec.each.as", "the name of a signal"),
+        ({"each": {**EACH, "as": "msg"}, "when": "true"}, "spec.each.as", "a sample already defines the variable"),
         ({**in_pairs(), "signals": [{**SPEED, "name": "closingSpeed"}]}, "spec.signals[0].name", "closingSpeed"),
     ],
 )

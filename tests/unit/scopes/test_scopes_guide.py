@@ -23,7 +23,7 @@ RULES = ("Pairs", "Fleet", "Each", "Parameters that follow")
 
 
 def test_every_section_has_its_example() -> None:
-    assert set(EXAMPLES) == {*RULES, "Clients that are known beforehand", "Episodes beyond a restart"}
+    assert set(EXAMPLES) == {*RULES, "Clients that are known in advance", "Episodes beyond a restart"}
 
 
 @pytest.mark.parametrize("section", RULES)

@@ -62,10 +62,10 @@ def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("plugin", "parameters", "told"),
     [
-        ("counting", "{}", "r.yaml:9:21: spec.signals[0].plugin.parameters.stream: is missing: give it"),
+        ("counting", "{}", "r.yaml:9:21: spec.signals[0].plugin.parameters.stream: is missing: add it"),
         ("counting", "{stream: spede}", "parameters.stream: the Detector has no stream spede; did you mean speed?"),
         ("counting", "{stream: speed, limit: x}", "parameters.limit: must be a valid number"),
-        ("counting", "{stream: speed, raisAt: 3}", "parameters.raisAt: there is no such field"),
+        ("counting", "{stream: speed, raisAt: 3}", "parameters.raisAt: unknown field"),
         ("not-a-plugin", "{}", "plugin.name: plugin not-a-plugin is tests.plugins.signals:CountingParameters"),
         ("broken", "{}", "plugin.name: plugin broken cannot be loaded: ModuleNotFoundError"),
     ],

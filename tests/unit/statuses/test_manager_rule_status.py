@@ -149,7 +149,7 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
     (status,) = written
     condition = status["conditions"][0]
     assert (condition["status"], condition["reason"], condition["observedGeneration"]) == ("False", reason, 2)
-    assert "spec.odd: there is no such field" in condition["message"]
+    assert "spec.odd: unknown field" in condition["message"]
 
 
 def test_what_may_go_wrong_with_a_good_rule_is_said_and_it_stays_accepted() -> None:

@@ -140,8 +140,8 @@ def test_a_wrong_expression_in_the_values_is_found_when_the_template_is_compiled
     ("helm", "problem"),
     [
         ({"chart": "oci://registry.example/app"}, "needs an exact version"),
-        ({"chart": "app", "version": "1.0.0"}, "does not say where it is"),
-        ({"chart": "oci://r/app", "version": "1.0.0", "repository": "https://x"}, "does not say where it is"),
+        ({"chart": "app", "version": "1.0.0"}, "is unclear"),
+        ({"chart": "oci://r/app", "version": "1.0.0", "repository": "https://x"}, "is unclear"),
         ({"chart": "/charts/app", "version": "1.0.0"}, "neither version nor repository"),
         ({"chart": "app", "version": "^1", "repository": "https://x"}, "version"),
         ({"chart": "--post-renderer", "version": "1.0.0", "repository": "https://x"}, "chart"),

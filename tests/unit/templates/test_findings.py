@@ -85,8 +85,8 @@ def test_a_rule_that_is_not_there_yet_is_a_doubt_and_a_circle_a_problem() -> Non
     assert "there is no rule fast" in str(missing.doubts[0])
     assert not rule_findings(counting("many", "fast"), [detector()], (), [rule()]).all
     circle = rule_findings(counting("many", "fast"), [detector()], (), [counting("fast", "many")])
-    assert "circle" in circle.problems[0]
-    assert "circle" in rule_findings(counting("many", "many"), [detector()]).problems[0]
+    assert "cycle" in circle.problems[0]
+    assert "cycle" in rule_findings(counting("many", "many"), [detector()]).problems[0]
 
 
 def test_what_stands_in_a_detectors_field_is_no_problem_of_the_rule() -> None:

@@ -1,1 +1,1 @@
-"""What a rule does about its episodes: each kind of action, as a rule says it. They run in detector/actions."""
+"""The actions of a rule, one module per kind: their models. They run in detector/actions."""

@@ -21,25 +21,27 @@ _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
 class Action(Model):
-    """What an episode leads to."""
+    """One action of an episode."""
 
     model_config = validations(
         (f"[{', '.join(f'has(self.{kind})' for kind in _KINDS)}].filter(given, given).size() == 1", _ONE)
     )
 
-    name: ObjectName = Field(description="Unique within the rule.")
+    name: ObjectName = Field(description="The name of the action, unique within the rule.")
     deploy: Deploy | None = Field(
-        default=None, description="Emit an ApplicationTask that holds while the episode lasts."
+        default=None, description="Emits an ApplicationTask that holds while the episode lasts."
     )
-    record: Record | None = Field(default=None, description="Record its samples as rosbag2 with MCAP files.")
-    trigger: Trigger | None = Field(default=None, description="Have another system record while the episode lasts.")
+    record: Record | None = Field(
+        default=None, description="Records the samples around the episode as rosbag2 with MCAP files."
+    )
+    trigger: Trigger | None = Field(default=None, description="Makes another system record while the episode lasts.")
     database: DatabaseAction | None = Field(
-        default=None, description="Write the samples around the episode to the Detector's database (MongoDB)."
+        default=None, description="Writes the samples around the episode to the Detector's database (MongoDB)."
     )
     notify: Notify | None = Field(
-        default=None, description="Tell somebody, over HTTP, by an Alertmanager or on a Zenoh key."
+        default=None, description="Sends notifications over HTTP, to an Alertmanager or on a Zenoh key."
     )
-    plugin: ActionPlugin | None = Field(default=None, description="What an installed package does about it.")
+    plugin: ActionPlugin | None = Field(default=None, description="Runs an action of an installed package.")
 
     @model_validator(mode="after")
     def _one_kind(self) -> Action:
@@ -49,17 +51,17 @@ class Action(Model):
 
     @property
     def field(self) -> str:
-        """The name of the field that says what to do."""
+        """The name of the field that is set, such as `deploy`."""
         return next(kind for kind in _KINDS if getattr(self, kind) is not None)
 
     @property
     def kind(self) -> str:
-        """What acts: the name of a built-in action, or of a plugin."""
+        """The name of the built-in action, or of the plugin."""
         return self.field if self.plugin is None else self.plugin.name
 
     @property
     def parameters(self) -> Model | Mapping[str, Any]:
-        """What it is to do: the model of a built-in action, or what is written for a plugin."""
+        """The configuration: the model of a built-in action, or the parameters of a plugin."""
         if self.plugin is not None:
             return self.plugin.parameters
         chosen: Model = getattr(self, self.field)
@@ -75,9 +77,9 @@ class Action(Model):
 
     @property
     def templates(self) -> tuple[tuple[str, ...], Mapping[str, JsonValue]]:
-        """What is rendered for each episode, by name, with ${…}; and the field of the action that they stand in.
+        """The path of the field with the values to render for each episode, and these values by name, with ${…}.
 
-        A built-in action says by its attribute `templates` which of its fields these are, and by `templates_in` where
+        A built-in action lists these fields in its attribute `templates`, and in `templates_in` the path where
         they are not its own but those of a field.
         """
         if self.plugin is not None:

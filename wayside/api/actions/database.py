@@ -15,41 +15,41 @@ DatabaseName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Z
 
 
 class Attachments(Model):
-    """Which data is written to files beside the database."""
+    """Which data is written to files outside the database."""
 
     above: PositiveQuantity = Field(
         default=PositiveQuantity("64Ki"),
-        description="Binary fields larger than this go to files: images as PNG, point clouds as PCD, others as they "
-        "are. Smaller ones stay in the documents.",
+        description="Binary fields larger than this are written to files: images as PNG, point clouds as PCD, other "
+        "data unchanged. Smaller fields stay in the documents.",
     )
 
 
 class DatabaseAction(Window):
-    """Write the samples of the episode's window to the Detector's database, as one scenario."""
+    """Writes the samples of the episode's window to the Detector's database, as one scenario."""
 
     database: DatabaseName = Field(default="wayside", description="The name of the database on the server.")
     metadata: dict[Identifier, JsonValue] = Field(
         default_factory=dict,
         max_length=64,
-        description="Facts to keep with the scenario, such as who drove, with ${…} over the rule's variables at the "
-        "start of the episode.",
+        description="Additional fields of the scenario, such as the driver, with ${…} over the rule's variables at "
+        "the start of the episode.",
     )
     renew_after: PositiveDuration | None = Field(
         default=None,
-        description="After this time the scenario is completed, and the episode goes on in another: no sample is "
-        "missing or in both. For rules whose episodes never end. Default: one scenario for each episode.",
+        description="Complete the scenario after this time and continue the episode in a new one; no sample is "
+        "missing or in both. For rules whose episodes never end. Default: one scenario per episode.",
     )
     files: Attachments | None = Field(
         default=None,
-        description="Which data goes to files beside. Default: binary fields above 64Ki where the Detector has "
-        "database.files, else none.",
+        description="Which data is written to files. Default: binary fields above 64Ki if the Detector has "
+        "database.files, otherwise none.",
     )
     dry_run: bool = Field(
         default=False,
-        description="true: documents are made, counted and measured, but nothing is written anywhere.",
+        description="If true, documents are built, counted and measured, but not written.",
     )
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode."""
+        """The values that are rendered for each episode."""
         return {"metadata": self.metadata} if self.metadata else {}

@@ -9,20 +9,25 @@ from wayside.api.operation import MEANING, Operation
 
 
 class Deploy(Model):
-    """Demand, reconfigure or suspend an application for as long as the episode lasts."""
+    """Deploys, reconfigures or suspends an application while the episode lasts."""
 
-    template: TemplateName = Field(description="The ApplicationTemplate, in the rule's namespace.")
+    template: TemplateName = Field(description="The name of the ApplicationTemplate, in the namespace of the rule.")
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
     priority: int = Field(
-        default=0, ge=-1_000_000, le=1_000_000, description="Tasks of higher priority are looked at first."
+        default=0,
+        ge=-1_000_000,
+        le=1_000_000,
+        description="The priority of the task; the highest comes first. Ties are ordered by creation time, then by "
+        "name.",
     )
     parameters: dict[Identifier, JsonValue] = Field(
         default_factory=dict,
         max_length=64,
-        description="The template's parameters, with ${…} over the rule's variables at the start of the episode.",
+        description="The values for the template's parameters, with ${…} over the rule's variables at the start of "
+        "the episode.",
     )
     follow: bool = Field(
         default=False,
-        description="true: the parameters are evaluated again at each evaluation while the episode lasts, and the task "
-        "is patched when they change. One that is unknown or fails keeps its last value.",
+        description="If true, the parameters are computed again at each evaluation while the episode lasts, and the "
+        "task is patched when they change. A parameter that is unknown or fails keeps its last value.",
     )

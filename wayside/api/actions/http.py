@@ -1,7 +1,7 @@
-"""How actions reach HTTP endpoints: headers, TLS and credentials, none of which stand in a rule where they are secret.
+"""Access of actions to HTTP endpoints: headers, TLS and credentials. A rule never contains the secret ones.
 
-Who writes rules is not always who runs the detector: a rule names Secrets that are mounted for it, and environment
-variables that are meant for rules, and no other files or variables.
+The authors of rules need not be those who run the detector: a rule can use Secrets that are mounted for it, and
+environment variables that are meant for rules, and no other files or variables.
 """
 
 from __future__ import annotations
@@ -21,36 +21,39 @@ _VALUE_ONCE = "give exactly one of value, variable and secret"
 
 
 HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$")]
-"""Where a request goes."""
+"""The URL of a request."""
 
 
 class SecretKey(Model):
-    """One value of a Secret that is mounted for the detector."""
+    """A key of a Secret that is mounted for the detector."""
 
-    name: ObjectName = Field(description="The Secret.")
+    name: ObjectName = Field(description="The name of the Secret.")
     key: str = Field(
-        min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="The key in it."
+        min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="The key in the Secret."
     )
 
 
 class HttpHeader(Model):
-    """A header of each request, and its value or where it is."""
+    """A header of each request, with its value or the source of its value."""
 
     model_config = validations(
         ("[has(self.value), has(self.variable), has(self.secret)].filter(given, given).size() == 1", _VALUE_ONCE)
     )
 
-    name: str = Field(min_length=1, max_length=128, pattern=_TOKEN, description="E.g. Authorization.")
+    name: str = Field(
+        min_length=1, max_length=128, pattern=_TOKEN, description="The name of the header, e.g. Authorization."
+    )
     value: str | None = Field(
-        default=None, max_length=2048, pattern=r"^[^\r\n\x00]*$", description="What is no secret, as it is."
+        default=None, max_length=2048, pattern=r"^[^\r\n\x00]*$", description="The literal value. Not for secrets."
     )
     variable: str | None = Field(
         default=None,
         max_length=255,
         pattern=_VARIABLE,
-        description="The environment variable of the detector that holds it; its name begins with WAYSIDE_.",
+        description="The environment variable of the detector that contains the value. Its name must begin with "
+        "WAYSIDE_.",
     )
-    secret: SecretKey | None = Field(default=None, description="The Secret that holds it.")
+    secret: SecretKey | None = Field(default=None, description="The Secret key that contains the value.")
 
     @model_validator(mode="after")
     def _coherent(self) -> HttpHeader:
@@ -62,27 +65,28 @@ class HttpHeader(Model):
 
 
 class HttpAccess(Model):
-    """How an endpoint is entered. Its certificate is always checked; redirects are never followed."""
+    """Access to an HTTP endpoint. Its certificate is always verified; redirects are never followed."""
 
     model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE))
 
     headers: list[HttpHeader] = Field(
         default_factory=list,
         max_length=32,
-        description="Further headers.",
+        description="Additional headers of each request.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     timeout: PositiveDuration = Field(
         default=PositiveDuration("10s"),
-        description="How long one attempt may take in all, from looking up the name to the end of the answer.",
+        description="The total timeout of one attempt, from name resolution to the end of the response.",
     )
-    tls: Tls | None = Field(default=None, description="Certificates in files.")
+    tls: Tls | None = Field(default=None, description="TLS certificates from files.")
     tls_secret: ObjectName | None = Field(
         default=None,
-        description="A Secret with ca.crt and, where the detector proves who it is, tls.crt and tls.key.",
+        description="A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and "
+        "tls.key.",
     )
     credentials_secret: ObjectName | None = Field(
-        default=None, description="A Secret with username and password, for HTTP's Basic authentication."
+        default=None, description="A Secret with the keys username and password, for HTTP Basic authentication."
     )
 
     @model_validator(mode="after")
@@ -91,10 +95,10 @@ class HttpAccess(Model):
             raise ValueError(TLS_ONCE)
         names = [header.name.lower() for header in self.headers]
         if len(set(names)) < len(names):
-            raise ValueError("headers: each name only once; upper and lower case are the same")
+            raise ValueError("headers: give each name only once (names are case-insensitive)")
         return self
 
     @property
     def access(self) -> Access:
-        """The same, as everything else that enters networks has it."""
+        """The same as an `Access`, as used for all networks."""
         return Access(tls=self.tls, tls_secret=self.tls_secret, credentials_secret=self.credentials_secret)

@@ -1,4 +1,4 @@
-"""The notify action: somebody is told of a rule's episodes, over HTTP, by an Alertmanager or on a Zenoh key."""
+"""The notify action: notifications of a rule's episodes over HTTP, to an Alertmanager or on a Zenoh key."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _TLS_ONCE = "give tls or tlsSecret, not both"
 _URL_ONCE = "give exactly one of url and urlSecret"
 _TARGETS = ("http", "alertmanager", "zenoh")
 _ONE_TARGET = "give exactly one of http, alertmanager and zenoh"
-_ALERTS = "an Alertmanager groups by itself and is told of starts and ends: leave out grouping and events"
-_NO_LABEL = "grouping.by names a label that labels does not have"
+_ALERTS = "an Alertmanager groups alerts itself and receives all starts and ends: remove grouping and events"
+_NO_LABEL = "grouping.by refers to a label that labels does not contain: add it to labels, or remove it"
 
 Template = Annotated[str, Field(min_length=1, max_length=4096)]
 """Text with ${…} over the rule's variables at the start of the episode."""
 
 
 class Moment(StrEnum):
-    """Of which events somebody is told."""
+    """The events that cause a notification."""
 
     STARTED = "Started"
     ENDED = "Ended"
@@ -37,19 +37,20 @@ class ContentMode(StrEnum):
 
 
 class NotifyHttp(HttpAccess):
-    """An endpoint that takes CloudEvents by POST."""
+    """An endpoint that receives CloudEvents by POST."""
 
     model_config = validations(
         ("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE), ("has(self.url) != has(self.urlSecret)", _URL_ONCE)
     )
 
-    url: HttpUrl | None = Field(default=None, description="The endpoint, e.g. https://events.example/city.")
+    url: HttpUrl | None = Field(default=None, description="The URL of the endpoint, e.g. https://events.example/city.")
     url_secret: SecretKey | None = Field(
-        default=None, description="The Secret that holds the URL, where knowing it is all that one needs."
+        default=None, description="The Secret key that contains the URL, if the URL itself grants access."
     )
     mode: ContentMode = Field(
         default=ContentMode.STRUCTURED,
-        description="Structured: the whole event is the body. Binary: its data is the body, the rest are headers.",
+        description="Structured: the body is the whole event. Binary: the body is the data of the event; the "
+        "attributes are headers.",
     )
 
     @model_validator(mode="after")
@@ -60,15 +61,15 @@ class NotifyHttp(HttpAccess):
 
 
 class NotifyAlertmanager(HttpAccess):
-    """An Alertmanager, or what takes alerts as it does (API v2)."""
+    """An Alertmanager, or a server with the same API (v2)."""
 
     url: HttpUrl = Field(
-        description="Where it is, e.g. http://alertmanager:9093; /api/v2/alerts is added.",
+        description="The base URL, e.g. http://alertmanager:9093. The path /api/v2/alerts is appended.",
     )
     repeat: PositiveDuration = Field(
         default=PositiveDuration("1m"),
-        description="An alert is sent again so often while its episode lasts. Without word for four times as long, the "
-        "Alertmanager takes it to be over.",
+        description="The interval at which an alert is sent again while its episode lasts. The alert resolves after "
+        "four intervals without an update.",
     )
 
 
@@ -79,71 +80,84 @@ class NotifyZenoh(Model):
         min_length=1,
         max_length=255,
         pattern=r"^[^/*$#?]+(/[^/*$#?]+)*$",
-        description="Where the event is published, beside its own key, e.g. city/alerts.",
+        description="The key on which the event is published, in addition to its own key, e.g. city/alerts.",
     )
 
 
 class Grouping(Model):
-    """Many events, one message."""
+    """Groups several events into one message."""
 
     wait: PositiveDuration = Field(
         default=PositiveDuration("10s"),
-        description="A message is sent so long after the first event that belongs in it.",
+        description="How long to collect events after the first one of a group, before the message is sent.",
     )
     by: list[Identifier] = Field(
         default_factory=list,
         max_length=8,
-        description="Names of labels: events with the same values share messages. Default: all events of the rule do.",
+        description="The names of labels. Events with the same values of these labels share a message. Default: all "
+        "events of the rule share messages.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
-    maximum: int = Field(default=20, ge=1, le=1000, description="So many events are given in full; all are counted.")
+    maximum: int = Field(
+        default=20,
+        ge=1,
+        le=1000,
+        description="The maximum number of events that a message contains in full. All events are counted.",
+    )
 
 
 class Rate(Model):
-    """How often somebody is told at most. What comes beyond waits."""
+    """The maximum rate of messages. Further messages wait."""
 
-    messages: int = Field(ge=1, le=100_000, description="So many messages, retries included.")
-    per: PositiveDuration = Field(default=PositiveDuration("1m"), description="Within this time.")
+    messages: int = Field(ge=1, le=100_000, description="The maximum number of messages per period, retries included.")
+    per: PositiveDuration = Field(default=PositiveDuration("1m"), description="The period.")
 
 
 class Notify(Model):
-    """Tell somebody of the rule's episodes."""
+    """Sends notifications of the rule's episodes."""
 
     model_config = validations(
         (f"[{', '.join(f'has(self.{kind})' for kind in _TARGETS)}].filter(given, given).size() == 1", _ONE_TARGET),
         ("!has(self.alertmanager) || !(has(self.grouping) || has(self.events))", _ALERTS),
     )
 
-    http: NotifyHttp | None = Field(default=None, description="An endpoint that takes CloudEvents.")
+    http: NotifyHttp | None = Field(default=None, description="An HTTP endpoint that receives CloudEvents.")
     alertmanager: NotifyAlertmanager | None = Field(
-        default=None, description="An Alertmanager: an alert fires while the episode lasts."
+        default=None, description="An Alertmanager. An alert fires while the episode lasts."
     )
-    zenoh: NotifyZenoh | None = Field(default=None, description="A Zenoh key.")
+    zenoh: NotifyZenoh | None = Field(default=None, description="A Zenoh key on which the event is published.")
     events: list[Moment] | None = Field(
         default=None,
         min_length=1,
         max_length=2,
-        description="Of which events. Default: Started and Ended.",
+        description="The events that cause a notification. Default: Started and Ended.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
-    title: Template | None = Field(default=None, description="A headline, with ${…}; the summary of an alert.")
-    text: Template | None = Field(default=None, description="What to tell, with ${…}; the description of an alert.")
+    title: Template | None = Field(
+        default=None, description="The title of the message, with ${…}; the summary of an alert."
+    )
+    text: Template | None = Field(
+        default=None, description="The text of the message, with ${…}; the description of an alert."
+    )
     labels: dict[Identifier, Annotated[str, Field(max_length=1024)]] = Field(
         default_factory=dict,
         max_length=32,
-        description="Facts for whoever sorts what comes in, such as severity, with ${…}; the labels of an alert.",
+        description="Labels for the receiver to filter or route by, such as severity, with ${…}; the labels of an "
+        "alert.",
     )
-    grouping: Grouping | None = Field(default=None, description="Many events, one message. Default: one message each.")
-    rate: Rate | None = Field(default=None, description="How often at most. Default: as it comes.")
+    grouping: Grouping | None = Field(
+        default=None, description="Groups several events into one message. Default: one message per event."
+    )
+    rate: Rate | None = Field(default=None, description="The maximum rate of messages. Default: no limit.")
     waiting: int = Field(
         default=1000,
         ge=1,
         le=100_000,
-        description="So many messages wait at most; what finds no place is a dead letter.",
+        description="The maximum number of waiting messages. Further messages become dead letters.",
     )
     give_up_after: Duration = Field(
         default=Duration("1h"),
-        description="What could not be delivered for so long, in several attempts, is a dead letter.",
+        description="A message becomes a dead letter after delivery has failed for this time, over several attempts.",
     )
 
     @model_validator(mode="after")
@@ -158,11 +172,11 @@ class Notify(Model):
 
     @property
     def moments(self) -> frozenset[Moment]:
-        """The events of which somebody is told."""
+        """The events that cause a notification."""
         return frozenset(Moment if self.events is None else self.events)
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode, by field."""
+        """The values that are rendered for each episode, by field."""
         given = {"title": self.title, "text": self.text, "labels": self.labels or None}
         return {name: value for name, value in given.items() if value is not None}

@@ -10,17 +10,20 @@ from wayside.api.source import PluginName
 
 
 class ActionPlugin(Model):
-    """An action of an installed package, and how it is to act."""
+    """An action of an installed package, and its parameters."""
 
-    name: PluginName = Field(description="What acts: what an installed package offers as wayside.actions.")
+    name: PluginName = Field(
+        description="The plugin: the name of a wayside.actions entry point of an installed package."
+    )
     parameters: dict[str, JsonValue] = Field(
         default_factory=dict,
-        description="What the plugin asks for; see its documentation.",
+        description="The parameters of the plugin; see its documentation.",
         json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
     )
     values: dict[Identifier, JsonValue] = Field(
         default_factory=dict,
         max_length=64,
-        description="What it is told of each episode, with ${…} over the rule's variables at the start.",
+        description="Values that the plugin receives for each episode, with ${…} over the rule's variables at the "
+        "start of the episode.",
     )
-    window: Window | None = Field(default=None, description="The samples that it gets. Default: none.")
+    window: Window | None = Field(default=None, description="The samples that the plugin receives. Default: none.")

@@ -21,34 +21,35 @@ class Compression(StrEnum):
 
 
 class Split(Model):
-    """When a recording goes on in another file; each file can be read on its own."""
+    """When a recording continues in a new file. Each file is readable on its own."""
 
-    bytes: PositiveQuantity | None = Field(default=None, description="A file has at most about this size.")
-    duration: PositiveDuration | None = Field(default=None, description="A file spans at most this time.")
+    bytes: PositiveQuantity | None = Field(default=None, description="The approximate maximum size of a file.")
+    duration: PositiveDuration | None = Field(default=None, description="The maximum time span of a file.")
 
 
 class Record(Window):
-    """Record the window as rosbag2 with MCAP files, in the Detector's `recordings` folder."""
+    """Records the window as rosbag2 with MCAP files, in the Detector's `recordings` folder."""
 
     templates_in: ClassVar[tuple[str, ...]] = ("metadata",)
 
     compression: Compression = Field(
-        default=Compression.NONE, description="None, Lz4 (fast), or Zstd (smaller). Readers need not be told."
+        default=Compression.NONE,
+        description="The compression of chunks: None, Lz4 (fast) or Zstd (smaller). Readers detect it.",
     )
-    split: Split = Field(default=Split(), description="When to go on in another file. Default: never.")
+    split: Split = Field(default=Split(), description="When to continue in a new file. Default: never.")
     renew_after: PositiveDuration | None = Field(
         default=None,
-        description="After this time the recording is completed, and the episode goes on in another: no sample is "
-        "missing or in both. For rules whose episodes never end. Default: one recording for each episode.",
+        description="Complete the recording after this time and continue the episode in a new one; no sample is "
+        "missing or in both. For rules whose episodes never end. Default: one recording per episode.",
     )
     metadata: dict[Annotated[str, Field(min_length=1, max_length=63)], JsonValue] = Field(
         default_factory=dict,
         max_length=64,
-        description="What else the recording shall say of itself, with ${…} over the rule's variables at the start of "
-        "the episode.",
+        description="Additional metadata of the recording, with ${…} over the rule's variables at the start of the "
+        "episode.",
     )
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode."""
+        """The values that are rendered for each episode."""
         return self.metadata

@@ -30,9 +30,9 @@ ServiceName = Annotated[
 ServiceType = Annotated[
     str, Field(min_length=1, max_length=255, pattern=r"^[A-Za-z][A-Za-z0-9_]*/srv/[A-Za-z][A-Za-z0-9_]*$")
 ]
-"""What a ROS 2 service is of, e.g. rosbag2_interfaces/srv/Snapshot."""
+"""The type of a ROS 2 service, e.g. rosbag2_interfaces/srv/Snapshot."""
 
-_CALL = "give start, stop or both: else nothing is called"
+_CALL = "give start, stop or both: otherwise nothing is called"
 _DOMAIN = "domain is for services with layout RmwZenoh: remove it"
 
 
@@ -43,54 +43,56 @@ class TriggerDetector(Model):
         min_length=1,
         max_length=512,
         pattern=r"^([A-Za-z0-9_.-]{1,253}|.*[$][{].*)$",
-        description="Which detector: its holder, that is the Detector's name or, of a Sidecar, <detector>.<pod>. "
-        "With ${…} over the rule's variables, e.g. recorder.${client}.",
+        description="The holder name of the other detector: the name of the Detector, or <detector>.<pod> for a "
+        "Sidecar. With ${…} over the rule's variables, e.g. recorder.${client}.",
     )
     streams: list[ObjectName] | None = Field(
         default=None,
         min_length=1,
         max_length=128,
-        description="Its streams. Default: all that it records on request.",
+        description="The streams of the other detector. Default: all that it records on request.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
     clients: WindowClients = Field(
         default=WindowClients.ALL,
-        description="All: every client that it knows. Subjects: those that the episode is about.",
+        description="All: every client that the other detector knows. Subjects: the clients of the episode.",
     )
     with_clients: list[ClientName] = Field(
         default_factory=list,
         max_length=64,
-        description="With clients: Subjects, further ones.",
+        description="With `clients: Subjects`: additional clients.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
     before: Duration = Field(
         default=Duration("0s"),
-        description="From so long before the onset, as far as it still has it in its buffer.",
+        description="How long before the onset the recording begins, as far as the other detector's buffer reaches.",
     )
-    after: Duration = Field(default=Duration("0s"), description="Until so long after the episode's end.")
+    after: Duration = Field(
+        default=Duration("0s"), description="How long after the end of the episode the recording ends."
+    )
 
 
 class ServiceCall(Model):
     """A call of a ROS 2 service."""
 
-    service: ServiceName = Field(description="The service, e.g. /rosbag2_recorder/resume.")
-    type: ServiceType = Field(description="Its type, e.g. rosbag2_interfaces/srv/Resume.")
+    service: ServiceName = Field(description="The name of the service, e.g. /rosbag2_recorder/resume.")
+    type: ServiceType = Field(description="The type of the service, e.g. rosbag2_interfaces/srv/Resume.")
     definition: str | None = Field(
         default=None,
         max_length=16_384,
-        description="What the type is made of, as its .srv file holds it. Known are the services of rosbag2's recorder "
-        "and of std_srvs, as of ROS 2 Jazzy.",
+        description="The definition of the type, in the format of .srv files. Not needed for the services of "
+        "rosbag2's recorder and of std_srvs (ROS 2 Jazzy).",
     )
     request: dict[Identifier, JsonValue] = Field(
         default_factory=dict,
         max_length=64,
-        description="The request's fields, with ${…} over the rule's variables at the start of the episode; those that "
-        "are not given are zero or empty.",
+        description="The fields of the request, with ${…} over the rule's variables at the start of the episode. "
+        "Omitted fields are zero or empty.",
     )
 
 
 class TriggerRos2(Model):
-    """Services of ROS 2, called over Zenoh when the episode starts and ends."""
+    """Calls of ROS 2 services over Zenoh, at the start and the end of the episode."""
 
     model_config = validations(
         ("has(self.start) || has(self.stop)", _CALL),
@@ -102,14 +104,14 @@ class TriggerRos2(Model):
         description="RmwZenoh: nodes that use rmw_zenoh. Plain: nodes behind zenoh-bridge-ros2dds.",
     )
     domain: int | None = Field(
-        default=None, ge=0, le=232, description="With layout RmwZenoh: the nodes' ROS domain. Default: 0."
+        default=None, ge=0, le=232, description="With layout RmwZenoh: the ROS domain ID of the nodes. Default: 0."
     )
     start: ServiceCall | None = Field(
         default=None,
-        description="Called at the start. With both, episodes that overlap are one recording: it is started with the "
-        "first and stopped with the last.",
+        description="The call at the start of the episode. With both start and stop, overlapping episodes share one "
+        "recording: it starts with the first and stops with the last.",
     )
-    stop: ServiceCall | None = Field(default=None, description="Called at the end.")
+    stop: ServiceCall | None = Field(default=None, description="The call at the end of the episode.")
 
     @model_validator(mode="after")
     def _coherent(self) -> TriggerRos2:
@@ -121,12 +123,12 @@ class TriggerRos2(Model):
 
     @property
     def calls(self) -> Mapping[str, ServiceCall]:
-        """The calls by the field that says them."""
+        """The calls by field name, start and stop."""
         return {name: call for name, call in (("start", self.start), ("stop", self.stop)) if call is not None}
 
 
 class HttpMethod(StrEnum):
-    """What a request does."""
+    """The method of an HTTP request."""
 
     POST = "POST"
     PUT = "PUT"
@@ -135,16 +137,16 @@ class HttpMethod(StrEnum):
 
 
 class HttpCall(Model):
-    """One HTTP request. Its header Idempotency-Key is the recording's id and .start or .stop."""
+    """One HTTP request. Its header Idempotency-Key consists of the recording's ID and .start or .stop."""
 
-    method: HttpMethod = Field(default=HttpMethod.POST, description="POST, PUT, PATCH or DELETE.")
+    method: HttpMethod = Field(default=HttpMethod.POST, description="The method: POST, PUT, PATCH or DELETE.")
     url: HttpUrl = Field(
-        description="Where to; {id} in it becomes the recording's id, e.g. https://recorder/recordings/{id}."
+        description="The URL, e.g. https://recorder/recordings/{id}. {id} is replaced with the ID of the recording."
     )
     body: dict[str, JsonValue] | None = Field(
         default=None,
-        description="What is sent as JSON, with ${…} over the rule's variables at the start of the episode. Default: "
-        "id, do (start or stop), maximumDuration and the CloudEvent of the start as event.",
+        description="The JSON body, with ${…} over the rule's variables at the start of the episode. Default: id, do "
+        "(start or stop), maximumDuration, and event: the CloudEvent of the start.",
         json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
     )
 
@@ -152,19 +154,19 @@ class HttpCall(Model):
     @classmethod
     def _fixed(cls, url: str) -> str:
         if "${" in url:
-            raise ValueError("takes no ${…}, since values could lead elsewhere: write {id}, and put values into body")
+            raise ValueError("must not contain ${…}, which could change the target: use {id}, and put values into body")
         return url
 
 
 class TriggerHttp(HttpAccess):
-    """Requests to an HTTP endpoint when the episode starts and ends."""
+    """Requests to an HTTP endpoint, at the start and the end of the episode."""
 
     model_config = validations(
         ("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE), ("has(self.start) || has(self.stop)", _CALL)
     )
 
-    start: HttpCall | None = Field(default=None, description="Sent at the start.")
-    stop: HttpCall | None = Field(default=None, description="Sent at the end.")
+    start: HttpCall | None = Field(default=None, description="The request at the start of the episode.")
+    stop: HttpCall | None = Field(default=None, description="The request at the end of the episode.")
 
     @model_validator(mode="after")
     def _any_call(self) -> TriggerHttp:
@@ -174,7 +176,7 @@ class TriggerHttp(HttpAccess):
 
     @property
     def calls(self) -> Mapping[str, HttpCall]:
-        """The calls by the field that says them."""
+        """The calls by field name, start and stop."""
         return {name: call for name, call in (("start", self.start), ("stop", self.stop)) if call is not None}
 
 
@@ -183,26 +185,27 @@ _ONE = f"give exactly one of {', '.join(_SYSTEMS[:-1])} and {_SYSTEMS[-1]}"
 
 
 class Trigger(Model):
-    """Another system records, from the start of the episode to its end."""
+    """Makes another system record, from the start of the episode to its end."""
 
     model_config = validations(
         (f"[{', '.join(f'has(self.{each})' for each in _SYSTEMS)}].filter(given, given).size() == 1", _ONE)
     )
 
-    detector: TriggerDetector | None = Field(default=None, description="Another detector records.")
-    ros2: TriggerRos2 | None = Field(default=None, description="Services of ROS 2 are called, e.g. of rosbag2.")
-    http: TriggerHttp | None = Field(default=None, description="An HTTP endpoint is told.")
+    detector: TriggerDetector | None = Field(default=None, description="A recording by another detector.")
+    ros2: TriggerRos2 | None = Field(default=None, description="Calls of ROS 2 services, e.g. of rosbag2.")
+    http: TriggerHttp | None = Field(default=None, description="Requests to an HTTP endpoint.")
     maximum_duration: PositiveDuration = Field(
         default=PositiveDuration("10m"),
-        description="The recording ends after so long even where nobody stops it. Another detector sees to that "
-        "itself; ROS 2 services and HTTP endpoints are then told by this one, if it still runs.",
+        description="The maximum duration of the recording; it ends after this time even without a stop. Another "
+        "detector enforces the limit itself. For ROS 2 services and HTTP endpoints, this detector sends the stop, if "
+        "it still runs.",
     )
     give_up_after: PositiveDuration = Field(
         default=PositiveDuration("5m"),
-        description="A start or stop that is not confirmed is sent again, for so long.",
+        description="How long a start or stop that is not confirmed is retried.",
     )
     timeout: PositiveDuration = Field(
-        default=PositiveDuration("3s"), description="How long one answer may take over Zenoh."
+        default=PositiveDuration("3s"), description="The timeout of one reply over Zenoh."
     )
 
     @model_validator(mode="after")
@@ -213,7 +216,7 @@ class Trigger(Model):
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
-        """What is rendered for each episode."""
+        """The values that are rendered for each episode."""
         if self.detector is not None:
             return {"detector": {"name": self.detector.name}}
         if self.ros2 is not None:

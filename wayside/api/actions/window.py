@@ -1,4 +1,4 @@
-"""Which samples an action gets of an episode: streams, clients, and how long before and after it."""
+"""The samples of an episode that an action receives: streams, clients, and the time before and after."""
 
 from __future__ import annotations
 
@@ -10,35 +10,37 @@ from wayside.api.base import ClientName, Duration, Model, ObjectName
 
 
 class WindowClients(StrEnum):
-    """Whose samples an action gets."""
+    """The clients whose samples an action receives."""
 
     SUBJECTS = "Subjects"
     ALL = "All"
 
 
 class Window(Model):
-    """Samples around an episode. Those of latched streams, such as /tf_static, always come with them."""
+    """Samples around an episode. Samples of latched streams, such as /tf_static, are always included."""
 
     streams: list[ObjectName] | None = Field(
         default=None,
         min_length=1,
         max_length=128,
-        description="The streams. Default: all of the Detector. Latched ones always come with them.",
+        description="The streams. Latched streams are always included. Default: all streams of the Detector.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
     clients: WindowClients = Field(
         default=WindowClients.SUBJECTS,
-        description="Subjects: the clients that the episode is about; of a fleet rule, all. All: every client.",
+        description="Subjects: the clients of the episode (in a fleet scope: all clients). All: every client.",
     )
     with_clients: list[ClientName] = Field(
         default_factory=list,
         max_length=64,
-        description="Further clients, such as the roadside unit that looks on.",
+        description="Additional clients, such as a roadside unit that observes the scene.",
         json_schema_extra={"x-kubernetes-list-type": "set"},
     )
     before: Duration = Field(
         default=Duration("0s"),
-        description="From so long before the onset, when the condition began to hold. Together with the rule's `for` "
-        "it must not exceed what is kept of the streams.",
+        description="How long before the onset the window begins. The sum of this and the rule's `for` must not "
+        "exceed the buffer duration of the streams.",
     )
-    after: Duration = Field(default=Duration("0s"), description="Until so long after the episode's end.")
+    after: Duration = Field(
+        default=Duration("0s"), description="How long after the end of the episode the window ends."
+    )

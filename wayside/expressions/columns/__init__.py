@@ -5,9 +5,9 @@
     program = Program(graph, [graph.truth(node)], texts)
     results = program.run(values, tags)         # a row for each of program.leaves
 
-`values` says what a column is, `nodes` what a graph consists of, `lowering` turns syntax into nodes, `program` puts
+`values` defines columns, `nodes` the elements of a graph, `lowering` turns syntax into nodes, `program` puts
 them into steps, and `operations` runs a step. Where a row holds what columns cannot decide, such as two texts that are
-ordered, `Results.foreign` says so, and the caller evaluates the expression itself there.
+ordered, `Results.foreign` marks the row, and the caller evaluates the expression itself there.
 """
 
 from wayside.expressions.columns.graph import Graph

@@ -18,7 +18,7 @@ from wayside.expressions.syntax import Call, Collection, Constant, Loop, Name, N
 
 
 class How(enum.Enum):
-    """What a fold makes of the truths of its rows."""
+    """The result of a fold over the truths of its rows."""
 
     ANY = enum.auto()
     ALL = enum.auto()

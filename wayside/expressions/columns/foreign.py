@@ -1,4 +1,4 @@
-"""Finds the rows that columns cannot decide as CEL does, so that the caller asks CEL there."""
+"""Finds the rows that columns cannot decide as CEL does, so that the caller evaluates them with CEL."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Foreign:
                 self._of_texts[rows[0], rows[1]] = number
 
     def find(self, frame: Frame) -> Found:
-        """What all watches find in one run."""
+        """The rows that all watches find in one run."""
         return dict(self._find(frame))
 
     def _find(self, frame: Frame) -> Iterator[tuple[int, Bools]]:

@@ -39,7 +39,7 @@ class Operand:
 
     source: Source
     rows: Rows
-    """Where in that array; of constants, where in `values`."""
+    """The index in that array; for constants, the index in `values`."""
     partial: bool
     """Whether some may be unknown even where every leaf is a number."""
     values: Doubles
@@ -57,7 +57,7 @@ class Sizes:
     mixed: int
 
     def bytes(self, n: int) -> int:
-        """What a frame takes for n points."""
+        """The size of a frame for n points."""
         return n * (9 * self.numbers + 2 * self.truths + 9 * self.mixed)
 
 
@@ -68,7 +68,7 @@ class Memory:
         self._spare: list[Bytes] = []
 
     def frame(self, sizes: Sizes, values: Doubles, tags: Bytes | None) -> Frame:
-        """A frame in memory that nobody else uses; any thread may ask."""
+        """A frame in memory that no other run uses. Thread-safe."""
         needed = sizes.bytes(values.shape[1])
         try:
             block = self._spare.pop()  # nobody else gets it before it is in use
@@ -89,7 +89,7 @@ _SMALL: Final = 1 << 20
 
 
 class Frame:
-    """The arrays of one run. `tagged` says whether any leaf holds anything but numbers; if not, much is left out."""
+    """The arrays of one run. `tagged` is whether any leaf holds other values than numbers; else steps are skipped."""
 
     def __init__(self, sizes: Sizes, values: Doubles, tags: Bytes | None, block: Bytes) -> None:
         n = values.shape[1]
@@ -132,7 +132,7 @@ class Frame:
         return self.mixed[rows], self.mixed_tags[rows] == NUMBER
 
     def truth(self, operand: Operand) -> tuple[Bools, Bools]:
-        """Where the operand is true, and where it is false."""
+        """The rows in which the operand is true, and those in which it is false."""
         rows = operand.rows
         match operand.source:
             case Source.TRUTHS:

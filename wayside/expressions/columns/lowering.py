@@ -197,13 +197,13 @@ class _Lowering:
         return found[0]
 
     def _choose(self, condition: Node, a: Node, b: Node) -> int:
-        asked, first, second = self._truth(condition), self._lower(a), self._lower(b)
+        test, first, second = self._truth(condition), self._lower(a), self._lower(b)
         kinds = {self._holds(first), self._holds(second)}
         holds = kinds.pop() if kinds in ({Holds.NUMBERS}, {Holds.TRUTHS}) else Holds.ANY
-        return self._graph.node(Op.CHOOSE, holds, (asked, first, second))
+        return self._graph.node(Op.CHOOSE, holds, (test, first, second))
 
     def _check_not_null(self, node: Node) -> None:
-        """Refuses an item of a list: null is a value there, which a column cannot tell from absent."""
+        """Refuses an item of a list: null is a value there, which a column cannot distinguish from absent."""
         match node:
             case Call("_?_:_", None, (_, a, b)):
                 self._check_not_null(a)

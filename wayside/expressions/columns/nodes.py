@@ -11,17 +11,17 @@ from wayside.expressions.columns.values import Tag
 
 
 class Holds(enum.Enum):
-    """What a node yields, as far as that is known before any row is."""
+    """The type of a node's result, as far as it is known without rows."""
 
     NUMBERS = enum.auto()
     TRUTHS = enum.auto()
     TEXTS = enum.auto()
     ANY = enum.auto()
-    """Each row says it by its tag."""
+    """The tag of each row decides."""
 
 
 class Op(enum.Enum):
-    """What a node does with its operands."""
+    """The operation of a node."""
 
     LEAF = enum.auto()
     CONSTANT = enum.auto()
@@ -48,12 +48,12 @@ class Op(enum.Enum):
     TRUTH = enum.auto()
     TEXT = enum.auto()
     NEVER = enum.auto()
-    """Unknown in every row: a truth asked of what cannot be one."""
+    """Unknown in every row: a truth of a value that cannot be one."""
 
 
 COMMUTATIVE = frozenset({Op.ADD, Op.MULTIPLY, Op.EQUAL, Op.AND, Op.OR})
 GIVEN = frozenset({Op.LEAF, Op.CONSTANT, Op.EXPECT})
-"""What needs no calculation."""
+"""Operations that need no calculation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ class Nodes:
         self._numbers = {key: number for key, number in self._numbers.items() if number < count}
 
     def watches(self, node: int) -> tuple[Watch, ...]:
-        """Where this node alone takes a row that the columns cannot decide."""
+        """The rows that the columns cannot decide because of this node alone."""
         here = self.nodes[node]
         if here.op is Op.EXPECT and isinstance(here.detail, Tag):
             return (Watch(Concern.UNEXPECTED, here.operands, here.detail),)

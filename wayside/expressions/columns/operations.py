@@ -137,7 +137,7 @@ def _equal(frame: Frame, step: Step) -> None:
 
 
 def _comparable(tags: Bytes) -> Bools:
-    """Where there is a number, a boolean or a text."""
+    """The rows with a number, a boolean or a string."""
     found: Bools = tags - ONE < THREE  # 0 − 1 is 255
     return found
 

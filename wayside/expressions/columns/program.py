@@ -70,7 +70,7 @@ class Program:
         found = self._rows.get(key)
         if found is None:
             if len({self._places[root][0] for root in key}) != 1:
-                raise ValueError("the roots hold different things: ask for each by itself")
+                raise ValueError("the roots have different types: evaluate each separately")
             if len(self._rows) >= _CACHE_SIZE:
                 self._rows.clear()
             found = self._rows[key] = self._operand(key)
@@ -81,7 +81,7 @@ class Program:
         return np.array([[self._partial[root]] for root in roots])
 
     def _is_partial(self, node: Node) -> bool:
-        """Whether the node may be unknown, or hold no number where one is asked, although all leaves are numbers."""
+        """Whether the node may be unknown, or not a number where one is required, although all leaves are numbers."""
         if node.op in UNKNOWN_OF_NUMBERS:
             return True
         operands = [self._nodes[each].holds for each in node.operands]
@@ -123,7 +123,7 @@ class Program:
         return steps, Sizes(counts[Source.NUMBERS], counts[Source.TRUTHS], counts[Source.MIXED])
 
     def _shape(self, node: Node) -> tuple[object, ...]:
-        """What the operands of nodes in one step have in common."""
+        """The common properties of the operands of the nodes in one step."""
         operands = [self._nodes[each] for each in node.operands]
         return tuple(
             (
@@ -186,7 +186,7 @@ def _rows(rows: Sequence[int]) -> Rows:
 
 
 class Results:
-    """What the roots yield for the n rows of a run."""
+    """The results of the roots for the n rows of a run."""
 
     __slots__ = ("_foreign", "_found", "_frame", "_program")
 

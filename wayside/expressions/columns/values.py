@@ -1,4 +1,4 @@
-"""What the rows of a column hold: a double for each row, and a tag that says what the double stands for."""
+"""The contents of a column: a double for each row, and a tag for the meaning of the double."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Objects = NDArray[np.object_]
 
 
 class Tag(IntEnum):
-    """What a row holds."""
+    """The type of the value in a row."""
 
     ABSENT = 0
     """Nothing: not there, null, NaN or unknown."""
@@ -160,7 +160,7 @@ def _entry(value: object, texts: Texts) -> tuple[Tag, float]:
 def _rare_entry(value: object, texts: Texts) -> tuple[Tag, float]:
     if isinstance(value, np.generic):  # before the plain types: numpy's double is one of them
         return _entry(value.item(), texts)
-    if isinstance(value, str):  # an enum's member, say
+    if isinstance(value, str):  # such as a member of an enum
         return _entry(str.__str__(value), texts)
     if isinstance(value, int):
         return _entry(int(value), texts)
@@ -183,6 +183,6 @@ def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
             return texts.text(int(double))
         case Tag.OTHER:
             if column.others is None:
-                raise ValueError(f"row {row} holds a value that this column does not have: ask CEL for it")
+                raise ValueError(f"row {row} holds a value that this column cannot represent: evaluate it with CEL")
             return cast("Value", column.others[row])
     return UNKNOWN

@@ -1,4 +1,4 @@
-"""What `matches` takes is of bounded length: a longer text has no answer, and is not searched."""
+"""Limits the input of `matches`: for a longer string the result is unknown, without a search."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wayside.expressions.regex import BOUNDED, LONGEST_INPUT
 _OTHERS: Final = (
     cel.Type.DOUBLE, cel.Type.BOOL, cel.Type.INT, cel.Type.UINT, cel.Type.BYTES, cel.Type.TIMESTAMP, cel.Type.DURATION,
 )  # fmt: skip
-"""What `matches` does not take: it reports that itself."""
+"""An input that `matches` itself refuses with an error."""
 
 
 def _bounded(arguments: Arguments) -> object:

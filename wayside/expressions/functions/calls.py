@@ -39,7 +39,7 @@ class _Method(ctypes.Structure):
 
 
 class _Noted(threading.local):
-    """What the evaluations on this thread called with, and got, since `settle`."""
+    """The arguments and results of the calls on this thread since `settle`."""
 
     def __init__(self) -> None:
         self.arguments: list[Arguments] = []
@@ -56,7 +56,7 @@ _noted = _Noted()
 
 
 def called_by_cel(function: Callable[[Arguments], object]) -> Callable[..., object]:
-    """What CEL can call with arguments, for a function that takes them as one tuple."""
+    """A wrapper that CEL can call with arguments, for a function that takes them as one tuple."""
 
     def call(arguments: Arguments) -> object:
         _noted.arguments.append(arguments)

@@ -38,7 +38,7 @@ def _places(items: object, what: str, path: str) -> list[Place]:
 
 
 def _has_neighbour(here: Place, by_x: list[Place], xs: list[float], within: float) -> bool:
-    # A little wider than asked: the distance decides, rounded as it is.
+    # Slightly wider than `within`: the rounded distance decides.
     reach = within * (1 + 1e-9)
     first, last = bisect_left(xs, here[0] - reach), bisect_right(xs, here[0] + reach)
     return any(math.dist(here, there) <= within for there in by_x[first:last])
@@ -48,7 +48,7 @@ FUNCTIONS = (
     function(
         "unmatched",
         Yields.LIST,
-        "the indices of the items that have none of the others within so many metres",
+        "the indices of the items that have none of the others within that many metres",
         (unmatched, "items:list others:list within"),
         (unmatched, "items:list others:list within path:text"),
     ),

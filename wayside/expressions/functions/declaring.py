@@ -1,4 +1,4 @@
-"""How a function is declared: its parameters by name, so that errors can say what it takes.
+"""The declaration of a function: its parameters by name, so that errors can name them.
 
 CEL finds the implementation by the types that arrive. A parameter for a list, a map or bytes therefore has two: the
 thing itself, where the expression writes it (`[[0, 0], [4, 0]]`), and its handle, where it comes from a value.
@@ -20,7 +20,7 @@ from wayside.expressions.handles import value_of
 
 
 class Takes(enum.Enum):
-    """What a parameter takes, as a user would say it."""
+    """The type of a parameter, as errors name it."""
 
     NUMBER = "number"
     TEXT = "text"
@@ -30,7 +30,7 @@ class Takes(enum.Enum):
 
 
 class Yields(enum.Enum):
-    """What a function yields."""
+    """The type of a function's result."""
 
     NUMBER = "number"
     BOOLEAN = "boolean"
@@ -56,7 +56,7 @@ _YIELDS = {
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter: its name tells the unit where the meaning does not."""
+    """A parameter. Its name contains the unit if its meaning does not imply it."""
 
     name: str
     takes: Takes
@@ -77,7 +77,7 @@ class Function:
     name: str
     yields: Yields
     summary: str
-    """What it yields, with the unit."""
+    """The meaning of the result, with its unit."""
     signatures: tuple[Signature, ...]
 
     @property

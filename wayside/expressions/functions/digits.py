@@ -34,4 +34,4 @@ DECLARATION: Final = cel.FunctionDecl(
         for kind in _OTHERS
     ],
 )
-"""What `string` converts stays what it is, but for doubles that are whole numbers: those become integers."""
+"""Prepares a value for `string`: a double without a fraction becomes an integer, any other value is unchanged."""

@@ -1,6 +1,6 @@
 """Reads numbers out of messages as functions get them: maps, records of decoded messages, lists of coordinates.
 
-What is absent, null or NaN raises ValueError with a text that says so and begins `no value for`: unknown, not wrong.
+An absent, null or NaN value raises ValueError with a message that begins with `no value for`: unknown, not wrong.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Final
 _ABSENT: Final = object()
 
 _PLACES: Final = (("position",), ("pose", "position"), ("pose", "pose", "position"), ("center", "position"))
-"""Where an object has its coordinates, if not itself."""
+"""The paths of an object's coordinates, if they are not in the object itself."""
 
 Place = tuple[float, float, float]
 """Metres along x, y and z."""
@@ -53,7 +53,7 @@ def pair(point: object, names: tuple[str, str], what: str) -> tuple[float, float
 
 
 def place(item: object, what: str, path: str = "") -> Place:
-    """Where an object is: at `path` (as in `bbox.center.position`), or where objects usually say it.
+    """The position of an object: at `path` (such as `bbox.center.position`), or in one of the usual fields.
 
     That is x, y and z (0 where absent) of the object itself, of its position, pose.position, pose.pose.position or
     center.position; or a list of two or three numbers.

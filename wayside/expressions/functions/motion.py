@@ -1,4 +1,4 @@
-"""Motion: when two that go on as they do will meet, and how near they will come."""
+"""Motion: the time to collision and the closest approach of two bodies at constant velocity."""
 
 from __future__ import annotations
 

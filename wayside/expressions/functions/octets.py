@@ -50,7 +50,7 @@ def utf8(data: bytes) -> str:
     try:
         return bytes(data).decode().replace("\0", "␀")
     except UnicodeDecodeError as error:
-        raise ValueError(f"the bytes are no UTF-8: {error.reason} at byte {error.start}") from None
+        raise ValueError(f"the bytes are not valid UTF-8: {error.reason} at byte {error.start}") from None
 
 
 FUNCTIONS = (

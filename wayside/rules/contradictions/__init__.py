@@ -1,4 +1,4 @@
-"""Where a rule's classification contradicts the rule. A contradiction is a warning: the rule runs as it is."""
+"""Contradictions between a rule and its classification. A contradiction is only a warning: the rule runs."""
 
 from wayside.rules.contradictions.case import Case
 from wayside.rules.contradictions.table import CONTRADICTIONS, Contradiction, contradictions

@@ -1,7 +1,7 @@
 """Which types of action an action of a rule can be.
 
-Some are told by what the action is: `record` records. Others are told by what stands at the other end: a message to
-software may be what reconfigures it, and an application that is launched may do anything.
+Some follow from the kind of action: `record` records. Others depend on the receiver: a message to
+software may reconfigure it, and an application that is launched may do anything.
 """
 
 from __future__ import annotations
@@ -14,36 +14,36 @@ from wayside.api.operation import Operation
 from wayside.api.scheme import TypeOfAction
 
 _ANY = frozenset(TypeOfAction)
-_TOLD = _ANY - {TypeOfAction.DATA_COLLECTION}
+_NOT_RECORDING = _ANY - {TypeOfAction.DATA_COLLECTION}
 
 
 class Types(NamedTuple):
-    """What an action is taken for."""
+    """The types of action that an action can have."""
 
     needed: frozenset[TypeOfAction]
-    """One of these must be named where the action is; empty: nothing is needed."""
+    """One of these must be in the classification; empty: none is required."""
     possible: frozenset[TypeOfAction]
-    """It accounts for these where they are named."""
+    """The types that the action can account for."""
     does: str
-    """What it does, for a warning."""
+    """The effect of the action, for a warning."""
 
 
 _LAUNCHES = Types(frozenset({TypeOfAction.DEPLOYMENT}), _ANY, "launches software")
 _CONFIGURES = Types(
     frozenset({TypeOfAction.RECONFIGURATION}),
     _ANY - {TypeOfAction.DEPLOYMENT},
-    "configures what runs, and starts nothing",
+    "reconfigures running applications, and starts none",
 )
 _SUSPENDS = Types(
     frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
     frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
-    "stops what runs",
+    "stops running applications",
 )
 _RECORDS = Types(frozenset({TypeOfAction.DATA_COLLECTION}), frozenset({TypeOfAction.DATA_COLLECTION}), "records data")
 _TRIES_RECORDING = _RECORDS._replace(needed=frozenset())
-_ASKS = Types(frozenset(), _ANY, "asks another system")
+_CALLS = Types(frozenset(), _ANY, "calls another system")
 _ALERTS = Types(frozenset({TypeOfAction.NOTIFICATION}), frozenset({TypeOfAction.NOTIFICATION}), "raises an alert")
-_TELLS = Types(_TOLD, _ANY, "tells somebody, or something")
+_NOTIFIES = Types(_NOT_RECORDING, _ANY, "sends a notification")
 
 _OF_OPERATION = {
     Operation.DEPLOY: _LAUNCHES,
@@ -53,7 +53,7 @@ _OF_OPERATION = {
 
 
 def types(action: Action) -> Types:
-    """What the action can be."""
+    """The types that the action can have."""
     if action.deploy is not None:
         return _OF_OPERATION[action.deploy.operation]
     if action.record is not None:
@@ -61,10 +61,10 @@ def types(action: Action) -> Types:
     if action.database is not None:
         return _TRIES_RECORDING if action.database.dry_run else _RECORDS
     if action.trigger is not None:
-        return _RECORDS if action.trigger.detector is not None else _ASKS
+        return _RECORDS if action.trigger.detector is not None else _CALLS
     if action.notify is not None:
-        return _ALERTS if action.notify.alertmanager is not None else _TELLS
-    return _ASKS
+        return _ALERTS if action.notify.alertmanager is not None else _NOTIFIES
+    return _CALLS
 
 
 def delay_ns(action: Action) -> int:

@@ -1,4 +1,4 @@
-"""A rule with its classification: what a contradiction is looked for in, and how one is said."""
+"""A rule with its classification: the input of the checks for contradictions, and the form of their warnings."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class Case:
     """The rules that it may name, by name."""
 
     def given(self, values: type[Value]) -> list[Value]:
-        """What the classification says in the dimension; nothing where it says nothing."""
+        """The values of the classification in the dimension; empty if it has none."""
         classification = self.rule.spec.classification or Classification()
         return classification.values_of(_dimension(values))
 
     def only(self, *values: Value) -> bool:
-        """Whether the classification says something in the values' dimension, and nothing but these."""
+        """Whether the classification has values in the dimension, and only these."""
         given = self.given(type(values[0]))
         return bool(given) and set(given) <= set(values)
 
     def against(self, value: Value, fact: str) -> RuleProblem:
-        """The warning that a value that is given does not fit the fact, which also says what would."""
+        """The warning that a given value contradicts the fact; the fact also contains the remedy."""
         dimension = _dimension(type(value))
         index = self.given(type(value)).index(value)
         return RuleProblem(
@@ -46,12 +46,12 @@ class Case:
         )
 
     def lacks(self, values: type[Value], fact: str) -> RuleProblem:
-        """The warning that a value is missing in a dimension; the fact says which."""
+        """The warning that a value is missing in a dimension; the fact names the value."""
         return RuleProblem(("spec", "classification", _dimension(values).name), fact)
 
 
 def conditions(rule: EventRule) -> Iterator[str]:
-    """The expressions that decide whether, and for whom, an episode starts or ends."""
+    """The expressions that start and end episodes, or select their subjects."""
     spec, scope = rule.spec, rule.spec.scope
     yield spec.when
     if spec.until is not None:

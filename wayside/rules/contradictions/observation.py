@@ -1,4 +1,4 @@
-"""How much time the data covers in which a rule finds its event, as far as the rule tells.
+"""The time span of the data that a rule needs to detect its event, as far as it is known from the rule.
 
 A rule that looks at the newest samples alone needs none. Windows need theirs, and `for` comes on top. A plugin, the age
 of a sample and the like may reach back any time: then the time is at least what is known.
@@ -26,11 +26,11 @@ class Observation:
     """The time that a rule looks back."""
 
     ns: int
-    """At least so long, in nanoseconds."""
+    """The minimum time, in nanoseconds."""
     why: str
-    """The fields that say so; what nothing says is said in words."""
+    """The fields that determine it, or an explanation if there are none."""
     any_time: bool
-    """Whether it may look back farther, which cannot be told."""
+    """Whether it may look back farther, by an unknown time."""
 
 
 class _Reach(NamedTuple):
@@ -52,7 +52,7 @@ def _observation(rule: EventRule, others: Mapping[str, EventRule], above: frozen
         why.append(f"spec.for: {rule.spec.for_}")
     return Observation(
         longest.ns + rule.spec.for_.ns,
-        " and ".join(why) or "it looks at the newest samples alone",
+        " and ".join(why) or "it uses only the newest samples",
         any(reach.any_time for reach in reaches),
     )
 
@@ -86,14 +86,14 @@ def _reach(at: str, signal: Signal) -> _Reach:
         any_time = any(window.over is None for window in windows)
         return _Reach(0, "", any_time) if longest is None else _Reach(longest.ns, f"{at}.model: {longest}", any_time)
     if signal.aggregate is Aggregate.LAST and signal.rule is None:
-        return _Reach(0, "")  # `over` says how old it may be; one sample is enough
+        return _Reach(0, "")  # `over` limits its age; one sample is enough
     if signal.over is not None:
         return _Reach(signal.over.ns, f"{at}.over: {signal.over}")
     return _Reach(0, "", any_time=signal.aggregate in _OF_ANY_TIME or signal.rule is not None)
 
 
 def looks_back(observed: Observation) -> str:
-    """What an observation says, for a warning."""
+    """The text of an observation, for a warning."""
     if not observed.ns:
         return observed.why
     return f"it looks back {span(observed.ns)} ({observed.why})"

@@ -1,8 +1,8 @@
-"""The table of contradictions: for a dimension of the scheme, what of a rule contradicts which value.
+"""The table of contradictions between the values of a dimension and the fields of a rule.
 
-Only what is certain is here. Of the overarching purpose, the data source entity, the affected entity and the scope of
-impact no rule says anything that could contradict a value. Where several values are given in a dimension, it is enough
-that one fits.
+It contains only certain contradictions. No field of a rule can contradict a value of the overarching purpose, the data
+source entity, the affected entity or the scope of impact. If several values are given in a dimension, one that fits is
+enough.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SENDERS = {
     "etsi/spatem": TypeOfParticipants.ROAD_INFRASTRUCTURE,
     "etsi/mapem": TypeOfParticipants.ROAD_INFRASTRUCTURE,
 }
-"""Who alone sends these messages: of VAM ETSI TS 103 300-3 says so, of SPATEM and MAPEM ETSI TS 103 301."""
+"""The only senders of these messages, by ETSI TS 103 300-3 (VAM) and ETSI TS 103 301 (SPATEM and MAPEM)."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Contradiction:
     check: str
     """The name of its finding."""
     dimension: type[Value]
-    says: str
+    description: str
     """When there is a warning, for people."""
     find: Callable[[Case], Iterator[RuleProblem]]
 
@@ -97,7 +97,7 @@ def _one_and_external(case: Case) -> Iterator[RuleProblem]:
     if case.only(NumberOfParticipants.ONE) and case.only(external):
         yield case.against(
             external,
-            f"whose data it is and who detects the event are two that take part, and numberOfParticipants says "
+            f"an external entity that detects the event is a second participant, but numberOfParticipants is "
             f"{NumberOfParticipants.ONE.explained()}: correct one of them",
         )
 
@@ -157,8 +157,8 @@ def _algorithm(case: Case) -> Iterator[RuleProblem]:
     if case.only(DetectionAlgorithm.LEARNING_BASED) and not models and not plugins:
         yield case.against(
             DetectionAlgorithm.LEARNING_BASED,
-            "no signal that decides comes from a model or a plugin: write RuleBased, or add it where what the rule "
-            "looks at was learnt",
+            "no signal that decides comes from a model or a plugin: write RuleBased, or add it if the rule's input "
+            "comes from a learnt algorithm",
         )
 
 
@@ -181,7 +181,7 @@ def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
     actions = case.rule.spec.actions
     if not given:
         return
-    # Somebody is told, and gets the data with it: that is a report, as in the paper's Table 2.
+    # A notification that comes with the data is a report, as in the paper's Table 2.
     report = TypeOfAction.NOTIFICATION in given and any(action.notify is not None for action in actions)
     for index, action in enumerate(actions):
         needed, _, does = types(action)
@@ -195,7 +195,7 @@ def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
 def _unaccounted_type(case: Case) -> Iterator[RuleProblem]:
     actions = case.rule.spec.actions
     possible = frozenset[Value]().union(*(types(action).possible for action in actions))
-    for value in case.given(TypeOfAction) if actions else ():  # without actions, somebody else acts on the events
+    for value in case.given(TypeOfAction) if actions else ():  # without actions, another system acts on the events
         if value not in possible:
             listed = ", ".join(f"spec.actions[{index}].{each.field}" for index, each in enumerate(actions))
             yield case.against(value, f"no action of the rule does that ({listed}): remove it, or add the action")
