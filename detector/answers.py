@@ -69,7 +69,7 @@ class Answers:
         answer = self._answers.get(what)
         if answer is None:
             known = ", ".join([*self._answers, RECORDINGS])
-            raise ValueError(f"a detector does not answer {what!r}: ask for one of {known}")
+            raise ValueError(f"unknown request {what!r}: the detector answers {known}")
         return answer(given)
 
     def status(self) -> Status:
@@ -77,7 +77,7 @@ class Answers:
         latest, outlet = self._evaluator.status.latest, self._outlet()
         dropped = [
             Drops("event_unpublished", "events not published", outlet.network.dropped_events),
-            Drops("event_unwritten", "events missing in events.jsonl", outlet.unwritten),
+            Drops("event_unwritten", "events not written to events.jsonl", outlet.unwritten),
         ]
         sources = [
             SourceStatus(each.source.name, each.source.plugin, each.state.value, each.messages, each.last_error)
@@ -103,11 +103,11 @@ class Answers:
     def healthy(self) -> tuple[bool, bytes]:
         """Whether all goes on that no waiting brings back, for /healthz: a restart is the remedy for it alone."""
         silent, hung, dead = self._evaluator.status.silence, self._pulse(), self._outlet().network.dead
-        lines = [f"the evaluation looked {silent:.1f} s ago"]
+        lines = [f"the last evaluation was {silent:.1f} s ago"]
         if hung >= _SILENT:
-            lines.append(f"the event loop has not run for {hung:.1f} s: tasks and the Lease stay as they are")
+            lines.append(f"the event loop has been blocked for {hung:.1f} s: tasks and the Lease are not updated")
         if dead is not None:
-            lines.append(f"nothing is received any more: {dead}")
+            lines.append(f"receiving has stopped: {dead}")
         return silent < _SILENT and hung < _SILENT and dead is None, "".join(f"{line}\n" for line in lines).encode()
 
     def ready(self) -> tuple[bool, bytes]:
@@ -120,7 +120,7 @@ class Answers:
         if not network.joined:
             return False, text + b"no Zenoh session yet\n"
         if not network.listens and not network.connected:
-            return False, text + b"nobody is connected on Zenoh: it is sought, and the buffer is kept\n"
+            return False, text + b"nothing is connected on Zenoh: reconnecting, the buffer is kept\n"
         return well, text
 
     def _status(self, given: Mapping[str, str]) -> bytes:
@@ -160,7 +160,7 @@ class Answers:
         try:
             return future.result(_PATIENCE)
         except TimeoutError:
-            raise ValueError(f"the evaluation did not get to it within {_PATIENCE:g} s: it is too slow") from None
+            raise ValueError(f"the evaluation did not answer within {_PATIENCE:g} s: it is overloaded") from None
 
     def _explanation(self, rule: str, subject: str | None, wait: str) -> Explanation | None:
         """What the rule's next evaluation sees; None where there is none within so many seconds."""
@@ -182,7 +182,7 @@ class Answers:
 def _rule(given: Mapping[str, str]) -> str:
     rule = given.get("rule")
     if not rule:
-        raise ValueError("which rule? Ask with ?rule=NAME")
+        raise ValueError("rule is missing: give ?rule=NAME")
     return rule
 
 

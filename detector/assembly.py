@@ -64,7 +64,7 @@ class Refusal:
     """Whether its last good version goes on."""
 
     def __str__(self) -> str:
-        what = "is refused, and goes on as it last was" if self.kept else "is refused"
+        what = "is refused; keeping its last good version" if self.kept else "is refused"
         return f"EventRule {self.rule.name} {what}: {'; '.join(map(str, self.problems))}"
 
 

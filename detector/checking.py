@@ -61,7 +61,7 @@ def findings(documents: Sequence[Document]) -> Findings:
     any_detector = any(isinstance(document.object, Detector) for document in documents)
     rules = [document for document in documents if isinstance(document.object, EventRule)]
     if rules and not any_detector:
-        missing = "a rule is checked against its Detector: give the Detector's file as well"
+        missing = "a rule is checked against its Detector: give the file of the Detector as well"
         problems.append(rules[0].problem((), missing, MISSING_DETECTOR.name))
     wrong = {
         detector.name: dependency_problems(
@@ -91,8 +91,8 @@ def _without_stamps(document: Document, detector: Detector, entries: Inlets) -> 
         for index, stream in without:
             yield document.problem(
                 ("spec", "streams", index),
-                f"stream {stream.name} carries no stamp, and others do: with clock Data the receive time counts for "
-                "it; give its stamp, e.g. msg.time or sample.received, or write clock: Wall",
+                f"stream {stream.name} has no stamp, unlike others: with clock Data its receive time is used; "
+                "give its stamp, e.g. msg.time or sample.received, or write clock: Wall",
                 STREAM_WITHOUT_STAMPS.name,
             )
 
@@ -155,7 +155,7 @@ def summary(documents: Sequence[Document]) -> str:
     if not counts:
         return looked
     others = ", ".join(_counted(count, kind) for kind, count in sorted(counts.items()))
-    return f"{looked} (not looked at: {others}; see `application-manager render`)"
+    return f"{looked} (not checked: {others}; see `application-manager render`)"
 
 
 def _counted(count: int, kind: str) -> str:

@@ -49,7 +49,7 @@ def read_material(access: Access, at: str) -> Material:
             raise AccessError(f"{at}: {problem}")
         ca, certificate, key = before
         return Material(ca, certificate, key, files.verify_name, credentials, tls=True)
-    raise AccessError(f"{at}: {files.certificate or files.ca} changes all the time: it is looked at again")
+    raise AccessError(f"{at}: {files.certificate or files.ca} keeps changing while it is read; it is read again later")
 
 
 def expiry(pem: bytes) -> float:
@@ -78,7 +78,7 @@ def _problem(files: TlsFiles) -> str | None:
         if files.ca is not None:
             context.load_verify_locations(files.ca)
     except (OSError, ssl.SSLError) as error:
-        return f"{files.ca} holds no certificates that can be read ({_reason(error)}): give PEM"
+        return f"{files.ca} contains no readable certificates ({_reason(error)}): give PEM"
     if files.certificate is None or files.key is None:
         return None
     try:
@@ -86,8 +86,8 @@ def _problem(files: TlsFiles) -> str | None:
         expires = expiry(files.certificate.read_bytes())
     except (OSError, ssl.SSLError, ValueError) as error:
         if "KEY_VALUES_MISMATCH" in str(error):
-            return f"{files.key} is not the key of {files.certificate}: give both of one pair"
-        return f"{files.certificate} and {files.key} are no certificate and key ({_reason(error)}): give PEM"
+            return f"{files.key} is not the key of {files.certificate}: give a certificate and its own key"
+        return f"{files.certificate} and {files.key} are not a certificate and a key ({_reason(error)}): give PEM"
     now = datetime.datetime.now(datetime.UTC).timestamp()
     return f"{files.certificate} expired {now - expires:.0f} s ago: renew it" if expires <= now else None
 

@@ -92,15 +92,15 @@ def _load(offers: Offers[T], name: str) -> type[T]:
     if entry is None:
         close = difflib.get_close_matches(name, entries, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(entries) or 'none'}"
-        raise LookupError(f"no {what} is installed here; {hint} ({offers.guide})")
+        raise LookupError(f"no {what} is installed; {hint} ({offers.guide})")
     try:
         offered: Any = entry.load()
     except Exception as error:  # somebody else's module, which may raise whatever it likes
-        raise LookupError(f"{what} cannot be loaded: {type(error).__name__}: {error}{_remedy(entry, error)}") from error
+        raise LookupError(f"cannot load {what}: {type(error).__name__}: {error}{_remedy(entry, error)}") from error
     base = f"{offers.base.__module__}.{offers.base.__qualname__}"
     complete = inspect.isclass(offered) and issubclass(offered, offers.base) and not inspect.isabstract(offered)
     if not complete:
-        raise LookupError(f"{what} is {entry.value}, which is no complete {base} ({offers.guide})")
+        raise LookupError(f"{what} is {entry.value}, which is not a complete {base} ({offers.guide})")
     model = getattr(offered, "Parameters", None)
     if not (inspect.isclass(model) and issubclass(model, offers.model)):
         raise LookupError(f"{what}: give {entry.value} a class Parameters({offers.model.__name__}) ({offers.guide})")

@@ -263,7 +263,7 @@ class Evaluator:
             events += self._gap(now, "the wall clock stepped back")
         else:
             if now - self._engine.next_tick() > _STALL and self._engine.on_wall_clock:
-                events += self._gap(now, "the evaluation stood still, or the wall clock stepped ahead")
+                events += self._gap(now, "the evaluation stalled, or the wall clock stepped forward")
             events += self._take(self._intake.drain(now), now)
         if wanted is not None:
             events += self._configure(wanted)
@@ -281,14 +281,14 @@ class Evaluator:
         names = self._engine.schedule.paused - {rule} | ({rule} if paused else set())
         self._record(self._engine.now, {"kind": "paused", "rules": sorted(names)})
         self._engine.set_paused(names)
-        _log.info("EventRule %s is %s", rule, "paused: its open episodes hold" if paused else "evaluated again")
+        _log.info("EventRule %s is %s", rule, "paused; its open episodes are kept" if paused else "evaluated again")
 
     def _adapt(self, spent: int) -> None:
         """Leave out more where the look took too long, and less when it is calm again."""
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
-            text = "the evaluation takes too long" if spent > LONG else "the evaluation keeps up"
-            _log.warning("%s: evaluations of low priority are left out at level %d of %d", text, level, highest)
+            text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"
+            _log.warning("%s: thinning evaluations of low priority at level %d of %d", text, level, highest)
             self._record(self._engine.now, {"kind": "level", "level": level})
             self._engine.set_level(level)
 
@@ -307,7 +307,7 @@ class Evaluator:
             self._record(self._engine.now, document)
 
     def _gap(self, now: int, why: str) -> list[Event]:
-        _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)
+        _log.warning("%s: skipping missed ticks; windows reset, open episodes kept", why)
         self.status.gaps += 1
         self._record(now, {"kind": "gap", "until": self._engine.now})
         return self._engine.gap(now)

@@ -84,9 +84,9 @@ class Losses:
     def sum_up(self) -> None:
         """Log how many samples came, all losses since the start, and how the evaluations went."""
         counters, buffer = self._engine.counters, self._engine.buffer
-        _log.info("%d samples in, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
+        _log.info("%d samples received, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
         for line in (*self.report(), *self.doubts()):
-            _log.warning("in all, %s", line)
+            _log.warning("in total, %s", line)
 
     def report(self) -> Iterator[str]:
         """All losses since the start; and where values were unknown, since a misspelt field looks like that."""
@@ -108,21 +108,21 @@ class Losses:
                 stream, period = spec.stream(stream_name), use.period
                 limit = None if stream is None else spec.stale_after_ns(stream)
                 if limit is None or period is None:
-                    continue  # it never goes stale: what was said last holds
+                    continue  # it never goes stale: the last sample stays valid
                 every = f"every {period / 1e9:.2g} s"
                 if period > limit:
                     yield Finding(
                         STALE_BETWEEN_SAMPLES.name,
-                        f"samples of stream {stream_name} come {every} and go stale after {limit / 1e9:g} s: EventRule "
-                        f"{name} finds them unknown in between; raise streams[{stream_name}].staleAfter",
+                        f"samples of stream {stream_name} arrive {every} and go stale after {limit / 1e9:g} s, so "
+                        f"EventRule {name} finds them unknown in between; raise streams[{stream_name}].staleAfter",
                         name,
                     )
                 elif use.old:
-                    old = f"{use.old} of the {use.count} it used were older than {OLD * period / 1e9:.2g} s"
+                    old = f"{use.old} of the {use.count} samples it used were older than {OLD * period / 1e9:.2g} s"
                     yield Finding(
                         OLD_SAMPLES.name,
-                        f"EventRule {name} used old samples of stream {stream_name}: they come {every}, and {old}. "
-                        "A client's last sample counts on after it falls silent: lower "
+                        f"EventRule {name} used old samples of stream {stream_name}: they arrive {every}, and {old}. "
+                        "The last sample of a silent client stays valid until staleAfter: lower "
                         f"streams[{stream_name}].staleAfter"
                         + (", or maxAge of the position" if self._in_pairs(name) else ""),
                         name,
@@ -141,20 +141,24 @@ class Losses:
         for name in sorted({*counters.delays, *counters.zeros}):
             remedy = f"give streams[{name}].stamp, e.g. msg.time or sample.received, or write clock: Wall"
             if zeros := counters.zeros[name]:
-                what = f"{zeros} samples of stream {name} are without a time: their stamps are 0"
-                yield f"zero {name}", Finding(ZERO_STAMPS.name, f"{what}; let the sender fill them in, {remedy}")
+                what = f"{zeros} samples of stream {name} have no time: their stamps are 0"
+                yield f"zero {name}", Finding(ZERO_STAMPS.name, f"{what}; set the stamps in the sender, {remedy}")
             if (unstamped := counters.unstamped[name]) and not all_unstamped:
-                what = f"{unstamped} samples of stream {name} carry no stamp, those of other streams do"
-                counted = f"{what}: with clock Data their receive time counts; {remedy}"
+                what = f"{unstamped} samples of stream {name} have no stamp, unlike those of other streams"
+                counted = f"{what}: with clock Data their receive time is used; {remedy}"
                 yield f"unstamped {name}", Finding(STREAM_WITHOUT_STAMPS.name, counted)
             behind = counters.delays.get(name, right[1]) - right[1]
             if behind < -_APART:
-                what = f"stamps of stream {name} are {-counters.delays[name] / 1e9:.1f} s ahead of the receive times"
-                late = "with clock Data the samples of other streams are late for it; set the sender's clock"
+                what = (
+                    f"the stamps of stream {name} are {-counters.delays[name] / 1e9:.1f} s ahead of the receive times"
+                )
+                late = "with clock Data this makes the samples of other streams late; set the clock of the sender"
                 yield f"ahead {name}", Finding(DIVERGING_STAMPS.name, f"{what}: {late}, {remedy}")
             elif behind > _APART:
-                what = f"stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those"
-                late = "with clock Data its samples are late for the others; set the sender's clock"
+                what = (
+                    f"the stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those"
+                )
+                late = "with clock Data this makes its samples late; set the clock of the sender"
                 yield f"behind {name}", Finding(DIVERGING_STAMPS.name, f"{what} of stream {right[0]}: {late}, {remedy}")
 
     def all(self) -> Iterator[Loss]:
@@ -166,38 +170,42 @@ class Losses:
         for losses in self._others:
             yield from losses()
         if self._intake is not None:
-            full = "samples dropped, the intake being full: more come in than are evaluated"
+            full = "samples dropped because the intake queue is full: more arrive than are evaluated"
             yield Loss(full, self._intake.dropped, cause="intake_full")
-        pushed_out = "samples pushed out of the buffer before their time: it is too small"
+        pushed_out = "samples evicted from the buffer early because it is too small"
         yield Loss(pushed_out, self._engine.buffer.evicted, cause="evicted")
         if isinstance(timeline, DataTimeline):
             ahead, late = timeline.dropped_ahead, timeline.dropped_late
-            yield Loss("samples dropped, their stamps being ahead of the rest", ahead, timeline.last, cause="ahead")
-            yield Loss("samples dropped, their stamps being too old", late, timeline.last, cause="late")
-            yield Loss("samples dropped, too many waiting for their time", timeline.dropped_full, cause="waiting_full")
-        too_late = "samples came when the window of an action that they belong to was complete: raise lateness"
+            yield Loss(
+                "samples dropped because their stamps are ahead of the rest", ahead, timeline.last, cause="ahead"
+            )
+            yield Loss("samples dropped because their stamps are too old", late, timeline.last, cause="late")
+            yield Loss(
+                "samples dropped because too many wait for their time", timeline.dropped_full, cause="waiting_full"
+            )
+        too_late = "samples too late for the window of an action: raise lateness"
         yield Loss(too_late, self._engine.consequences.too_late, cause="window_late")
         for name, count in counters.undecodable.items():
             last = counters.last_undecodable.get(name, "")
             unread = f"times a sample of stream {name} could not be read"
             yield Loss(unread, count, last, cause="undecodable", stream=name)
         for name, count in counters.unnamed.items():
-            unnamed = f"samples of stream {name} dropped, naming no client by key or message"
+            unnamed = f"samples of stream {name} dropped because neither key nor message names a client"
             yield Loss(unnamed, count, counters.last_unnamed.get(name, ""), cause="unnamed", stream=name)
         for name, count in counters.crowded.items():
-            crowded = f"samples of stream {name} dropped, too many clients being known"
+            crowded = f"samples of stream {name} dropped because too many clients are known"
             yield Loss(crowded, count, cause="crowded", stream=name)
         for name, rule in counters.rules.items():
             yield Loss(f"evaluation errors in EventRule {name}", rule.errors, rule.last_error, cause="error", rule=name)
             misplaced = f"times a sample had no position for EventRule {name}"
             yield Loss(misplaced, rule.misplaced, rule.last_misplaced, cause="misplaced", rule=name)
-            crowded = f"looks at pairs left out for EventRule {name}, more than maxPairs being near"
+            crowded = f"evaluations of pairs skipped for EventRule {name} because more than maxPairs are near"
             yield Loss(crowded, rule.crowded_pairs, cause="crowded_pairs", rule=name)
-            kept = f"times a parameter that follows kept its last value in EventRule {name}"
+            kept = f"times a followed parameter kept its last value in EventRule {name}"
             yield Loss(kept, rule.unfollowed, rule.last_unfollowed, cause="unfollowed", rule=name)
-            slow = f"evaluations of EventRule {name} left out, the machine being too slow"
+            slow = f"evaluations of EventRule {name} skipped because the machine is too slow"
             yield Loss(slow, rule.skipped, cause="skipped", rule=name)
-            often = f"episodes of EventRule {name} left out, beyond maxEpisodesPerHour"
+            often = f"episodes of EventRule {name} suppressed beyond maxEpisodesPerHour"
             yield Loss(often, rule.suppressed, cause="suppressed", rule=name)
 
 

@@ -72,7 +72,7 @@ class LiveOutlet:
         try:
             self.network.start()
         except NetworkError as error:
-            _log.error("the changed Detector has no network, correct it: %s", error)
+            _log.error("cannot join the network of the changed Detector; correct it: %s", error)
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
         """Have what is open written to the state volume, where there is one."""

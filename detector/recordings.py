@@ -15,9 +15,9 @@ from wayside.commandline import refuse
 if TYPE_CHECKING:
     from detector.actions.trigger.requests import RecordingReport, RecordingRequest
 
-app = typer.Typer(help="Have running detectors record, where they allow it (spec.recordings.onRequest).")
+app = typer.Typer(help="Request recordings of running detectors that permit it (spec.recordings.onRequest).")
 
-Id = Annotated[str, typer.Argument(help="The recording's id.", show_default=False)]
+Id = Annotated[str, typer.Argument(help="The id of the recording.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, a line for each recording.")]
 
 _WIDTH = 160
@@ -26,11 +26,13 @@ _WIDTH = 160
 
 @app.command()
 def start(
-    identity: Annotated[str | None, typer.Argument(help="An id of your choice. Default: a new one.")] = None,
-    stream: Annotated[list[str] | None, typer.Option(help="A stream; may be repeated. Default: all allowed.")] = None,
+    identity: Annotated[str | None, typer.Argument(help="An id of your choice. Default: a generated one.")] = None,
+    stream: Annotated[list[str] | None, typer.Option(help="A stream; may be repeated. Default: all permitted.")] = None,
     client: Annotated[list[str] | None, typer.Option(help="A client; may be repeated. Default: all.")] = None,
-    before: Annotated[str, typer.Option(help="How long before now it begins, as far as the buffer reaches.")] = "0s",
-    maximum_duration: Annotated[str, typer.Option(help="The recording ends after this time at the latest.")] = "10m",
+    before: Annotated[
+        str, typer.Option(help=("How long before now the recording starts, as far as the buffer reaches."))
+    ] = "0s",
+    maximum_duration: Annotated[str, typer.Option(help="The maximum duration of the recording.")] = "10m",
     detector: DetectorFile = None,
     name: Name = None,
     connect: Connect = None,
@@ -47,7 +49,7 @@ def start(
         maximumDuration=maximum_duration,
     )
     if detector is None and name is None:
-        refuse("which detector is to record? Give --name NAME or --detector FILE")
+        refuse("no detector given to record: give --name NAME or --detector FILE")
     _print(_asked(request, detector, name, connect, timeout), as_json)
 
 
@@ -63,7 +65,7 @@ def stop(
 ) -> None:
     """End a recording."""
     if detector is None and name is None:
-        refuse("which detector is to stop? Give --name NAME or --detector FILE")
+        refuse("no detector given to stop: give --name NAME or --detector FILE")
     _print(_asked(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
 
 

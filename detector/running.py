@@ -136,7 +136,7 @@ class Running:
             len(self._restored.demands),
         )
         if self._restored.episodes:
-            _log.info("%d open episodes of the state volume", len(self._restored.episodes))
+            _log.info("restored %d open episodes from the state volume", len(self._restored.episodes))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -198,7 +198,7 @@ class Running:
         try:
             _checked(wanted)
         except DetectorError as error:
-            _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.name, error)
+            _log.error("cannot apply the new Detector %s; keeping the last good one: %s", wanted.name, error)
             return self._rule_set.detector
         return wanted
 
@@ -212,7 +212,7 @@ class Running:
     def _summarise(self) -> None:
         self._evaluator.losses.sum_up()
         if self._outlet.network.dropped_events:
-            _log.warning("in all, %d events not published", self._outlet.network.dropped_events)
+            _log.warning("in total, %d events not published", self._outlet.network.dropped_events)
 
 
 def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:
@@ -234,15 +234,17 @@ def _server(port: int, answers: Answers) -> StatusServer:
 
 def _of_state(state: StateFile) -> Iterator[Loss]:
     """What the state volume did not take or give."""
-    unwritten = "times the state volume could not be written, and was tried again"
+    unwritten = "times the state volume could not be written"
     yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
-    yield Loss("files of the state volume set aside, being unreadable", state.set_aside, cause="state_unreadable")
+    yield Loss("unreadable files of the state volume set aside", state.set_aside, cause="state_unreadable")
 
 
 def _of_traces(traces: EpisodeTraces) -> Iterator[Loss]:
     """Spans that nobody got."""
-    yield Loss("spans dropped, too many being on their way", traces.tracing.dropped, cause="spans_dropped")
-    yield Loss("spans not taken", traces.tracing.failed, f"by {traces.tracing.endpoint}", cause="spans_failed")
+    yield Loss("spans dropped because too many are in flight", traces.tracing.dropped, cause="spans_dropped")
+    yield Loss(
+        "spans that could not be exported", traces.tracing.failed, f"by {traces.tracing.endpoint}", cause="spans_failed"
+    )
 
 
 def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:
@@ -258,7 +260,7 @@ def _unused(path: Path) -> Path:
     candidates = chain([path], (path.with_name(f"{path.stem}.{number}{path.suffix}") for number in count(2)))
     free = next(candidate for candidate in candidates if not candidate.exists())
     if free != path:
-        _log.warning("%s exists already: recording into %s", path, free)
+        _log.warning("%s already exists: recording into %s", path, free)
     return free
 
 

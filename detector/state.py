@@ -36,8 +36,8 @@ def state_file(detector: Detector, holder: str) -> StateFile | None:
         return StateFile(Path(state.path), detector.namespace, holder)
     except OSError as error:
         raise OSError(
-            f"spec.state.path: {state.path} cannot be written ({error.strerror}): give a folder that the detector may "
-            "write to"
+            f"spec.state.path: cannot write {state.path} ({error.strerror}): give a folder that the "
+            "detector may write to"
         ) from error
 
 
@@ -71,7 +71,7 @@ class StateFile:
         except FileNotFoundError:
             return []
         except OSError as error:
-            _log.error("%s cannot be read, no episode is restored from it: %s", self.path, error)
+            _log.error("cannot read %s; restoring no episode from it: %s", self.path, error)
             return []
         try:
             return self._read(text)
@@ -84,7 +84,7 @@ class StateFile:
         if not isinstance(document, dict) or document.get("version") != _VERSION:
             raise ValueError(f"it is not of version {_VERSION}")
         if document.get("of") != self._whose:
-            raise ValueError(f"it is of {document.get('of')}, not of {self._whose}")
+            raise ValueError(f"it belongs to {document.get('of')}, not to {self._whose}")
         episodes = document.get("episodes")
         if not isinstance(episodes, list) or not all(isinstance(each, dict) for each in episodes):
             raise ValueError("its episodes are not a list of maps")
@@ -98,9 +98,9 @@ class StateFile:
         try:
             self.path.rename(aside)
         except OSError as refused:
-            _log.error("%s is unreadable and cannot be set aside (%s): %s", self.path, refused, error)
+            _log.error("cannot read %s, nor set it aside (%s): %s", self.path, refused, error)
         else:
-            _log.error("the state is unreadable, set aside as %s, and nothing restored from it: %s", aside, error)
+            _log.error("cannot read the state; set it aside as %s and restored nothing from it: %s", aside, error)
 
     def save(self, episodes: Sequence[OpenEpisode]) -> None:
         """These are open now. Never waits; only the newest counts."""
@@ -138,7 +138,7 @@ class StateFile:
                 self.failures += 1
                 self.last_failure = str(error)
                 if not failed:
-                    _log.error("the state cannot be written, and is as soon as possible: %s", error)
+                    _log.error("cannot write the state; retrying: %s", error)
                 failed = True
                 with self._changed:
                     if self._wanted is None:

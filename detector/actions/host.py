@@ -112,9 +112,9 @@ class ActionHost:
             if not worker.join(max(0.0, deadline - time.monotonic())):
                 rule, action = worker.which
                 _log.error(
-                    "action %s of EventRule %s does not end within %g s, and is left behind", action, rule, grace
+                    "action %s of EventRule %s did not stop within %g s; abandoning its thread", action, rule, grace
                 )
-                self.outcomes.lose(worker.which, "times the action did not end and was left behind", 1, "")
+                self.outcomes.lose(worker.which, "times the action did not stop in time and was abandoned", 1, "")
 
     def _dismiss(self) -> None:
         """Let those go who have nothing left to do."""
@@ -144,7 +144,7 @@ class ActionHost:
 
     def _around(self) -> Surroundings:
         if self._surroundings is None:
-            raise RuntimeError("no rule has been followed yet")
+            raise RuntimeError("no EventRule has been applied yet")
         return self._surroundings
 
 

@@ -36,11 +36,16 @@ def prepare(action: api.Action, streams: Sequence[str] | None = None) -> tuple[t
         given = action.parameters
         if not isinstance(given, offered.Parameters):
             wanted = f"{offered.Parameters.__module__}.{offered.Parameters.__name__}"
-            raise PluginError(((action.field,), f"what is installed as action {action.kind} asks for {wanted}"))
+            raise PluginError(((action.field,), f"the installed action {action.kind} takes the parameters {wanted}"))
         return offered, given
     name = action.plugin.name
     if name in api.Action.model_fields:
-        raise PluginError((("plugin", "name"), f"{name} is no plugin: write {name}: {{…}} in place of plugin: {{…}}"))
+        raise PluginError(
+            (
+                ("plugin", "name"),
+                f"{name} is a built-in action, not a plugin: write {name}: {{…}} instead of plugin: {{…}}",
+            )
+        )
     offered = OFFERS.load(name, ("plugin", "name"))
     context = {"streams": None if streams is None else list(streams)}
     return offered, OFFERS.parameters(offered, action.plugin.parameters, ("plugin", "parameters"), context)

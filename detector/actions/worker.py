@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 MAXIMUM_BYTES = 256 * 2**20
 """So many bytes of samples wait for an action at most, overhead included."""
 
-SILENT = "the action ended without saying what became of it"
+SILENT = "the action ended without reporting an outcome"
 
 _AGAIN = 1.0
 """Seconds after which `wake` is called again when it failed."""
@@ -89,7 +89,7 @@ class Worker:
             elif size and self._waiting + size > self._maximum:
                 count = len(consequence.samples) if isinstance(consequence, Sampled) else 0
                 self._missing[consequence.run] = self._missing.get(consequence.run, 0) + count
-                self._outcomes.lose(self.which, "samples left out, the action being too slow", count, "")
+                self._outcomes.lose(self.which, "samples left out because the action is too slow", count, "")
                 return
             self._waiting += size
             self._inbox.append((consequence, size))
@@ -142,7 +142,7 @@ class Worker:
         try:
             return self._make(), ""
         except Exception as error:  # noqa: BLE001  somebody else's code: its episodes fail, and nothing else does
-            problem = f"the action cannot be had: {_text(error)}"
+            problem = f"cannot create the action: {_text(error)}"
             _log.error("action %s of EventRule %s: %s", self.which.action, self.which.rule, problem)
             return None, problem
 

@@ -98,12 +98,12 @@ def choose(texts: Iterable[str]) -> Chosen:
         dimension = next((each for each in SCHEME if each.name == name), None)
         if dimension is None:
             raise ChoiceError(
-                f"{text}: there is no dimension {name!r}; there are {_listed(each.name for each in SCHEME)}"
+                f"{text}: unknown dimension {name!r}; the dimensions are {_listed(each.name for each in SCHEME)}"
             )
         value = next((each for each in dimension.values if each.value == written), None)
         if value is None:
             there = _listed(each.value for each in dimension.values)
-            raise ChoiceError(f"{text}: {name} has no value {written!r}; it has {there}")
+            raise ChoiceError(f"{text}: {name} has no value {written!r}; its values are {there}")
         chosen[dimension] = chosen.get(dimension, frozenset()) | {value}
     return chosen
 

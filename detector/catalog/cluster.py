@@ -21,13 +21,14 @@ async def read_cluster(namespace: str | None) -> Read:
     """
     entries: list[Entry] = []
     unreadable: list[str] = []
-    async with connect(namespace, otherwise="give files or folders with EventRules instead of --cluster") as cluster:
+    async with connect(namespace, otherwise="give either files or folders with EventRules, or --cluster") as cluster:
         try:
             listed = await cluster.api.list(EVENT_RULES, cluster.namespace, {})
         except ApiError as error:
             raise NoClusterError(
-                f"the EventRules of namespace {cluster.namespace} cannot be listed: {error}. Check that KUBECONFIG "
-                "leads to the right cluster, and that its account may list eventrules.wayside.dev there"
+                f"cannot list the EventRules of namespace {cluster.namespace}: {error}. Check that "
+                "KUBECONFIG points to the right cluster, and that its account may list "
+                "eventrules.wayside.dev there"
             ) from error
         for each in listed["items"]:
             # The status is the manager's business, and a newer manager's may have fields that we do not know.

@@ -29,7 +29,7 @@ def _overview(catalog: Catalog) -> Iterator[str]:
             yield f"| {first} | {value.words} | {names(catalog.having(value))} |"
             first = ""
         if silent := catalog.silent(dimension):
-            yield f"| | *not said* | {names(silent)} |"
+            yield f"| | *not given* | {names(silent)} |"
     if catalog.unclassified:
         yield from ("", f"Without classification: {names(catalog.unclassified)}.")
 

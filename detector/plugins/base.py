@@ -25,7 +25,7 @@ def _known_stream(name: str, info: ValidationInfo) -> str:
     if streams is None or name in streams:
         return name
     close = difflib.get_close_matches(name, streams, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(streams)}"
+    hint = f"did you mean {close[0]}?" if close else f"its streams are {', '.join(streams)}"
     raise ValueError(f"the Detector has no stream {name}; {hint}")
 
 

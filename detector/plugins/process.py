@@ -89,7 +89,7 @@ class SignalProcess:
                 self._end(f"did not start within {within:g} s")
             return False
         except ClosedError:
-            self._end("ended while it was starting")
+            self._end("exited while it was starting")
             return False
         if answer == "refused":
             self._end(f"cannot run: {content[0]}")
@@ -116,9 +116,9 @@ class SignalProcess:
                         value: Value = content[0]
                         return value
         except TimeoutError:
-            raise StoppedError(self._end("gave no value in time")) from None
+            raise StoppedError(self._end("did not return a value in time")) from None
         except ClosedError:
-            raise StoppedError(self._end("ended by itself")) from None
+            raise StoppedError(self._end("exited")) from None
 
     def keep(self, subjects: Collection[str]) -> None:
         """Drop the state of all other subjects."""
@@ -147,7 +147,7 @@ class SignalProcess:
             try:
                 self._wire.send(*message, within=PATIENCE)
             except (TimeoutError, ClosedError):
-                self._end("ended by itself, or does not read what it is told")
+                self._end("exited, or does not read its input")
 
     def _end(self, why: str) -> str:
         self.stop()
@@ -155,9 +155,9 @@ class SignalProcess:
         if self._starts <= len(_PAUSES):
             pause = _PAUSES[self._starts - 1]
             self._again_at = self._monotonic() + pause
-            then = f"it is stopped, and started again after {pause:g} s"
+            then = f"stopped, restarting in {pause:g} s"
         else:
-            then = "it stays stopped until its rule changes"
+            then = "stopped until the rule changes"
         self.why = f"its process {why}; {then}"
         _log.error(
             "EventRule %s, signal %s, plugin %s: %s", self._rule, self._plugin.name, self._plugin.plugin, self.why

@@ -62,7 +62,7 @@ class ProcessHost:
         signal = self._signals[call.rule, call.signal]
         if not self.outages.expects(call):
             signal.reset()
-            raise PluginFailedError(Reason.ABSENT, "it did not run when this was recorded")
+            raise PluginFailedError(Reason.ABSENT, "the plugin was not running when this was recorded")
         if not signal.is_ready(START_PATIENCE if self._wait else 0.0, again=not self._wait):
             self.outages.note(call, running=False)
             raise PluginFailedError(Reason.ABSENT, signal.why)

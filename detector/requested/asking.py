@@ -68,7 +68,7 @@ class Requested:
             if entry is None:
                 return report
             self._runs[run_of(entry.id).episode] = entry.id
-        _log.info("recording %s begins on request", entry.id)
+        _log.info("starting recording %s on request", entry.id)
         try:
             self._in_time(self._call(lambda: self._begin(entry, request)))
         except Exception:
@@ -83,7 +83,7 @@ class Requested:
             report, entry = self._book.stop(request, self._engine.now)
         if entry is not None and entry.until is not None:
             until = entry.until
-            _log.info("recording %s ends on request", entry.id)
+            _log.info("stopping recording %s on request", entry.id)
             self._in_time(self._call(lambda: self._release(entry.id, until)))
         return report
 
@@ -109,4 +109,4 @@ class Requested:
             future.result(_PATIENCE)
         except TimeoutError:
             # It is done as soon as there is time: who asks again under the same id is told so.
-            _log.warning("the evaluation did not get to a request for a recording within %g s", _PATIENCE)
+            _log.warning("the evaluation did not process a recording request within %g s", _PATIENCE)

@@ -88,7 +88,7 @@ class Book:
             message = "it was stopped before it was started"
             self._entries[identity] = Entry(identity, Progress.UNKNOWN, stopped=True, message=message)
             self._forget()
-            return RecordingReport(identity, Progress.UNKNOWN, "nothing is known of it here"), None
+            return RecordingReport(identity, Progress.UNKNOWN, "this detector does not know the recording"), None
         if entry.state is not Progress.RECORDING:
             return entry.report(), None
         entry.state, entry.stopped = Progress.ENDING, True
@@ -121,14 +121,14 @@ class Book:
 
     def _refusal(self, request: RecordingRequest, allowed: OnRequest | None, streams: Collection[str]) -> str:
         if allowed is None:
-            return "this detector records nothing on request: its spec.recordings.onRequest says who may ask for what"
+            return "this detector accepts no recording requests: allow them in its spec.recordings.onRequest"
         open_ones = sum(not entry.state.over for entry in self._entries.values())
         if open_ones >= allowed.maximum_recordings:
-            return f"{open_ones} recordings are under way, as many as recordings.onRequest.maximumRecordings allows"
+            return f"{open_ones} recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
         may = streams if allowed.streams is None else allowed.streams
         for name in request.streams or ():
             if name not in may:
-                return f"stream {name} is none that may be recorded here: there is {', '.join(sorted(may))}"
+                return f"stream {name} may not be recorded here; permitted are {', '.join(sorted(may))}"
         return ""
 
     def _forget(self) -> None:

@@ -29,7 +29,7 @@ def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[Event
             "kind": "EventRule",
             "metadata": {"name": REQUESTED.rule, "namespace": detector.namespace},
             "spec": {
-                "description": "Recordings that others asked for.",
+                "description": "Recordings requested by others.",
                 "when": "false",
                 "actions": [{"name": REQUESTED.action, "record": {}}],
             },

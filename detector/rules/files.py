@@ -81,8 +81,8 @@ def _left_out(documents: dict[str, Document], chosen: dict[str, Document], detec
         rule = document.object
         if rule.namespace != detector.namespace:
             why = (
-                f"it is in namespace {rule.namespace!r}, the Detector {detector.name!r} in {detector.namespace!r}: "
-                "a detector evaluates rules of its own namespace only"
+                f"it is in namespace {rule.namespace!r}, the Detector {detector.name!r} in "
+                f"{detector.namespace!r}: a detector evaluates only rules of its own namespace"
             )
             yield str(document.problem(("metadata", "namespace"), f"the EventRule {name!r} is not evaluated: {why}"))
         else:
@@ -101,6 +101,6 @@ def _load(paths: Iterable[str | Path], problems: list[Problem]) -> list[Document
 
 def _not_one(given: str, detectors: list[Document]) -> Iterable[Problem]:
     if not detectors:
-        yield Problem(given, 0, 0, "", "holds no Detector: give one object of kind: Detector")
+        yield Problem(given, 0, 0, "", "contains no Detector: give one object of kind: Detector")
     for document in detectors[1:]:
-        yield document.problem(("metadata", "name"), "is a second Detector: give one, in a file of its own")
+        yield document.problem(("metadata", "name"), "is a second Detector: give only one")

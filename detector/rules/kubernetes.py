@@ -132,8 +132,8 @@ class _Known(Generic[Object]):
             parsed = parse_object(shape | read)
         except ValueError as error:
             if self.unreadable.get(name) != str(error):
-                what = "goes on as it last was" if name in self.objects else "is left out"
-                _log.warning("the %s %s cannot be read and %s: %s", self._kind.__name__, name, what, error)
+                what = "keeping its last good version" if name in self.objects else "leaving it out"
+                _log.warning("cannot read the %s %s; %s: %s", self._kind.__name__, name, what, error)
             self.unreadable[name] = str(error)
             return
         assert isinstance(parsed, self._kind)  # noqa: S101  the shape says so

@@ -80,7 +80,7 @@ class SourceThread:
         if self._thread.is_alive():
             self._tally.add(Cause.LEFT_BEHIND, self.source.name)
             log.error(
-                "source %s (%s) does not stop and is left behind: its run() must look at feed.stopping",
+                "source %s (%s) does not stop; abandoning its thread: its run() must check feed.stopping",
                 self.source.name,
                 self.source.plugin,
             )
@@ -106,13 +106,13 @@ class SourceThread:
             self.state = State.STOPPED
         else:
             self.state = State.FINISHED
-            log.info("source %s has nothing more to deliver, after %d messages", self.source.name, self.messages)
+            log.info("source %s has ended after %d messages", self.source.name, self.messages)
 
     def _failed(self, error: BaseException, pause: float) -> None:
         self.state = State.PAUSING
         self.last_error = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         self._tally.add(Cause.FAILED, self.source.name, last=self.last_error)
-        log.warning("source %s failed, again in %g s: %s", self.source.name, pause, self.last_error)
+        log.warning("source %s failed; restarting it in %g s: %s", self.source.name, pause, self.last_error)
         log.debug("source %s", self.source.name, exc_info=error)
 
 

@@ -33,9 +33,9 @@ class Watching:
         """Raises ValueError where there is no such rule, or it is watched already."""
         run = engine.rules.get(rule)
         if run is None:
-            raise ValueError(f"rule {rule} is not evaluated: its state and message say why")
+            raise ValueError(f"rule {rule} is not evaluated: see its state and message")
         if run.witness is not None:
-            raise ValueError(f"somebody else asks about rule {rule} just now: ask again")
+            raise ValueError(f"another request about rule {rule} is in progress: try again")
         self.future: Future[Explanation] = Future()
         self._engine = engine
         self._run = run
@@ -85,7 +85,10 @@ class Watching:
         """By signal, as expressions name it, why it has no value."""
         for plugin in self._run.rule.plugins:
             if plugin.name not in variables:
-                yield plugin.name, f"plugin {plugin.plugin} gave no value, or failed: see the rule's last error"
+                yield (
+                    plugin.name,
+                    f"plugin {plugin.plugin} returned no value or failed: see the last error of the rule",
+                )
         match self._run.rule.subject:
             case PairSubject():
                 for role in ("a", "b"):
@@ -110,32 +113,34 @@ class Watching:
         lane = self._engine.buffer.lane(client, stream)
         spec = self._engine.detector.spec.stream(stream)
         if spec is None:
-            return f"nothing of {stream} has such a value"
+            return f"no {stream} has such a value"
         if lane is None or lane.latest == NEVER:
-            return f"no sample of stream {stream} has come from {client}"
+            return f"no sample of stream {stream} has arrived from {client}"
         age = (self._engine.now - lane.latest) / 1e9
         limit = self._engine.detector.spec.stale_after_ns(spec)
         if limit is not None and age > limit / 1e9:
             return f"stream {stream} of {client} is stale: its newest sample is {age:.1f} s old, more than staleAfter"
-        return f"what came of stream {stream} from {client} has no such value in its window"
+        return f"the samples of stream {stream} from {client} have no such value in the window"
 
     def _why_not(self, text: str) -> str:
         try:
             clients, _ = parse_subject(text)
         except ValueError:
-            return f"{text!r} is no subject: write car1, car1+car2, ~fleet, or with an element car1~north"
+            return f"{text!r} is not a subject: write car1, car1+car2 or ~fleet, or with an element car1~north"
         missing = [client for client in clients if client not in self._engine.clients]
         if missing:
-            return f"client {missing[0]} is not known: nothing came from it within clientTimeout"
+            return f"unknown client {missing[0]}: no sample arrived from it within clientTimeout"
         match self._run.rule.subject:
             case PairSubject() as pairs if len(clients) == 2:
-                return f"the pair is not within {pairs.within:g} m, or a place is unknown, or a role does not fit"
+                return f"the pair is not within {pairs.within:g} m, or a position is unknown, or a role does not match"
             case PairSubject():
                 return "the rule is about pairs: write car1+car2"
             case FleetSubject():
                 return "the rule is about the fleet: write ~fleet"
             case ClientSubject():
-                return "the rule is about single clients, and elements where it has `each`: write car1, or car1~north"
+                return (
+                    "the rule is about single clients, or their elements where it has `each`: write car1 or car1~north"
+                )
 
 
 def _plain(truth: Any) -> bool | None:

@@ -275,7 +275,7 @@ def _state(run: RuleRun, schedule: Schedule) -> tuple[RuleState, str]:
     if not run.rule.enabled:
         return RuleState.DISABLED, "enabled is false"
     if run.rule.name in schedule.paused:
-        return RuleState.PAUSED, "open episodes hold until it is resumed"
+        return RuleState.PAUSED, "open episodes are kept until it is resumed"
     if not run.rule.on_demand and (thinned := schedule.thinning(run.rule)) > 1:
-        return RuleState.DEGRADED, f"the machine is too slow: one of {thinned} evaluations takes place"
-    return RuleState.ACCEPTED, "dryRun: events are published, no action runs" if run.rule.dry_run else ""
+        return RuleState.DEGRADED, f"the machine is too slow: the rule is evaluated once in {thinned} times"
+    return RuleState.ACCEPTED, "dryRun: publishing events, running no action" if run.rule.dry_run else ""

@@ -30,7 +30,7 @@ class StatusServer:
             def do_GET(self) -> None:
                 page = pages.get(self.path.partition("?")[0])
                 if page is None:
-                    self._send(404, f"ask for one of {', '.join(pages)}\n".encode())
+                    self._send(404, f"unknown page; the pages are {', '.join(pages)}\n".encode())
                     return
                 well, text = page()
                 self._send(200 if well else 503, text)

@@ -60,8 +60,8 @@ def ask(
             if time.monotonic() + _PATIENCE >= end:
                 where = ", ".join(config.connect) or "the local network"
                 raise NoAnswerError(
-                    f"no detector {holder} answers at {where} within {timeout:g} s: is it running, and is this its "
-                    "Zenoh network? Give --connect ENDPOINT, e.g. tcp/127.0.0.1:7447"
+                    f"no response from detector {holder} at {where} within {timeout:g} s: is it running, "
+                    "and is this its Zenoh network? Give --connect ENDPOINT, e.g. tcp/127.0.0.1:7447"
                 )
             time.sleep(_PATIENCE)
 

@@ -102,7 +102,7 @@ class Renewal:
                 self._look()
         except Exception as error:  # noqa: BLE001  this thread's edge: certificates would expire unnoticed
             if not self._stop.is_set():
-                log.critical("certificates are not followed any more: %s", error)
+                log.critical("watching certificates failed; they are no longer renewed: %s", error)
                 self._on_failure(error)
 
     def _look(self) -> None:
@@ -123,7 +123,7 @@ class Renewal:
 
     def _tell(self, problem: str) -> None:
         if problem and problem != self.standing.problem and not self._stop.is_set():
-            log.warning("the new certificates or password are not used, the session of before goes on: %s", problem)
+            log.warning("cannot use the new certificates or password; keeping the current session: %s", problem)
         self.standing = Standing(self._member.material.expires, self.standing.renewals, problem)
 
     def _exchange(self, material: Material) -> None:
@@ -138,7 +138,7 @@ class Renewal:
             return
         self.standing = Standing(material.expires, self.standing.renewals + 1)
         until = "" if material.expires is None else f", until {time.strftime('%FT%TZ', time.gmtime(material.expires))}"
-        log.info("zenoh: the new certificates or password are in use%s", until)
+        log.info("zenoh: using the new certificates or password%s", until)
 
     def _take_over(self, material: Material) -> None:
         first = self._member
@@ -171,7 +171,7 @@ class Renewal:
     def _run_both(self, first: Membership, second: Membership) -> None:
         """Until both sessions are level. Raises NetworkError where nothing is given to the second one."""
         if first.connections.any and not second.await_somebody(self._stop, _AT_MOST):
-            raise NetworkError(f"zenoh: with them nobody is connected at {[*self._config.connect]}")
+            raise NetworkError(f"zenoh: with the new ones no connection to {[*self._config.connect]} is established")
         begin = time.monotonic()
         pairs = [*zip(self._inlets, second.subscriptions, strict=True)]
         while not self._stop.wait(_LOOK_AT_BOTH):
@@ -183,7 +183,9 @@ class Renewal:
             if elapsed >= _AT_LEAST and not any(inlet.waits for inlet in self._inlets):
                 break
         if not self._stop.is_set() and any(inlet.only_first for inlet in self._inlets):
-            raise NetworkError("zenoh: with them nothing is received: does the router allow the new name to subscribe?")
+            raise NetworkError(
+                "zenoh: with the new ones nothing is received: does the router permit the new name to subscribe?"
+            )
 
     def _reopen(self, material: Material) -> None:
         try:
@@ -220,7 +222,7 @@ class Renewal:
             inlet.follow(subscription)
         if self._tokens is not None and second.tokens is not None:
             self._tokens.follow(second.tokens, second.connections)
-        lost = "zenoh: the session was opened anew within %.1f s: what was sent meanwhile is lost"
+        lost = "zenoh: reopened the session within %.1f s: samples sent in the meantime are lost"
         log.warning(lost, time.monotonic() - began)
         if tried is not material and refused is not None:
             raise refused

@@ -41,13 +41,13 @@ def split(key: str) -> tuple[str, str]:
     domain, _, rest = key.partition("/")
     parts = rest.rsplit("/", 2)
     if len(parts) < 3 or not domain.isdecimal():
-        raise MisfitError(f"{key} does not read <domain>/<topic>/<type>/<type hash>")
+        raise MisfitError(f"{key} is not of the form <domain>/<topic>/<type>/<type hash>")
     topic, mangled, _ = parts
     names = mangled.replace("%", "/").replace("::", "/").split("/")
     if len(names) == 4 and names[2] == "dds_" and names[3].endswith("_"):
         names = [*names[:2], names[3][:-1]]
     if len(names) != 3 or not all(names):
-        raise MisfitError(f"{key} names no type: {mangled} does not read <package>::msg::dds_::<Type>_")
+        raise MisfitError(f"{key} names no type: {mangled} is not of the form <package>::msg::dds_::<Type>_")
     return topic, "/".join(names)
 
 
@@ -82,7 +82,7 @@ class Reader:
                 self._tally.add(Cause.MISFIT, self._stream, last=str(error))
                 return None
             if self._type not in (None, told):
-                misfit = f"{topic} is {told}, but the stream's type is {self._type}"
+                misfit = f"{topic} is of type {told}, but the type of the stream is {self._type}"
                 self._tally.add(Cause.MISFIT, self._stream, last=misfit)
                 return None
             if len(self._topics) >= _TOPICS:

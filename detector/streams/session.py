@@ -44,7 +44,8 @@ def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Sessi
         return zenoh.open(_settings(config, material_of(config) if material is None else material))
     except zenoh.ZError as error:
         raise NetworkError(
-            f"zenoh: no session as {config.mode} with connect {[*config.connect]}, listen {[*config.listen]}: {error}"
+            f"zenoh: cannot open a session as {config.mode} with connect {[*config.connect]}, listen "
+            f"{[*config.listen]}: {error}"
         ) from error
 
 
@@ -58,7 +59,7 @@ def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, 
         except NetworkError as error:
             if str(error) != said:
                 said = str(error)
-                log.warning("%s; trying on", error)
+                log.warning("%s; retrying", error)
         stop.wait(_RETRY_SECONDS[min(attempt, len(_RETRY_SECONDS) - 1)])
         attempt += 1
     return None
@@ -100,7 +101,7 @@ class Connections:
                 self._others.add(other)
                 if self._alone:
                     self._alone = False
-                    log.info("zenoh: connected again, to %s %s", role, other)
+                    log.info("zenoh: reconnected to %s %s", role, other)
                 return
             self._others.discard(other)
             if event.transport.whatami == zenoh.WhatAmI.ROUTER:
@@ -108,7 +109,7 @@ class Connections:
                 self.departures += 1
             if not self._others and not self._closing:
                 self._alone = True
-                log.warning("zenoh: the connection to %s %s is lost, nobody is connected; trying on", role, other)
+                log.warning("zenoh: lost the connection to %s %s, and no other is left; reconnecting", role, other)
 
 
 def _settings(config: Zenoh, material: Material) -> zenoh.Config:

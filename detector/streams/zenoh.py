@@ -117,7 +117,7 @@ class Network:
         if errors:
             raise NetworkError(f"{selector}: {errors[0]}")
         if not answers:
-            raise NetworkError(f"{selector}: nobody answered within {timeout:g} s")
+            raise NetworkError(f"{selector}: no response within {timeout:g} s")
         return answers
 
     @property
@@ -177,7 +177,7 @@ class Network:
             self._tokens.close(timeout)
         if (left := len(self._events)) > 0:
             self.dropped_events += left
-            log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
+            log.warning("%d events were not published: the network did not accept them within %g s", left, timeout)
 
     def _join(self, session: zenoh.Session, material: Material) -> Membership:
         return Membership(session, material, self._streams, self._config.liveliness, self._tally)
@@ -218,14 +218,14 @@ class Network:
             pump(inlet.bursts())
         except Exception as error:  # noqa: BLE001  this thread's edge: without it, the stream would be silent for ever
             if not self._stop.is_set():
-                log.critical("a stream's thread ended, nothing is received on it any more: %s", error)
+                log.critical("the thread of a stream ended; receiving from it has stopped: %s", error)
                 self._on_failure(error)
 
     def _run(self) -> None:
         try:
             self._serve()
         except Exception as error:  # noqa: BLE001  this thread's edge: without it, events would wait for ever
-            log.critical("the network thread ended, no event is published any more: %s", error)
+            log.critical("the network thread ended; publishing events has stopped: %s", error)
             self._on_failure(error)
 
     def _serve(self) -> None:
@@ -260,7 +260,7 @@ class Network:
             except zenoh.ZError as error:
                 before, member = member, self._successor(member)
                 if member is before:
-                    log.warning("event on %s was not published: %s", key, error)
+                    log.warning("cannot publish the event on %s: %s", key, error)
                     break
         self.dropped_events += 1
 

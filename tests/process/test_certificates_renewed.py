@@ -138,9 +138,9 @@ def test_a_certificate_that_the_router_does_not_take_leaves_the_session_alone(
         stranger = Authority(tmp_path, "stranger").sign("detector")
         foreign = {"tls.crt": stranger[0].read_bytes(), "tls.key": stranger[1].read_bytes()}
         authority.change(mounted, foreign)
-        wait_for(lambda: "no session as client" in running.standing.problem)
+        wait_for(lambda: "cannot open a session as client" in running.standing.problem)
         authority.change(mounted, {"tls.crt": b"nonsense", "tls.key": foreign["tls.key"]})
-        wait_for(lambda: "are no certificate and key" in running.standing.problem)
+        wait_for(lambda: "are not a certificate and a key" in running.standing.problem)
         authority.change(mounted, foreign | {"tls.key": authority.sign("other")[1].read_bytes()})
         wait_for(lambda: "is not the key of" in running.standing.problem)
         authority.mount(mounted, "detector", lasting=datetime.timedelta(seconds=-60))
@@ -148,7 +148,7 @@ def test_a_certificate_that_the_router_does_not_take_leaves_the_session_alone(
         assert running.standing.renewals == 0
         before = len(arrivals.seen)
         wait_for(lambda: len(arrivals.seen) > before + 10)
-        assert "the session of before goes on" in caplog.text
+        assert "keeping the current session" in caplog.text
         assert "PRIVATE KEY" not in caplog.text
         authority.mount(mounted, "detector", lasting=datetime.timedelta(days=30))
         wait_for(lambda: running.standing.renewals == 1)
@@ -238,9 +238,9 @@ def test_a_detector_that_listens_opens_its_session_anew_and_stays_as_it_was_with
             wait_for(is_renewed)
             before = len(arrivals.seen)
             wait_for(lambda: len(arrivals.seen) > before + 10)
-            assert "what was sent meanwhile is lost" in caplog.text
+            assert "samples sent in the meantime are lost" in caplog.text
             authority.change(mounted, {"tls.crt": b"nonsense", "tls.key": b"nonsense"})
-            wait_for(lambda: "are no certificate and key" in running.standing.problem)
+            wait_for(lambda: "are not a certificate and a key" in running.standing.problem)
             before = len(arrivals.seen)
             wait_for(lambda: len(arrivals.seen) > before + 10)
         for car in CARS:
@@ -258,7 +258,7 @@ def test_a_router_that_is_away_does_not_keep_a_renewal_from_coming_later(
             wait_for(lambda: running.connected)
         wait_for(lambda: not running.connected)
         authority.mount(mounted, "detector")
-        wait_for(lambda: "no session as client" in running.standing.problem)
+        wait_for(lambda: "cannot open a session as client" in running.standing.problem)
         assert running.dead is None
         with guarded_router(at, authority) as source:
 

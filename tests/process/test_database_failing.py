@@ -174,7 +174,7 @@ def test_open_episodes_say_that_the_database_is_away(desk: MakeDesk, way: Way) -
     def told(away: bool) -> bool:
         keep.take(episode, speeds(1000))
         last = keep.last()
-        return last is not None and last.message.startswith("the database is away") is away
+        return last is not None and last.message.startswith("the database is unavailable") is away
 
     wait_until(lambda: told(True))
     way.restore()

@@ -115,7 +115,7 @@ def test_a_folder_that_cannot_be_written_is_said_and_costs_only_the_keeping(tmp_
         Journal(tmp_path / "notify", "j")
     with endpoint() as there:
         desk = a_desk({"http": {"url": there.url}}, state=tmp_path)
-        assert desk.lost["events that would not survive the detector's end"] == 1
+        assert desk.lost["events that would not survive a restart"] == 1
         desk.end()
 
 

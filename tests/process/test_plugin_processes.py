@@ -79,7 +79,7 @@ def test_one_that_ends_is_told_and_the_others_go_on(host: ProcessHost) -> None:
     assert drive.take(until=6) == ["z a started 5"]
     counters = drive.engine.counters.rule("r")
     assert counters.errors == 1
-    assert counters.last_error.startswith("signal p: plugin counting: its process ended by itself; it is stopped")
+    assert counters.last_error.startswith("signal p: plugin counting: its process exited; stopped")
     assert counters.unknowns == 3 + 4  # the signal's, and those of the condition
 
 
@@ -94,7 +94,7 @@ def test_one_that_hangs_is_stopped_and_told(caplog: pytest.LogCaptureFixture) ->
         assert drive.take(until=4) == ["z a started 3"]
         assert process is not None
         assert process.returncode is not None
-        assert "its process gave no value in time; it is stopped" in caplog.text
+        assert "its process did not return a value in time; stopped" in caplog.text
         assert "EventRule r, signal p, plugin counting" in caplog.text
 
 

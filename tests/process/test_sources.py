@@ -216,19 +216,19 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
             )
 
     asyncio.run(live())
-    assert "is not followed, the last good one goes on: spec.sources[0].plugin: no plugin unknown" in caplog.text
+    assert "keeping the last good one: spec.sources[0].plugin: no plugin unknown" in caplog.text
 
 
 @pytest.mark.parametrize(
     ("source", "problem"),
     [
-        ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed here; did you mean once?"),
+        ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed; did you mean once?"),
         (
             {"plugin": "unmet"},
             "spec.sources[0].plugin: plugin unmet cannot be loaded: ModuleNotFoundError: No module named",
         ),
         ({"plugin": "absent"}, "spec.sources[0].plugin: plugin absent cannot be loaded: AttributeError"),
-        ({"plugin": "noparameters"}, "which is no complete detector.sources.base.Source"),
+        ({"plugin": "noparameters"}, "which is not a complete detector.sources.base.Source"),
         (
             {"plugin": "unfinished"},
             "spec.sources[0].plugin: plugin unfinished: give tests.process.test_sources:Unfinished a",

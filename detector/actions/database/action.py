@@ -160,7 +160,7 @@ class Database(Action[DatabaseAction]):
         if self._store.put(write, self.setting.closing):
             return
         open_ones = {each.scenario.id: each.scenario for each in self._writings.values()}
-        why = "no room in the queue" if not self._store.away else "no room while the database is away"
+        why = "the queue is full" if not self._store.away else "the queue is full while the database is unavailable"
         for name, count in batch.owners.items():
             if name in open_ones:  # else it failed meanwhile
                 self._lose(open_ones[name], count, why)
@@ -218,7 +218,7 @@ class Database(Action[DatabaseAction]):
         if bool(away) != self._told_away:
             self._told_away = bool(away)
             for writing in self._writings.values():
-                self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is away: {away}")
+                self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is unavailable: {away}")
 
     def close(self) -> None:
         """Let go of the queue; the last action that does waits for it, a few seconds."""

@@ -115,7 +115,7 @@ class Documents:
             made = encoded(document)
             if len(made) <= LARGEST:
                 return Made(collection, made, files, undecoded=undecoded)
-            reason = f"it would be a document of {len(made)} bytes, and MongoDB takes {LARGEST}"
+            reason = f"the document would have {len(made)} bytes; MongoDB accepts at most {LARGEST}"
         except UnfitError as error:
             reason = str(error)
         document.pop("msg", None)

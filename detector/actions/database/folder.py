@@ -37,7 +37,7 @@ class Folder:
         except OSError as error:
             with suppress(OSError):
                 unfinished.unlink(missing_ok=True)
-            raise FolderError(f"a file could not be written: {error.strerror or type(error).__name__}") from None
+            raise FolderError(f"cannot write a file: {error.strerror or type(error).__name__}") from None
         self._used += len(attachment.content)
 
 

@@ -42,9 +42,9 @@ class Queue:
         self.damaged = False
         """Something in the spool could not be read in this run."""
         if spool is not None and spool.damaged:
-            lose("bytes of the database's spool", spool.damaged, "a crash or the disk damaged them")
+            lose("bytes of the database's spool", spool.damaged, "corrupted by a crash or by the disk")
         if spool is not None and spool.records:
-            _log.info("database: %d requests of an earlier run wait in the spool", spool.records)
+            _log.info("database: the spool holds %d requests of an earlier run", spool.records)
 
     @property
     def inherited(self) -> bool:
@@ -107,7 +107,9 @@ class Queue:
                 self.full = not self._move(self._spool)
             except OSError as error:
                 if not self.full:
-                    _log.warning("database: the spool takes nothing more: %s", error.strerror or type(error).__name__)
+                    _log.warning(
+                        "database: the spool accepts no more requests: %s", error.strerror or type(error).__name__
+                    )
                 self.full = True
 
     def _move(self, spool: Spool) -> bool:

@@ -164,13 +164,13 @@ def why_incomplete(scenario: Scenario, episode: Episode | None, completion: Comp
     """Why not all of it is there; empty where it is. Without the episode, another scenario follows."""
     reasons = [f"{count} lost: {reason}" for reason, count in sorted(scenario.lost.items())]
     if completion.missing:
-        reasons.append(f"{completion.missing} lost: the samples came faster than they could be taken")
+        reasons.append(f"{completion.missing} lost: the samples arrived faster than the action could process them")
     if completion.cut:
         reasons.append(completion.cut)
     if scenario.resumed:
-        reasons.append("the beginning was seen by an earlier run of the detector")
+        reasons.append("an earlier run of the detector saw the start of the episode")
     if episode is not None and episode.end_time is None and not completion.cut:
-        reasons.append("its end was not seen")
+        reasons.append("this run did not see its end")
     return "; ".join(reasons)
 
 

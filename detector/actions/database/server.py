@@ -161,7 +161,7 @@ class Server:
             try:
                 collection.create_index("scenario")  # what everybody asks for
             except OperationFailure as error:  # it goes without
-                _log.warning("database: no index on %s: %s", write.collection, self._short(error))
+                _log.warning("database: cannot create the index on %s: %s", write.collection, self._short(error))
             self._indexed.add((write.database, write.collection))
         collection.insert_many([RawBSONDocument(document) for document in write.documents], ordered=False)
         return len(write.documents), []
@@ -183,7 +183,7 @@ class Server:
         Raises UnavailableError where the rest is not safe yet, or another detector made the same at the same time.
         """
         if not inserting and any(_there_already(each) for each in details.get("writeErrors", ())):
-            raise UnavailableError("somebody else makes the same document")
+            raise UnavailableError("another client is writing the same document")
         refused = [
             Refused(int(each["index"]), self.redact(each.get("errmsg", "")))
             for each in details.get("writeErrors", ())
@@ -191,7 +191,7 @@ class Server:
         ]
         concerns: Sequence[Mapping[str, Any]] = details.get("writeConcernErrors", ())
         if concerns:
-            raise UnavailableError(self.redact(concerns[0].get("errmsg", "the write concern is not met")))
+            raise UnavailableError(self.redact(concerns[0].get("errmsg", "the write concern is not satisfied")))
         return refused
 
     def _short(self, error: PyMongoError) -> str:

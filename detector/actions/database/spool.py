@@ -45,10 +45,10 @@ class Spool:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._lock.close()
-            raise SpoolError(f"the spool {folder} is used by another process: give each detector its own") from None
+            raise SpoolError(f"another process uses the spool {folder}: give each detector its own") from None
         except OSError as error:
             reason = error.strerror or type(error).__name__
-            raise SpoolError(f"the spool {folder} cannot be used: {reason}: correct its path") from None
+            raise SpoolError(f"cannot use the spool {folder}: {reason}: correct its path") from None
         self._tail: int | None = None
         self.damaged = 0
         """Bytes of an earlier run's segments that could not be read."""
@@ -61,7 +61,7 @@ class Spool:
             self._take_stock()
         except OSError as error:
             self.close()
-            raise SpoolError(f"{error.filename} in the spool cannot be read: {error.strerror}: remove it") from None
+            raise SpoolError(f"cannot read {error.filename} in the spool: {error.strerror}: remove it") from None
 
     def _take_stock(self) -> None:
         for segment in self._segments:

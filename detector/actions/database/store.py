@@ -134,8 +134,8 @@ class Store:
                 if self._send(write) and not self._left:
                     self._queue.done()
             except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue goes on, since doing twice is doing once
-                self._lose("times the database's queue had to begin anew", 1, self._server.redact(error))
-                _log.error("database: the queue begins anew: %s", type(error).__name__)
+                self._lose("times the database queue was restarted", 1, self._server.redact(error))
+                _log.error("database: restarting the queue: %s", type(error).__name__)
                 _log.debug("in the queue", exc_info=error)
                 time.sleep(_ANEW)
         self._leave()
@@ -170,7 +170,7 @@ class Store:
                 self._note_away(str(error))
                 broke = broke + 1 if error.broke and self._server.answers() else 0
                 if broke >= patience:
-                    return self._divide(write, "the server ends the connection when it gets it")
+                    return self._divide(write, "the server closes the connection when it receives it")
                 if error.broke and broke:
                     pause = 0.05  # it is there
                 if not self._pause(pause * random.uniform(0.7, 1.3)):  # noqa: S311  no secret
@@ -202,12 +202,12 @@ class Store:
         """
         lose = write.losing or self._lost_earlier
         if not write.documents:
-            lose(1, f"the database refused a change of {write.collection}: {why}")
+            lose(1, f"the database rejected a change of {write.collection}: {why}")
             return True
         scenario = bson.decode(write.documents[index]).get("scenario", "")
         if not self._send(scenarios.reject(write.database, scenario, why)):
             return False
-        lose(1, f"the database refused it: {why}")
+        lose(1, f"the database rejected it: {why}")
         return True
 
     def _lost_earlier(self, count: int, why: str) -> None:
@@ -216,7 +216,7 @@ class Store:
     def _confirm(self, write: Write, matched: int, why: str) -> None:
         confirm = self._confirms.pop(write.completes, None)
         if confirm is not None:
-            confirm(bool(matched) and not why, why or "the database refused some of it")
+            confirm(bool(matched) and not why, why or "the database rejected some of it")
 
     def _pause(self, seconds: float) -> bool:
         """Wait before the next attempt; what comes meanwhile goes to the disk. False where there is no more time."""
@@ -238,22 +238,24 @@ class Store:
         for write in self._queue.close():
             if write.documents:
                 lose = write.losing or self._lost_earlier
-                lose(len(write.documents), "the detector ended before it was written")
+                lose(len(write.documents), "the detector stopped before it was written")
         confirms, self._confirms = self._confirms, {}
         for confirm in confirms.values():
             confirm(False, self._end_text())
 
     def _end_text(self) -> str:
-        where = "what is not written waits in the spool" if self._spooling else "there is no spool"
-        return f"the detector ended before the database had it ({self._away or 'it was busy'}); {where}"
+        where = "unwritten requests stay in the spool" if self._spooling else "there is no spool"
+        return f"the detector stopped before the database stored it ({self._away or 'it was busy'}); {where}"
 
     def _note_away(self, why: str) -> None:
         if not self._away:
-            where = "waits in the spool on disk" if self._spooling else "waits in memory: there is no spool"
-            _log.warning("database: cannot be written to: %s; what comes %s", why, where)
+            where = (
+                "is queued in the spool on disk" if self._spooling else "is queued in memory, because there is no spool"
+            )
+            _log.warning("database: cannot write: %s; new data %s", why, where)
         self._away = why
 
     def _note_back(self) -> None:
         if self._away:
-            _log.info("database: can be written to again; %d bytes wait", self.waiting)
+            _log.info("database: writing again; %d bytes are queued", self.waiting)
             self._away = ""

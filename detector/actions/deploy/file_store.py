@@ -52,7 +52,7 @@ class FileTaskStore:
                 snapshot = await self._run(self._folder.look)
             except StoreUnavailableError as error:
                 if not away:
-                    _log.warning("cannot read the tasks in %s, and try again until I can: %s", self._folder.path, error)
+                    _log.warning("cannot read the tasks in %s; retrying with backoff: %s", self._folder.path, error)
                 away = True
             else:
                 away = False
@@ -143,9 +143,9 @@ class _Folder:
     def change(self, name: str, field: str, value: JsonValue) -> StoredTask:
         stored = self.look().tasks.get(name)
         if stored is None:
-            raise TaskRefusedError("NotFound", f"{self._file(name)} is gone, or somebody else's")
+            raise TaskRefusedError("NotFound", f"{self._file(name)} does not exist, or belongs to another holder")
         if not stored.live:
-            raise TaskRefusedError("Ended", f"{self._file(name)} has ended: a demand that ended does not come back")
+            raise TaskRefusedError("Ended", f"{self._file(name)} has ended: an ended task cannot become active again")
         spec = stored.task.spec.model_copy(update={field: value})
         return self._write(stored.task.model_copy(update={"spec": spec}))
 
@@ -163,7 +163,7 @@ class _Folder:
         except FileNotFoundError:
             return None
         except (yaml.YAMLError, ValidationError, UnicodeDecodeError) as error:
-            _log.warning("%s is left alone, since it is no ApplicationTask: %s", file, error)
+            _log.warning("ignoring %s, which is not an ApplicationTask: %s", file, error)
             return None
         return StoredTask(task, self._next()) if belongs_to(task, self._holder) else None
 

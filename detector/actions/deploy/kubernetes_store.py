@@ -104,7 +104,7 @@ class KubernetesTaskStore:
             name = obj["metadata"]["name"]
             if name not in self._unreadable:
                 self._unreadable.add(name)
-                _log.warning("the ApplicationTask %s is left alone, since it cannot be read: %s", name, error)
+                _log.warning("ignoring the ApplicationTask %s, which cannot be read: %s", name, error)
             return None
         return stored if belongs_to(stored.task, self._holder) else None
 
@@ -127,4 +127,4 @@ def _store_errors() -> Iterator[None]:
     except ApiError as error:
         raise TaskRefusedError(error.reason, str(error)) from error
     except ValidationError as error:
-        raise TaskRefusedError("Unreadable", f"the stored ApplicationTask cannot be read: {error}") from error
+        raise TaskRefusedError("Unreadable", f"cannot read the stored ApplicationTask: {error}") from error

@@ -124,7 +124,7 @@ class HolderLease:
                 self._backoff.succeed()
             except ApiError as error:
                 if not self._backoff.failures:
-                    _log.warning("cannot renew the Lease %s, and try again until I can: %s", self.name, error)
+                    _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
                 self.failures += 1
                 delay = self._backoff.fail()
             with suppress(TimeoutError):
@@ -191,17 +191,21 @@ class HolderLease:
         if self.held.is_set():
             self.held.clear()
             _log.error(
-                "the process %s has taken over the Lease %s while this one did not renew it; this one (%s) emits no "
-                "more tasks until it holds the Lease again",
+                (
+                    "process %s took over the Lease %s, because this process (%s) did not renew it; it creates "
+                    "no more tasks until it holds the Lease again"
+                ),
                 holder,
                 self.name,
                 self._identity.text,
             )
         elif holder != self._refused_by:
             _log.warning(
-                "the Lease %s is held by %s: either another detector of the same name runs (stop one of them, or name "
-                "them differently), or it has just been killed; this one (%s) emits no tasks until the Lease has not "
-                "been renewed for %g s",
+                (
+                    "the Lease %s is held by %s: either another detector with the same name is running (stop "
+                    "or rename one of them), or that process has just been killed; this process (%s) creates "
+                    "no tasks until the Lease has not been renewed for %g s"
+                ),
                 self.name,
                 holder,
                 self._identity.text,

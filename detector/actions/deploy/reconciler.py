@@ -130,7 +130,7 @@ class DemandReconciler:
                 async with asyncio.timeout(self._deadline if self._may_change() else 0.0):
                     await self._queue.empty()
             if self.pending:
-                _log.warning("%d tasks are not yet as demanded: the next start makes good", self.pending)
+                _log.warning("%d tasks are not reconciled yet; the next start completes them", self.pending)
             for task in working:
                 task.cancel()
 
@@ -212,21 +212,21 @@ class DemandReconciler:
         try:
             task = to_task(demand) if self._traces is None else self._traces.task(demand, to_task(demand))
         except ValueError as error:
-            raise TaskRefusedError("Invalid", f"the demand makes no ApplicationTask: {error}") from error
+            raise TaskRefusedError("Invalid", f"cannot make an ApplicationTask of the demand: {error}") from error
         deleted = name in self._ledger.held
         try:
             self._ledger.put(name, await self._store.create(task))
         except TaskExistsError as error:
             found = await self._store.get(name)
             if found is None or found.leaving:
-                why = "it is being deleted" if found else "it is not this holder's"
-                raise TaskRefusedError("AlreadyExists", f"the name is taken, and {why}: {error}") from error
+                why = "it is being deleted" if found else "it belongs to another holder"
+                raise TaskRefusedError("AlreadyExists", f"the name is already in use ({why}): {error}") from error
             self._ledger.put(name, found)
             self.counts.adopted += 1
         else:
             if deleted:
                 self.counts.recreated += 1
-                _log.info("created the task %s again, since somebody deleted it", name)
+                _log.info("recreated the task %s, which another client deleted", name)
             else:
                 self.counts.created += 1
             if self._traces is not None and not deleted:
@@ -246,11 +246,11 @@ class DemandReconciler:
             self._ledger.put(name, await self._store.set_parameters(stored, plain(demand.parameters)))
             self.counts.patched += 1
             if self._ledger.next(name) is Step.SET_PARAMETERS:
-                raise TaskRefusedError("Altered", "the store changed the parameters that it was given")
+                raise TaskRefusedError("Altered", "the store changed the parameters that it received")
 
     def _unavailable(self, error: StoreUnavailableError) -> None:
         if not self._away.failures:
-            _log.warning("tasks cannot be changed now, and are as soon as possible: %s", error)
+            _log.warning("cannot update tasks; retrying with backoff: %s", error)
         self._reachable.clear()
         self._pause = self._away.fail(error.retry_after)
 
@@ -258,7 +258,12 @@ class DemandReconciler:
         self.counts.refused[error.reason] += 1
         if (step, error.reason) not in self._said:
             self._said.add((step, error.reason))
-            _log.error("cannot %s the task %s (others alike are only counted): %s", step.value, name, error)
+            _log.error(
+                "cannot %s the task %s (further failures of this kind are counted, not logged): %s",
+                step.value,
+                name,
+                error,
+            )
 
 
 def _same(one: StoredTask | None, other: StoredTask) -> bool:

@@ -105,7 +105,7 @@ async def restore(store: TaskStore) -> list[Demand]:
         async for change in changes:
             if isinstance(change, Snapshot):
                 return live_demands(change)
-    raise AssertionError("a store's changes never end")
+    raise AssertionError("the stream of a store's changes ended")
 
 
 def live_demands(snapshot: Snapshot) -> list[Demand]:

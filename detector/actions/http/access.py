@@ -38,7 +38,9 @@ def read_headers(access: HttpAccess, field: str) -> Headers:
         at = f"{field}.headers[{index}]"
         value = _value(header, at)
         if any(character in value for character in "\r\n\0"):
-            raise AccessError(f"{at}: the value has line breaks, which no header can have: write it in one line")
+            raise AccessError(
+                f"{at}: the value has line breaks, which an HTTP header cannot have: write it in one line"
+            )
         values[header.name] = value
         if header.value is None and value:
             secrets += [value, *(part for part in value.split() if len(part) >= 4)]
@@ -92,5 +94,5 @@ def _context(files: TlsFiles | None, field: str) -> ssl.SSLContext:
             context.load_cert_chain(str(files.certificate), str(files.key))
     except (ssl.SSLError, OSError) as error:
         places = ", ".join(str(path) for path in (files.ca, files.certificate, files.key) if isinstance(path, Path))
-        raise AccessError(f"{field}: no certificates can be read from {places}: give files in PEM format") from error
+        raise AccessError(f"{field}: cannot read certificates from {places}: give files in PEM format") from error
     return context

@@ -112,7 +112,7 @@ async def _watched(exchange: _Exchange, give_up: Callable[[], bool]) -> Answer:
     try:
         while not task.done():
             if give_up():
-                raise HttpError(f"{exchange.where}: given up before it answered, since the detector ends")
+                raise HttpError(f"{exchange.where}: aborted before it answered, because the detector is stopping")
             await asyncio.wait({task}, timeout=_LOOK)
         return task.result()
     finally:
@@ -193,17 +193,17 @@ def _why(error: Exception) -> str:
     match error:
         case aiohttp.ClientConnectorCertificateError():
             found = error.certificate_error
-            return f"its certificate is not accepted: {getattr(found, 'verify_message', '') or found}"
+            return f"its certificate is not trusted: {getattr(found, 'verify_message', '') or found}"
         case aiohttp.ClientConnectorDNSError():
-            return f"the name cannot be looked up: {error.os_error.strerror or error.os_error}"
+            return f"cannot resolve the host name: {error.os_error.strerror or error.os_error}"
         case aiohttp.ClientConnectorSSLError():
-            return f"TLS fails: {getattr(error.os_error, 'reason', None) or 'it speaks another protocol'}"
+            return f"TLS handshake failed: {getattr(error.os_error, 'reason', None) or 'it speaks another protocol'}"
         case aiohttp.ClientConnectorError():
-            return f"cannot be reached: {error.os_error.strerror or error.os_error}"
+            return f"cannot connect: {error.os_error.strerror or error.os_error}"
         case aiohttp.ServerDisconnectedError():
-            return "it hung up without an answer"
+            return "it closed the connection without a response"
         case aiohttp.ClientResponseError():
-            return "its answer is no HTTP"
+            return "its response is not HTTP"
         case OSError():
             return f"the connection broke: {error.strerror or type(error).__name__}"
         case _:

@@ -27,7 +27,7 @@ class Resolver(AbstractResolver):
             try:
                 answer: list[ResolveResult] | OSError = _addresses(host, port, family)
             except (OSError, UnicodeError) as error:
-                answer = error if isinstance(error, OSError) else OSError(f"{host!r} is no host's name")
+                answer = error if isinstance(error, OSError) else OSError(f"{host!r} is not a host name")
             try:
                 loop.call_soon_threadsafe(_settle, found, answer)
             except RuntimeError:  # the loop is closed: nobody waits any more

@@ -148,4 +148,4 @@ def _target(parameters: api.Notify, setting: Setting, field: str) -> Target:
         return HttpTarget(parameters.http, f"{field}.http")
     if parameters.zenoh is not None:
         return ZenohTarget(parameters.zenoh, setting.messenger)
-    raise ValueError("the model lets nothing through without a target")
+    raise ValueError("the model requires a target")

@@ -63,7 +63,7 @@ class AlertDesk:
         """What came of a request."""
         told, given_up = self._alerts.settle(sent, delivery, now)
         if delivery.fate is Fate.REFUSED:
-            self._setting.lose("times that alerts were refused", len(sent.alerts), delivery.why)
+            self._setting.lose("alerts rejected by the Alertmanager", len(sent.alerts), delivery.why)
         for alert in given_up:
             self._lose(alert, delivery.why)
         for alert in told:
@@ -78,7 +78,11 @@ class AlertDesk:
         """The end. What was not heard is lost. What still fires lapses, or goes on after the next start."""
         for alert in self._alerts.leave():
             if alert.heard and alert.ends_at is None:
-                self._report(alert, OutcomeState.DONE, "it had not ended: its alert lapses, or the next start goes on")
+                self._report(
+                    alert,
+                    OutcomeState.DONE,
+                    "the episode had not ended: its alert expires, unless the next start takes it up",
+                )
             else:
                 self._lose(alert, UNTOLD)
 
@@ -86,8 +90,11 @@ class AlertDesk:
         if alert.heard or alert.attempts == 1:
             self._report(alert, OutcomeState.DONE, "")
         else:
-            why = "it was heard of only when it was over, after failures: an Alertmanager tells nobody of such alerts"
-            self._setting.lose("alerts that nobody heard of", 1, why)
+            why = (
+                "it was accepted only after the episode had ended, because of failures: an Alertmanager "
+                "notifies nobody of such alerts"
+            )
+            self._setting.lose("alerts that reached nobody", 1, why)
             self._report(alert, OutcomeState.FAILED, why)
         self._episodes.pop(alert.episode, None)
 

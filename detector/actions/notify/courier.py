@@ -74,7 +74,7 @@ class Courier(Generic[T]):
             try:
                 delivery = self._send(parcel, self._over)
             except Exception as error:  # noqa: BLE001  a message that cannot be sent ends no thread
-                _log.error("a notification could not be sent", exc_info=error)
+                _log.error("cannot send a notification", exc_info=error)
                 delivery = Delivery(Fate.AGAIN, f"{type(error).__name__}: {error}")
             with self._changed:
                 self._desk.settle(parcel, delivery, time.monotonic())

@@ -15,8 +15,8 @@ from detector.actions.notify.outbox import Budget, Delivery, Fate, Message, Outb
 from detector.actions.notify.targets import encoded
 from wayside.api.actions.notify import Notify
 
-UNTOLD = "the detector ended, or the rule no longer has this action, before it was delivered"
-FULL = "more messages wait than the rule allows (waiting)"
+UNTOLD = "the detector stopped, or the action was removed from the rule, before it was delivered"
+FULL = "the queue is full (waiting)"
 
 
 class EventDesk:

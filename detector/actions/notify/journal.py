@@ -54,9 +54,9 @@ class Journal:
                     taken.append((path, file))
                     self._read(file)
         except OSError as error:
-            raise JournalError(f"{folder} cannot be written ({error.strerror})") from error
+            raise JournalError(f"cannot write {folder} ({error.strerror})") from error
         if not taken:
-            raise JournalError(f"{folder} has {_FILES} journals of {name} in use")
+            raise JournalError(f"{folder} already has {_FILES} journals of {name} in use")
         self._path, self._file = taken[0]
         try:
             self._rewrite()
@@ -64,7 +64,7 @@ class Journal:
                 path.unlink()
                 file.close()
         except OSError as error:
-            raise JournalError(f"{folder} cannot be written ({error.strerror})") from error
+            raise JournalError(f"cannot write {folder} ({error.strerror})") from error
 
     def put(self, key: str, document: Mapping[str, Any]) -> None:
         """Keep a document. Raises OSError where the disk refuses; it is then not kept."""

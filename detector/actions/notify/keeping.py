@@ -23,8 +23,8 @@ _log = logging.getLogger(__name__)
 FOLDER = "notify"
 """In the folder of `spec.state`."""
 _NOTICE, _OPEN = "notice/", "open/"
-_LOST = "events that nobody was told of"
-_UNKEPT = "events that would not survive the detector's end"
+_LOST = "events not delivered to any target"
+_UNKEPT = "events that would not survive a restart"
 
 
 class Keeping:
@@ -47,11 +47,13 @@ class Keeping:
         try:
             self._journal = Journal(folder, name)
         except JournalError as error:
-            _log.error("what action %s of EventRule %s has to tell is not kept: %s", *whose[:1:-1], error)
+            _log.error("the events of action %s of EventRule %s are not kept on disk: %s", *whose[:1:-1], error)
             setting.lose(_UNKEPT, 1, str(error))
             return
         if self._journal.unreadable:
-            setting.lose("lines of the journal that could not be read", self._journal.unreadable, "no JSON of ours")
+            setting.lose(
+                "lines of the journal that could not be read", self._journal.unreadable, "not JSON of this format"
+            )
 
     def waiting(self) -> list[Notice]:
         """What earlier runs did not tell, oldest first."""
@@ -60,7 +62,7 @@ class Keeping:
             try:
                 found.append(notice_from(document))
             except (KeyError, TypeError, ValueError, AttributeError) as error:
-                self._setting.lose(_LOST, 1, f"the journal's entry cannot be read: {type(error).__name__}")
+                self._setting.lose(_LOST, 1, f"cannot read the entry of the journal: {type(error).__name__}")
                 self._drop([key])
         return found
 
@@ -113,7 +115,7 @@ class Keeping:
             }
             try:
                 if self._letters is None:
-                    _log.error("nobody was told of event %s: %s", notice.id, why)
+                    _log.error("event %s was not delivered to any target: %s", notice.id, why)
                 else:
                     self._letters.write(letter)
             except (OSError, ValueError) as error:
@@ -127,7 +129,7 @@ class Keeping:
             try:
                 self._journal.close()
             except OSError as error:
-                _log.error("the journal of action %s cannot be closed: %s", self._setting.action, error)
+                _log.error("cannot close the journal of action %s: %s", self._setting.action, error)
 
     def _kept(self, prefix: str) -> Mapping[str, dict[str, Any]]:
         live = {} if self._journal is None else self._journal.live
@@ -147,4 +149,4 @@ class Keeping:
         try:
             self._journal.drop(keys)
         except OSError as error:
-            self._setting.lose("entries of the journal that could not be dropped", len(keys), str(error))
+            self._setting.lose("journal entries that could not be dropped", len(keys), str(error))

@@ -65,7 +65,7 @@ class Ledger:
     def kept(self, episode: str) -> None:
         """One is left to the next start of the detector."""
         entry = self._entry(episode)
-        self._tell(entry, OutcomeState.RUNNING, "not delivered yet: it is tried again after the detector's next start")
+        self._tell(entry, OutcomeState.RUNNING, "not delivered yet: the detector retries after its next start")
 
     def failed(self, episode: str, why: str) -> None:
         """One was given up."""
@@ -88,7 +88,7 @@ class Ledger:
         if entry.failures:
             self._tell(entry, OutcomeState.FAILED, "not delivered: " + "; ".join(dict.fromkeys(entry.failures)))
         else:
-            self._tell(entry, OutcomeState.DONE, "" if entry.delivered else "there was nothing to tell of it")
+            self._tell(entry, OutcomeState.DONE, "" if entry.delivered else "there was nothing to send")
 
     def _tell(self, entry: _Entry, state: OutcomeState, message: str) -> None:
         if entry.episode is None:

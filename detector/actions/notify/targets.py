@@ -88,7 +88,7 @@ class HttpTarget:
         try:
             headers, body = structured(event) if self._http.mode is ContentMode.STRUCTURED else binary(event)
         except ValueError as error:
-            return Delivery(Fate.REFUSED, f"the event cannot be sent as JSON: {error}")
+            return Delivery(Fate.REFUSED, f"cannot send the event as JSON: {error}")
         try:
             url = self._url()
         except AccessError as error:
@@ -102,7 +102,7 @@ class HttpTarget:
         at = f"{self._field}.urlSecret"
         url = secret_text(secret.name, secret.key, at).strip()
         if not url.startswith(("http://", "https://")):
-            raise AccessError(f"{at}: what the Secret {secret.name} holds is no URL: write https://… there")
+            raise AccessError(f"{at}: the content of the Secret {secret.name} is not a URL: write https://… there")
         return url
 
 
@@ -117,5 +117,5 @@ class ZenohTarget:
         try:
             self._messenger.publish(self._key, encoded(event), STRUCTURED)
         except ValueError as error:
-            return Delivery(Fate.REFUSED, f"the event cannot be sent as JSON: {error}")
+            return Delivery(Fate.REFUSED, f"cannot send the event as JSON: {error}")
         return Delivery(Fate.DELIVERED)

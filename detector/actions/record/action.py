@@ -63,7 +63,7 @@ class Record(Action[api.Record]):
                 renew_after=None if renew is None else renew.ns,
             )
         except (NoRoomError, OSError) as error:
-            raise ActionError(f"the recording cannot begin: {reason(error)}") from error
+            raise ActionError(f"cannot start the recording: {reason(error)}") from error
         self._open[episode.id] = _Open(series, episode, time.monotonic())
         self.setting.report(episode, Outcome(OutcomeState.RUNNING, series.problem))
 
@@ -105,7 +105,7 @@ class Record(Action[api.Record]):
     def close(self) -> None:
         """Completes what is still open, marked as cut."""
         for current in [*self._open.values()]:
-            current.series.finish("the detector ended", 0)
+            current.series.finish("the detector stopped", 0)
             self._settle(current, over=True)
 
     def _know(self, episode: Episode) -> _Open | None:
@@ -137,7 +137,7 @@ class Record(Action[api.Record]):
 
     def _lose(self, samples: int) -> None:
         if samples:
-            self.setting.lose("samples to record", samples, "their recording ended early")
+            self.setting.lose("samples to record", samples, "the recording ended early")
 
     def _begin(self, description: Description, start: int | None) -> Recording:
         """A new recording. Raises NoRoomError, OSError."""
@@ -156,14 +156,14 @@ class Record(Action[api.Record]):
                 thread.start()
             self._dropped(place.expire(), "older than spec.recordings.age")
         except (ActionError, OSError) as error:
-            log.error("rule %s: the folder of recordings cannot be used: %s", self.setting.rule.name, error)
+            log.error("rule %s: cannot use the folder of recordings: %s", self.setting.rule.name, error)
 
     def _recover(self, place: Destination, left: Sequence[Path]) -> None:
         try:
             kept = recover(place, left)
         except Exception as error:  # what a kill left may be anything, and must not keep new recordings from being made
-            log.exception("recordings that were left behind cannot be completed")
-            self.setting.lose("times recordings that were left behind could not be completed", 1, str(error))
+            log.exception("cannot complete interrupted recordings")
+            self.setting.lose("times interrupted recordings could not be completed", 1, str(error))
             return
         if kept:
             self.setting.lose("recordings cut short", len(kept), REASON)
@@ -171,12 +171,12 @@ class Record(Action[api.Record]):
     def _destination(self, surroundings: Surroundings) -> Destination:
         recordings = surroundings.detector.spec.recordings
         if recordings is None:
-            raise ActionError(f"Detector {surroundings.detector.name} does not say where: give its spec.recordings")
+            raise ActionError(f"Detector {surroundings.detector.name} has no spec.recordings: add it")
         return destination(recordings)
 
-    def _dropped(self, dropped: Sequence[Kept], why: str = "dropped to make room for newer ones") -> None:
+    def _dropped(self, dropped: Sequence[Kept], why: str = "deleted to make room for newer ones") -> None:
         for each in dropped:
-            log.warning("%s: the recording was deleted: %s", each.path, why)
+            log.warning("%s: deleted the recording: %s", each.path, why)
         if dropped:
             self.setting.lose("recordings", len(dropped), why)
 

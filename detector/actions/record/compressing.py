@@ -39,4 +39,4 @@ def decompress(name: str, data: bytes, size: int) -> bytes:
                 return zstandard.decompress(data, max_output_size=size)
     except (RuntimeError, zstandard.ZstdError) as error:
         raise ValueError(str(error)) from error
-    raise ValueError(f"no compression of recordings is called {name!r}")
+    raise ValueError(f"unknown compression of recordings: {name!r}")

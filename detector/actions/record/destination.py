@@ -90,7 +90,7 @@ class Destination:
                 if self._limits.when_full is WhenFull.STOP:
                     raise NoRoomError(f"{short}; whenFull is Stop: make room in {self.path}, or raise the limit")
                 if not self._kept:
-                    raise NoRoomError(f"{short}; there is no finished recording left to drop: raise the limit")
+                    raise NoRoomError(f"{short}; there is no finished recording left to delete: raise the limit")
                 dropped.append(self._drop(self._kept[0]))
             self._bytes += needed
             self._files += files
@@ -125,12 +125,12 @@ class Destination:
         """Which limit there is no room under, for so much more; empty where there is room."""
         limits = self._limits
         if size > 0 and self._total + size > limits.bytes.bytes:
-            return f"the recordings would take more than spec.recordings.bytes ({limits.bytes})"
+            return f"the recordings would use more than spec.recordings.bytes ({limits.bytes})"
         total = self._files + self._kept_files + files
         if files > 0 and limits.files is not None and total > limits.files:
             return f"there would be more than {limits.files} files (spec.recordings.files)"
         if size > 0 and self._free() - self._ahead - size < limits.reserve.bytes:
-            return f"the disk would have less than {limits.reserve} left free (spec.recordings.reserve)"
+            return f"less than {limits.reserve} of the disk would be free (spec.recordings.reserve)"
         return ""
 
     def _free(self) -> int:

@@ -34,10 +34,10 @@ def recover(destination: Destination, left: Iterable[Path]) -> list[Kept]:
         except BlockingIOError:
             continue
         except OSError as error:
-            log.error("%s: the recording that was left behind cannot be completed: %s", path, error)
+            log.error("%s: cannot complete the interrupted recording: %s", path, error)
             continue
         if recording is not None:
-            log.warning("%s: %s; what there is of it was completed", recording.path, REASON)
+            log.warning("%s: %s; completed the recording with the data that was written", recording.path, REASON)
             kept.append(recording)
     return kept
 

@@ -143,7 +143,7 @@ class Series:
                 with_ending(self.description.told(), continues=continues or None), cut, missing
             )
         except OSError as error:
-            self.problem = self.problem or f"the recording cannot be completed, the next start tries again: {error}"
+            self.problem = self.problem or f"cannot complete the recording; the next start retries: {error}"
             self._missing += recording.given + missing
             return
         self.problem = self.problem or str(told.get("cut", ""))

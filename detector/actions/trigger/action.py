@@ -75,7 +75,7 @@ class Trigger(Action[api.Trigger]):
     def started(self, episode: Episode) -> None:
         """Ask for a recording, or for its continuation."""
         if len(self._courses) >= _MOST:
-            raise ActionError(f"{_MOST} recordings elsewhere are under way already: this one is not asked for")
+            raise ActionError(f"{_MOST} recordings on other systems are already in progress: this one is not requested")
         identity = f"{self._prefix}.{encode(episode.id)}"
         left = self._left.pop(identity, None)
         order = Order(identity, self._rendered(episode) if left is None else left.rendered, episode.started)
@@ -101,7 +101,7 @@ class Trigger(Action[api.Trigger]):
             return
         if self.setting.closing.is_set() and self._outlives():
             del self._courses[identity], self._episodes[identity]  # but not in the journal
-            message = "it goes on: the episode is taken up again after the restart, or its maximumDuration ends it"
+            message = "it continues: the episode is resumed after the restart, or its maximumDuration ends it"
             self.setting.report(episode, self._outcome(OutcomeState.DONE, course, message))
         else:
             now = time.monotonic()
@@ -145,10 +145,10 @@ class Trigger(Action[api.Trigger]):
         if self._journal is None:
             for course in self._courses.values():
                 if course.step in (Step.START, Step.STOP):
-                    self._lose(course, "the detector ends")
+                    self._lose(course, "the detector is stopping")
         self._courses = {identity: each for identity, each in self._courses.items() if not each.finished}
         for identity, course in self._courses.items():
-            problem = course.problem or f"the detector ended before its {course.step.value} was confirmed"
+            problem = course.problem or f"the detector stopped before its {course.step.value} was confirmed"
             state = OutcomeState.DONE if course.step is Step.AWAIT else OutcomeState.FAILED
             self._report(identity, self._outcome(state, course, problem if state is OutcomeState.FAILED else ""))
 
@@ -227,7 +227,7 @@ class Trigger(Action[api.Trigger]):
             course.step = Step.STOP
             course.end(now, now)
             self._courses[identity] = course
-            _log.info("recording %s was not stopped before the restart: stopping it", identity)
+            _log.info("stopping recording %s, which was not stopped before the restart", identity)
         self._left = {}
 
     def _forget_finished(self) -> None:
@@ -245,7 +245,7 @@ class Trigger(Action[api.Trigger]):
             self._save()
 
     def _lose(self, course: Course, why: str) -> None:
-        what = "recordings elsewhere whose stop was not confirmed: they end by their maximumDuration"
+        what = "recordings on other systems whose stop was not confirmed: their maximumDuration ends them"
         self.setting.lose(what, 1, f"{course.order.id}: {why}")
 
     def _say(self, course: Course, message: str) -> None:

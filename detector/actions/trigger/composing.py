@@ -26,7 +26,7 @@ def message(store: Typestore, name: str, values: object, where: str) -> object:
     unknown = sorted(str(key) for key in values if key not in fields)
     if unknown:
         there = ", ".join(field for field in fields if field != "structure_needs_at_least_one_member") or "none"
-        raise ServiceError(f"{where}.{unknown[0]} is no field of {name}: it has {there}")
+        raise ServiceError(f"{where}.{unknown[0]} is not a field of {name}: its fields are {there}")
     made = [_value(store, desc, values.get(field), f"{where}.{field}") for field, desc in fields.items()]
     return store.types[name](*made)
 

@@ -91,7 +91,7 @@ class Course:
     def look(self, now: float) -> Step | None:
         """What is to be asked now; None: nothing yet."""
         if self.step is Step.HOLD and now >= self._limit:
-            self.note = "ended by its maximumDuration, before the episode did" if self.ended is None else self.note
+            self.note = "its maximumDuration ended it before the episode ended" if self.ended is None else self.note
             self._to(Step.STOP, now)
         return self.step if now >= self.due and not self.finished else None
 
@@ -109,17 +109,17 @@ class Course:
         if now - self._since < self._limits.give_up or self.step is Step.HOLD:
             return
         if self.step is Step.START:
-            self.problem = f"not started, and given up: {why}"
+            self.problem = f"gave up starting it: {why}"
             if self.unanswered:
                 self._to(Step.STOP, now)  # else it might record what nobody waits for
             else:
                 self.step = Step.FINISHED
         elif self.step is Step.STOP:
             self.lost_stop = True
-            self.problem = self.problem or f"the stop was not confirmed, and is given up: {why}"
+            self.problem = self.problem or f"gave up waiting for the confirmation of the stop: {why}"
             self.step = Step.FINISHED
         else:
-            self.note = self.note or f"what became of it is not known: {why}"
+            self.note = self.note or f"its result is unknown: {why}"
             self.step = Step.FINISHED
 
     def answered(self, now: float, report: Report) -> None:
@@ -134,7 +134,7 @@ class Course:
             self._started(now, report)
         elif report.progress is Progress.UNKNOWN:
             if self.confirmed and not self.problem:
-                self.problem = "the other system knows nothing of it any more: it was restarted, its recording is cut"
+                self.problem = "the other system no longer knows the recording: it restarted, and the recording is cut"
             self.step = Step.FINISHED
         elif report.progress.over:
             self._over(report)
@@ -147,7 +147,7 @@ class Course:
             self.failures = 0
             self.due = now + _POLL
             if now - self._since >= self._limits.give_up:
-                self.failed(now, "it does not come to an end", silent=False)
+                self.failed(now, "it does not finish", silent=False)
 
     def _started(self, now: float, report: Report) -> None:
         if report.progress.over:
@@ -164,9 +164,9 @@ class Course:
     def _over(self, report: Report) -> None:
         """It has ended there."""
         if report.progress is not Progress.DONE:
-            self.problem = self.problem or report.message or "it failed there"
+            self.problem = self.problem or report.message or "it failed on the other system"
         elif self.step in (Step.START, Step.HOLD):
-            self.note = report.message or "it ended there before the episode did"
+            self.note = report.message or "it ended on the other system before the episode ended"
         else:
             self.note = self.note or report.message
         self.step = Step.FINISHED

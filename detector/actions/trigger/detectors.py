@@ -43,7 +43,9 @@ class OtherDetector:
         """The other detector's holder."""
         name = member(order.rendered, "detector", "name")
         if not isinstance(name, str) or not _HOLDER.fullmatch(name):
-            raise ActionError(f"detector.name: {name!r} is no detector's name: it has letters, digits, _, . and - only")
+            raise ActionError(
+                f"detector.name: {name!r} is not a detector name: it may have letters, digits, _, . and - only"
+            )
         return name
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
@@ -81,5 +83,5 @@ class OtherDetector:
         try:
             said = read_report(answers[0])
         except (IndexError, ValueError) as error:
-            raise ActionError(f"detector {name} answered something else: {error}") from error
+            raise ActionError(f"detector {name} returned an unexpected response: {error}") from error
         return Report(said.state, said.message, said.samples, said.bytes, said.missing, tuple(said.files))

@@ -40,7 +40,7 @@ class Journal:
         except FileNotFoundError:
             return {}
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            _log.error("%s cannot be read, nothing is stopped because of it: %s", self._path, error)
+            _log.error("cannot read %s; not stopping any recordings listed in it: %s", self._path, error)
             return {}
 
     def save(self, orders: Iterable[Order]) -> None:
@@ -52,7 +52,7 @@ class Journal:
             self._write(wanted)
         except OSError as error:
             self.failures += 1
-            _log.error("%s cannot be written, a restart may not know what to stop: %s", self._path, error)
+            _log.error("cannot write %s; after a restart, recordings may not be stopped: %s", self._path, error)
         self._written = list(wanted)
 
     def _write(self, orders: Mapping[str, Order]) -> None:

@@ -97,7 +97,7 @@ def read_request(payload: bytes) -> RecordingRequest:
         where = ".".join(map(str, first["loc"])) or "the request"
         raise ValueError(f"{where}: {first['msg']}") from None
     if request.do != "status" and request.id is None:
-        raise ValueError(f"{request.do} which recording? Give its id")
+        raise ValueError(f"{request.do}: give the id of the recording")
     return request
 
 

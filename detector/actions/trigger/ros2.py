@@ -64,7 +64,7 @@ class Ros2Services:
             if report is not None:
                 return report
         self._recording.add(order.id)
-        return Report(Progress.RECORDING, "the recorder runs already, for another episode" if shared else "")
+        return Report(Progress.RECORDING, "the recorder already runs for another episode" if shared else "")
 
     def stop(self, order: Order, ago: float) -> Report:
         """Call `stop`, unless another episode goes on."""
@@ -74,7 +74,7 @@ class Ros2Services:
             if report is not None:
                 return report
         self._recording.discard(order.id)
-        return Report(Progress.DONE, "the recorder goes on, for another episode" if shared else "")
+        return Report(Progress.DONE, "the recorder keeps running for another episode" if shared else "")
 
     def status(self, order: Order) -> Report:
         """Nothing more is to be known than what the calls said."""

@@ -274,5 +274,5 @@ class Walk:
 def _size(kind: str) -> int:
     """Of a number, in bytes."""
     if kind not in _FORMATS:
-        raise UnwalkableError(f"{kind} is not read")
+        raise UnwalkableError(f"{kind} is not supported")
     return struct.calcsize("<" + _FORMATS[kind])

@@ -29,7 +29,7 @@ class JsonDecoder:
         try:
             value = _read(payload)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise DecodeError(f"no JSON: {error}") from None
+            raise DecodeError(f"not JSON: {error}") from None
         except RecursionError:
             # msgspec counts its depth, so the stack is sound: this is its way of saying that the nesting is too deep.
             raise _too_deep() from None
@@ -69,4 +69,4 @@ _DONE = frozenset((float, str, bool, type(None)))
 
 
 def _too_deep() -> DecodeError:
-    return DecodeError(f"JSON nested more than {MAX_DEPTH} deep")
+    return DecodeError(f"JSON nested more than {MAX_DEPTH} levels deep")

@@ -58,12 +58,16 @@ def test_an_action_gets_its_parameters_as_its_model() -> None:
 @pytest.mark.parametrize(
     ("name", "parameters", "problem"),
     [
-        ("lamb", {}, "plugin.name: no action lamb is installed here; did you mean lamp? (docs/actions.md)"),
-        ("xyz", {}, "plugin.name: no action xyz is installed here; there are bare, lamp, lost, parameters"),
-        ("lost", {}, "plugin.name: action lost cannot be loaded: AttributeError"),
-        ("parameters", {}, "which is no complete detector.actions.base.Action (docs/actions.md)"),
+        ("lamb", {}, "plugin.name: no action lamb is installed; did you mean lamp? (docs/actions.md)"),
+        ("xyz", {}, "plugin.name: no action xyz is installed; there are bare, lamp, lost, parameters"),
+        ("lost", {}, "plugin.name: cannot load action lost: AttributeError"),
+        ("parameters", {}, "which is not a complete detector.actions.base.Action (docs/actions.md)"),
         ("bare", {}, "plugin.name: action bare: give tests.unit.actions.test_actions_registry:Bare a class Parameters"),
-        ("deploy", {}, "plugin.name: deploy is no plugin: write deploy: {…} in place of plugin: {…}"),
+        (
+            "deploy",
+            {},
+            "plugin.name: deploy is a built-in action, not a plugin: write deploy: {…} instead of plugin: {…}",
+        ),
         ("lamp", {}, "plugin.parameters.colour: is missing: give it"),
         ("lamp", {"colour": "red", "seconds": 0}, "plugin.parameters.seconds: must be greater than 0; given: 0"),
         ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: there is no such field"),

@@ -57,7 +57,7 @@ def test_what_is_not_confirmed_is_asked_later_and_later_and_given_up() -> None:
         if step is Step.STOP:
             break
     assert times == [0, 0.5, 1.5, 3.5, 7.5, 15.5, 30.5, 45.5, 60.5]
-    assert course.problem == "not started, and given up: silence"
+    assert course.problem == "gave up starting it: silence"
     assert not course.lost_stop
 
 
@@ -70,7 +70,7 @@ def test_a_stop_that_is_given_up_is_told() -> None:
             course.failed(second, "silence", silent=True)
     assert course.finished
     assert course.lost_stop
-    assert course.problem == "the stop was not confirmed, and is given up: silence"
+    assert course.problem == "gave up waiting for the confirmation of the stop: silence"
 
 
 def test_what_is_refused_is_asked_again_and_then_needs_no_stop() -> None:
@@ -79,7 +79,7 @@ def test_what_is_refused_is_asked_again_and_then_needs_no_stop() -> None:
         assert course.look(now) is Step.START
         course.answered(now, Report(Progress.REFUSED, "too many"))
     assert course.finished
-    assert course.problem == "not started, and given up: too many"
+    assert course.problem == "gave up starting it: too many"
 
 
 def test_a_system_that_was_restarted_goes_on_with_the_next_start() -> None:
@@ -94,7 +94,7 @@ def test_a_system_that_was_restarted_goes_on_with_the_next_start() -> None:
     course.end(301, 301)
     course.answered(301, UNKNOWN)  # restarted once more, just now
     assert course.finished
-    assert "restarted, its recording is cut" in course.problem
+    assert "restarted, and the recording is cut" in course.problem
 
 
 def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
@@ -104,7 +104,7 @@ def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
     assert course.look(29.9) is None
     assert course.look(30) is Step.STOP
     course.answered(30, DONE)
-    assert course.note == "ended by its maximumDuration, before the episode did"
+    assert course.note == "its maximumDuration ended it before the episode ended"
 
 
 def test_a_system_that_counts_the_time_itself_says_so() -> None:

@@ -160,7 +160,7 @@ def test_while_a_stream_is_stale_nothing_is_known() -> None:
     [
         ({}, "is missing"),
         ({"objects": {"stream": "radar"}}, "no stream radar"),
-        ({"objects": {"stream": "camera", "frame": "m", "pose": {"stream": "camera"}}}, "give frame"),
+        ({"objects": {"stream": "camera", "frame": "m", "pose": {"stream": "camera"}}}, "give either frame"),
         ({"objects": {"stream": "camera"}, "within": 0}, "greater than 0"),
         ({"objects": {"stream": "camera"}, "of": "c"}, "'a' or 'b'"),
     ],

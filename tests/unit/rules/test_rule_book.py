@@ -16,7 +16,7 @@ def test_a_refused_version_leaves_the_last_good_one_in_place_and_says_so() -> No
         [a_rule("r", **GOOD | {"when": "fst > 10"}), a_rule("s", **GOOD)], detector, {}
     )
     assert (kept.name, kept.digest, other.name) == ("r", first.digest, "s")
-    assert "EventRule r is refused, and goes on as it last was: spec.when" in str(refusal)
+    assert "EventRule r is refused; keeping its last good version: spec.when" in str(refusal)
     assert "did you mean `fast`?" in str(refusal)
     (mended, _), refused = book.compile(
         [a_rule("r", **GOOD | {"when": "fast > 20"}), a_rule("s", **GOOD)], detector, {}

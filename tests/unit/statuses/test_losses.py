@@ -27,12 +27,12 @@ def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
         losses.say()
     said = [message for message in caplog.messages if "could not be read" in message]
     assert len(said) == 2
-    assert said[0].startswith("once a sample of stream pose could not be read; the last: vehicles/car/pose: no JSON")
+    assert said[0].startswith("once a sample of stream pose could not be read; the last: vehicles/car/pose: not JSON")
     assert said[1].startswith("3 times a sample of stream pose could not be read")
     caplog.clear()
     losses.sum_up()
     assert any(
-        message.startswith("in all, 4 times a sample of stream pose could not be read") for message in caplog.messages
+        message.startswith("in total, 4 times a sample of stream pose could not be read") for message in caplog.messages
     )
 
 
@@ -61,7 +61,7 @@ def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCap
         drive.take(arrival(0.5, client, {"t": next(stamps)}, "pose"), until=1)
     drive.take(arrival(1.5, "c", {"t": next(stamps) + 3600}, "pose"), until=2)
     Losses(drive.engine, Intake(lambda: 0)).say()
-    (message,) = [each for each in caplog.messages if "stamps being ahead" in each]
+    (message,) = [each for each in caplog.messages if "because their stamps are ahead" in each]
     assert "the last: c is 3601 s ahead of the rest" in message
 
 
@@ -74,6 +74,6 @@ def test_unknown_values_are_told_by_their_reasons_with_samples_that_are_not_ther
     drive.take(arrival(0.5, "car", {}, "speed"), until=4)
     Losses(drive.engine).sum_up()
     assert (
-        "in all, 9 unknown values in 4 evaluations of EventRule fast: 4 times no sample or an old one; "
+        "in total, 9 unknown values in 4 evaluations of EventRule fast: 4 times no sample or an old one; "
         '4 times no value for `v`; once no key "v" in the map'
     ) in caplog.messages

@@ -47,7 +47,7 @@ class Bits:
         """The same number, once it is certain that a message of this length can hold so many elements."""
         self._elements -= count
         if self._elements < 0:
-            raise DecodeError("it claims more elements than it can hold")
+            raise DecodeError("it claims more elements than its length allows")
         return count
 
     def lengths(self) -> Iterator[int]:
@@ -61,7 +61,7 @@ class Bits:
                 return
             pieces = self.take(6)
             if not 1 <= pieces <= 4:
-                raise DecodeError(f"a length in {pieces} pieces: there can be 1 to 4")
+                raise DecodeError(f"a length in {pieces} pieces; 1 to 4 are allowed")
             yield pieces * _FRAGMENT
 
     def blob(self) -> bytes:
@@ -79,7 +79,7 @@ class Bits:
     def _number(self) -> bytes:
         octets = self.blob()
         if len(octets) > _LONGEST:
-            raise DecodeError(f"a number of {len(octets)} bytes: none has more than {_LONGEST}")
+            raise DecodeError(f"a number of {len(octets)} bytes; the maximum is {_LONGEST}")
         return octets
 
     def small(self) -> int:

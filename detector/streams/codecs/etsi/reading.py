@@ -66,7 +66,7 @@ class Readers:
             case asn1.Open():
                 return Bits.blob
             case asn1.Unreadable(name):
-                return _refusal(f"it holds ASN.1 {name}, which is not read")
+                return _refusal(f"it contains the unsupported ASN.1 type {name}")
 
     def _octet_string(self, kind: asn1.OctetString) -> Read:
         octets = _counted(kind.size, Bits.octets, b"".join)
@@ -160,7 +160,7 @@ class Readers:
                 return {name: reader(inner)}
             index = bits.take(width)
             if index >= len(root):
-                raise DecodeError(f"alternative {index} of a CHOICE that has {len(root)}")
+                raise DecodeError(f"alternative {index} of a CHOICE with {len(root)} alternatives")
             name, reader = root[index]
             return {name: reader(bits)}
 
@@ -201,7 +201,7 @@ def _enumerated(kind: asn1.Enumerated) -> Read:
             return additions[index] if index < len(additions) else None  # None: of a later version of the definition
         index = bits.take(width)
         if index >= len(root):
-            raise DecodeError(f"value {index} of an ENUMERATED that has {len(root)}")
+            raise DecodeError(f"value {index} of an ENUMERATED with {len(root)} values")
         return root[index]
 
     return read
@@ -232,7 +232,7 @@ def _text(kind: asn1.Text) -> Read:
         if identity:
             return "".join(map(chr, codes))
         if codes and max(codes) >= len(alphabet):
-            raise DecodeError(f"a character that is not of the {len(alphabet)} possible ones")
+            raise DecodeError(f"a character outside the alphabet of {len(alphabet)}")
         return "".join(alphabet[code] for code in codes)
 
     return _counted(kind.size, characters, "".join)
