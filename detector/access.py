@@ -18,7 +18,9 @@ SECRETS_FOLDER = "/etc/wayside/secrets"
 
 
 class AccessError(ValueError):
-    """A certificate or password that is not where the resource says; the text names the field, never a secret."""
+    """A certificate or password that is not where the resource places it; the message names the field, never a
+    secret.
+    """
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What a running detector answers to those who ask: its status, and what a rule with onDemand says.
+"""What a running detector answers to requests: its status, and the result of a rule with onDemand.
 
 Some also change something: a rule is paused, or evaluated again; a recording begins, or ends.
 """
@@ -29,10 +29,10 @@ _PATIENCE = 5.0
 """Seconds in which the evaluation should have time for a question."""
 
 _RUNS = 20
-"""Of so many episodes it is told what an action last said."""
+"""Maximum number of episodes per action whose last message is shown."""
 
 _SILENT = 30.0
-"""Seconds without a look after which the evaluation is taken for dead; one that is merely slow says so itself."""
+"""Seconds without an evaluation after which it is considered dead; a slow one reports that itself."""
 
 
 class Answers:
@@ -48,7 +48,7 @@ class Answers:
     ) -> None:
         """`outlet` gives the outlet: the network that it has changes with the Detector, as do the `sources`.
 
-        `pulse` tells for how many seconds the event loop has not run.
+        `pulse` returns the seconds for which the event loop has not run.
         """
         self._pulse = pulse
         self._evaluator = evaluator
@@ -63,7 +63,7 @@ class Answers:
         }
 
     def answer(self, what: str, given: Mapping[str, str], payload: bytes) -> bytes:
-        """The answer as JSON. Raises ValueError where there is none; the text says why."""
+        """The answer as JSON. Raises ValueError if there is none; the message gives the reason."""
         if what == RECORDINGS:
             return self._requested.answer(payload)
         answer = self._answers.get(what)
@@ -94,14 +94,14 @@ class Answers:
         return msgspec.structs.replace(
             latest,
             connected=outlet.network.connected,
-            certificate=CertificateStatus(**asdict(outlet.network.standing)),
+            certificate=CertificateStatus(**asdict(outlet.network.certificate_state)),
             drops=[*latest.drops, *dropped],
             sources=sources,
             actions=actions,
         )
 
     def healthy(self) -> tuple[bool, bytes]:
-        """Whether all goes on that no waiting brings back, for /healthz: a restart is the remedy for it alone."""
+        """Whether everything runs that only a restart can repair, for /healthz."""
         silent, hung, dead = self._evaluator.status.silence, self._pulse(), self._outlet().network.dead
         lines = [f"the last evaluation was {silent:.1f} s ago"]
         if hung >= _SILENT:
@@ -113,7 +113,7 @@ class Answers:
     def ready(self) -> tuple[bool, bytes]:
         """Whether samples can come in and be evaluated, for /readyz.
 
-        Who listens is ready with nobody connected: else no Service would lead anyone to it.
+        A detector that listens is ready without connections: otherwise no Service would route to it.
         """
         well, text = self.healthy()
         network = self._outlet().network
@@ -163,7 +163,7 @@ class Answers:
             raise ValueError(f"the evaluation did not answer within {_PATIENCE:g} s: it is overloaded") from None
 
     def _explanation(self, rule: str, subject: str | None, wait: str) -> Explanation | None:
-        """What the rule's next evaluation sees; None where there is none within so many seconds."""
+        """What the rule's next evaluation sees; None if there is none within `wait` seconds."""
         if not re.fullmatch(r"[0-9]{1,2}(\.[0-9]{1,3})?", wait):
             raise ValueError(f"wait={wait}: give seconds below 100, e.g. wait=2.5")
         watching = None

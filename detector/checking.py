@@ -40,7 +40,7 @@ def check_documents(documents: Sequence[Document]) -> list[Problem]:
 
 
 def findings(documents: Sequence[Document]) -> Findings:
-    """What is to be said of the Detectors, and of the rules with each Detector that selects them."""
+    """The findings about the Detectors, and about the rules with each Detector that selects them."""
     problems: list[Problem] = []
     warnings: list[Problem] = []
     detectors: list[tuple[Document, Detector, Inlets]] = []
@@ -103,7 +103,7 @@ def _unignored(document: Document, warnings: Iterable[Problem]) -> Iterator[Prob
 
 
 def _has_stamp(stream: Stream, fields: Fields | None) -> bool:
-    """Whether its messages can tell the sender's time."""
+    """Whether its messages can give the time of the sender."""
     if stream.stamp is not None or stream.encoding is Encoding.UPER:
         return True
     if stream.encoding is not Encoding.CDR:

@@ -1,4 +1,4 @@
-"""The command `detector`: run, replay, check, and the commands that ask one that runs.
+"""The command `detector`: run, replay, check, and the commands that query a running one.
 
 Declared here, and in the modules of commands that are added below; what a command runs is imported when it runs.
 """
@@ -32,7 +32,7 @@ app = typer.Typer(
 )
 
 _EXPECTED = (InputError, OSError)
-"""Errors of the input: said in one line, without a trace."""
+"""Errors of the input: printed in one line, without a trace."""
 
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
 RuleFiles = Annotated[

@@ -67,7 +67,7 @@ def _read(files: TlsFiles) -> tuple[bytes | None, bytes | None, bytes | None]:
 def _content(path: Path | None) -> bytes | None:
     try:
         return None if path is None else path.read_bytes()
-    except OSError:  # replaced just now: the next attempt tells
+    except OSError:  # just being replaced: the next attempt decides
         return None
 
 

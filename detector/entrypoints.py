@@ -1,7 +1,8 @@
 """What installed packages offer: classes of one kind, each with a model of its parameters.
 
-A package says by an entry point what it brings; whoever writes a resource names it and gives it parameters. Whatever is
-wrong with that (nothing of that name, a module that does not load, parameters that it refuses) is told with its field.
+A package declares what it provides by an entry point; a resource names it and gives it parameters. Whatever is
+wrong with that (nothing of that name, a module that does not load, parameters that it refuses) is reported with its
+field.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _OWN = "wayside"
 
 
 class PluginError(ValueError):
-    """A plugin that is not there, cannot be loaded, or refuses its parameters; `problems` says where and why.
+    """A plugin that is not there, cannot be loaded, or refuses its parameters; `problems` gives places and reasons.
 
     The paths begin at the part of the resource that names the plugin.
     """
@@ -49,7 +50,7 @@ class Offers(Generic[T]):
     model: type[BaseModel]
     """What `Parameters` derives from."""
     guide: str
-    """Where it is told how to write one, e.g. docs/plugins.md."""
+    """The guide for writing one, e.g. docs/plugins.md."""
     shipped: tuple[EntryPoint, ...] = ()
     """Those that need no installed package."""
 
@@ -95,7 +96,7 @@ def _load(offers: Offers[T], name: str) -> type[T]:
         raise LookupError(f"no {what} is installed; {hint} ({offers.guide})")
     try:
         offered: Any = entry.load()
-    except Exception as error:  # somebody else's module, which may raise whatever it likes
+    except Exception as error:  # a third-party module, which may raise anything
         raise LookupError(f"cannot load {what}: {type(error).__name__}: {error}{_remedy(entry, error)}") from error
     base = f"{offers.base.__module__}.{offers.base.__qualname__}"
     complete = inspect.isclass(offered) and issubclass(offered, offers.base) and not inspect.isabstract(offered)

@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from typing import Any, Protocol, TypeVar
 
 from detector.actions.base import Surroundings
-from detector.assembly import RuleBook, inlets
+from detector.assembly import RuleIndex, inlets
 from detector.engine.consequences.consequences import Consequence
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, to_task
@@ -44,7 +44,7 @@ Result = TypeVar("Result")
 _DRAIN_EVERY = 0.05
 """Seconds between two looks at the intake, so that its queue stays short however rare the ticks are."""
 
-_SAY_EVERY = 1.0
+_LOG_EVERY = 1.0
 """Seconds between two looks at what was lost: there are counters for each rule and stream."""
 
 _STALL = 1_000_000_000
@@ -61,7 +61,7 @@ class Recorder(Protocol):
         """What comes from now on belongs to these streams."""
 
     def control(self, time: int, document: Mapping[str, Any]) -> None:
-        """Something else that the engine is told, at a time in nanoseconds since the epoch."""
+        """Another input of the engine, at a time in nanoseconds since the epoch."""
 
 
 class Outlet(Protocol):
@@ -71,13 +71,13 @@ class Outlet(Protocol):
         """What started and ended, in order."""
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
-        """What is open may have changed; `episodes` tells what is, and is to be called at once or not at all."""
+        """Open episodes may have changed; `episodes` returns them, and must be called at once or not at all."""
 
     def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
         """These rules are evaluated from now on."""
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
-        """What actions other than deploy are told, in order."""
+        """The consequences for actions other than deploy, in order."""
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
@@ -108,7 +108,7 @@ class Evaluator:
         outages: Outages | None = None,
         onlooker: Onlooker | None = None,
     ) -> None:
-        """`now` gives nanoseconds since the epoch; `on_failure` is told if the thread dies of an error.
+        """`now` gives nanoseconds since the epoch; `on_failure` is called if the thread dies of an error.
 
         `outages` are those of the engine's plugins: they are recorded, so that a replay knows them.
         """
@@ -120,7 +120,7 @@ class Evaluator:
         self._on_failure = on_failure
         self._outages = outages or Outages()
         self._onlooker = engine.instruments.observer = onlooker
-        self._rule_book = RuleBook()
+        self._rule_index = RuleIndex()
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
         self._stopping = False
@@ -180,13 +180,13 @@ class Evaluator:
         return future
 
     def ask(self, rule: str) -> Future[list[OnDemandResult]]:
-        """Evaluate a rule with onDemand now; thread-safe. Gives what it says of each subject, or NoAnswerError."""
+        """Evaluate a rule with onDemand now; thread-safe. Gives its result for each subject, or NoAnswerError."""
         return self.call(lambda: self._ask(rule))
 
     def pause_rule(self, rule: str, paused: bool) -> Future[None]:
         """Do not evaluate the rule from now on, or (not `paused`) again; thread-safe.
 
-        Gives NoAnswerError where there is no such rule. A detector that starts anew has no paused rules.
+        Gives NoAnswerError where there is no such rule. A restarted detector has no paused rules.
         """
         return self.call(lambda: self._pause_rule(rule, paused))
 
@@ -205,7 +205,7 @@ class Evaluator:
 
     def _run(self) -> None:
         try:
-            stopping, say_due = False, time.monotonic()
+            stopping, log_due = False, time.monotonic()
             while not stopping:
                 with self._wake:
                     if self._wanted is None and not self._stopping and not self._calls and not self._urgent:
@@ -218,9 +218,9 @@ class Evaluator:
                 for future, work in calls:
                     _answer(future, work)
                 self.status.looked()
-                if time.monotonic() >= say_due:
-                    say_due = time.monotonic() + _SAY_EVERY
-                    self.losses.say()
+                if time.monotonic() >= log_due:
+                    log_due = time.monotonic() + _LOG_EVERY
+                    self.losses.log_new()
                 self._sweeper.look()
             self._finish()
             self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
@@ -248,7 +248,7 @@ class Evaluator:
         self._record(end, {"kind": "end", "finished": True})
 
     def pause(self) -> float:
-        """Seconds until there is something to do. With clock Data only the samples say when a tick is due."""
+        """Seconds until there is something to do. With clock Data only the samples determine when a tick is due."""
         if not self._engine.on_wall_clock:
             return _DRAIN_EVERY
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
@@ -303,7 +303,7 @@ class Evaluator:
         return events
 
     def _record_outages(self) -> None:
-        for document in self._outages.news():
+        for document in self._outages.take_changes():
             self._record(self._engine.now, document)
 
     def _gap(self, now: int, why: str) -> list[Event]:
@@ -332,11 +332,11 @@ class Evaluator:
 
     def _apply_rules(self, rule_set: RuleSet) -> list[Event]:
         entries = inlets(rule_set.detector)
-        compiled, refused = self._rule_book.compile(rule_set.rules, rule_set.detector, entries.fields)
+        compiled, refused = self._rule_index.compile(rule_set.rules, rule_set.detector, entries.fields)
         for refusal in refused:
             _log.error("%s", refusal)
         self.status.refused(refused)
-        self._outlet.follow(self._rule_book.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
+        self._outlet.follow(self._rule_index.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
         events = self._engine.set_rules(compiled)
         if self._onlooker is not None:
             self._onlooker.attend(self._engine)
@@ -371,9 +371,9 @@ class Evaluator:
 
 
 def _answer(future: Future[Any], work: Callable[[], Any]) -> None:
-    """Do what somebody asked for; an error is theirs, and not the evaluation's end."""
+    """Carry out a call; its error goes to the caller and does not end the evaluation."""
     if future.set_running_or_notify_cancel():
         try:
             future.set_result(work())
-        except Exception as error:  # noqa: BLE001  whoever asked hears of it
+        except Exception as error:  # noqa: BLE001  passed to the caller
             future.set_exception(error)

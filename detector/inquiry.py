@@ -1,4 +1,4 @@
-"""The commands that ask a running detector: `detector status`, `evaluate`, `pause` and `resume`.
+"""The commands that query a running detector: `detector status`, `evaluate`, `pause` and `resume`.
 
 A command imports what it runs when it runs, so that `--help` need not.
 """
@@ -15,7 +15,7 @@ from wayside.beginning import importing
 from wayside.commandline import refuse
 
 if TYPE_CHECKING:
-    from detector.streams.asking import Asked
+    from detector.streams.querying import Reply
     from wayside.api.zenoh import Zenoh
 
 DetectorFile = Annotated[
@@ -83,17 +83,17 @@ def pause(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
     """Do not evaluate a rule until it is resumed; its open episodes hold."""
-    _told("pause", rule, inquire("pause", {"rule": rule}, detector, name, connect, timeout))
+    _print_replies("pause", rule, inquire("pause", {"rule": rule}, detector, name, connect, timeout))
 
 
 def resume(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
     """Evaluate a paused rule again."""
-    _told("resume", rule, inquire("resume", {"rule": rule}, detector, name, connect, timeout))
+    _print_replies("resume", rule, inquire("resume", {"rule": rule}, detector, name, connect, timeout))
 
 
-def _told(what: str, rule: str, answers: list[Asked]) -> None:
+def _print_replies(what: str, rule: str, answers: list[Reply]) -> None:
     for answer in answers:
         typer.echo(f"{answer.key.split('/')[2]}: rule {rule} {what}d", err=True)
 
@@ -106,11 +106,11 @@ def inquire(
     connect: list[str] | None,
     timeout: float,
     payload: bytes | None = None,
-) -> list[Asked]:
+) -> list[Reply]:
     """Ask the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
     with importing():
         from detector.rules.files import load_rules
-        from detector.streams.asking import ask
+        from detector.streams.querying import query_detectors
         from wayside.api.pod import DetectorMode
         from wayside.api.zenoh import Zenoh, ZenohMode
 
@@ -124,7 +124,7 @@ def inquire(
         config = config.model_copy(update={"connect": connect, "scouting": False, "mode": ZenohMode.CLIENT})
     if not config.connect and not config.scouting:
         refuse("give --connect ENDPOINT, or --detector FILE with the endpoints in spec.zenoh")
-    return ask(config, name or holder, what, given, timeout, payload)
+    return query_detectors(config, name or holder, what, given, timeout, payload)
 
 
 def _reaching(zenoh: Zenoh) -> Zenoh:

@@ -1,4 +1,4 @@
-"""What is lost, or cannot be used: said when it first happens, then at most once a minute, and in all at the end.
+"""What is lost, or cannot be used: logged when it first happens, then at most once a minute, and in total at the end.
 
 Every kind of loss has a counter where it happens, and the last one's reason. Here they are only read.
 """
@@ -58,27 +58,27 @@ class Losses:
         self._monotonic = monotonic
         self._tallies: list[Tally] = []
         self._others: list[Callable[[], Iterable[Loss]]] = []
-        self._said: dict[str, tuple[int, float]] = {}
+        self._logged: dict[str, tuple[int, float]] = {}
 
     def watch(self, tally: Tally) -> None:
-        """Say what it counts as well."""
+        """Also report what this tally counts."""
         self._tallies.append(tally)
 
     def watch_also(self, losses: Callable[[], Iterable[Loss]]) -> None:
-        """Say these as well, whatever counts them."""
+        """Also report these losses, whatever counts them."""
         self._others.append(losses)
 
-    def say(self) -> None:
-        """Log each kind of loss of which there is more, unless it was said within the last minute."""
+    def log_new(self) -> None:
+        """Log each kind of loss that has increased, unless it was logged within the last minute."""
         now = self._monotonic()
         for loss in self.all():
-            said, since = self._said.get(loss.what, (0, -math.inf))
-            if loss.count > said and now - since >= _EVERY:
-                self._said[loss.what] = loss.count, now
-                _log.warning("%s", _line(loss, loss.count - said))
+            logged, since = self._logged.get(loss.what, (0, -math.inf))
+            if loss.count > logged and now - since >= _EVERY:
+                self._logged[loss.what] = loss.count, now
+                _log.warning("%s", _line(loss, loss.count - logged))
         for what, finding in self._apart():
-            if what not in self._said:
-                self._said[what] = 1, now
+            if what not in self._logged:
+                self._logged[what] = 1, now
                 _log.warning("%s", finding)
 
     def sum_up(self) -> None:

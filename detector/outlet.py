@@ -64,7 +64,7 @@ class LiveOutlet:
                 self._traces.over(event)
 
     def move(self, network: Network) -> None:
-        """The Detector changed: leave the network, and join the other. Where that fails, it is said."""
+        """The Detector changed: leave the network, and join the other. A failure is logged."""
         dropped = self.network.dropped_events
         self.network.close()
         self.network = network
@@ -85,16 +85,18 @@ class LiveOutlet:
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
         """Tell the actions."""
-        self.actions.tell(consequences if self._traces is None else self._traces.consequences(consequences))
+        self.actions.dispatch(consequences if self._traces is None else self._traces.consequences(consequences))
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """See `Messenger`: for the actions, which need not know that the network may be another tomorrow."""
         self.network.publish(key, payload, encoding)
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
         """See `Messenger`."""
         try:
-            return self.network.ask(selector, payload, timeout, attachment)
+            return self.network.query(selector, payload, timeout, attachment)
         except NetworkError as error:
             raise ActionError(str(error)) from error
 

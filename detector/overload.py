@@ -1,7 +1,7 @@
 """When the evaluation falls behind, and when it has caught up: how much is left out, from what a look took. Pure.
 
 A look that took long means that ticks are overdue: the level rises by one at once. It falls by one after each ten
-seconds without such a look. What a level means, `detector/engine/timing/load.py` says.
+seconds without such a look. `detector/engine/timing/load.py` defines the levels.
 """
 
 from __future__ import annotations

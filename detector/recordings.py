@@ -50,7 +50,7 @@ def start(
     )
     if detector is None and name is None:
         refuse("no detector given to record: give --name NAME or --detector FILE")
-    _print(_asked(request, detector, name, connect, timeout), as_json)
+    _print(_request_reports(request, detector, name, connect, timeout), as_json)
 
 
 @app.command()
@@ -66,7 +66,7 @@ def stop(
     """End a recording."""
     if detector is None and name is None:
         refuse("no detector given to stop: give --name NAME or --detector FILE")
-    _print(_asked(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
+    _print(_request_reports(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
 
 
 @app.command()
@@ -79,7 +79,7 @@ def status(
     timeout: Timeout = 3.0,
 ) -> None:
     """Say what is recorded on request, and what was."""
-    _print(_asked(_request(id=identity), detector, name, connect, timeout), as_json)
+    _print(_request_reports(_request(id=identity), detector, name, connect, timeout), as_json)
 
 
 def _request(**given: object) -> RecordingRequest:
@@ -96,7 +96,7 @@ def _request(**given: object) -> RecordingRequest:
         refuse(f"{'.'.join(map(str, path))}: {text}")
 
 
-def _asked(
+def _request_reports(
     request: RecordingRequest,
     detector: DetectorFile,
     name: str | None,
@@ -110,14 +110,14 @@ def _asked(
     return [(answer.key.split("/")[2], report) for answer in answers for report in read_reports(answer.payload)]
 
 
-def _print(told: list[tuple[str, RecordingReport]], as_json: bool) -> None:
+def _print(reports: list[tuple[str, RecordingReport]], as_json: bool) -> None:
     """Exits with 1 where a recording was refused or has failed."""
     from detector.actions.trigger.orders import Progress
 
     if as_json:
         import msgspec
 
-        for holder, report in told:
+        for holder, report in reports:
             answer = {"detector": holder, **{key: value for key, value in msgspec.to_builtins(report).items() if value}}
             typer.echo(json.dumps(answer))
     else:
@@ -130,10 +130,10 @@ def _print(told: list[tuple[str, RecordingReport]], as_json: bool) -> None:
         table = Table(box=None, pad_edge=False, header_style="bold")
         for column in ("detector", "recording", "state", "until", "samples", "bytes", "files", "message"):
             table.add_column(column, overflow="fold")
-        for holder, report in told:
+        for holder, report in reports:
             counts = (report.samples, report.bytes)
             files = "\n".join(report.files)
             table.add_row(holder, report.id, report.state.value, report.until, *map(str, counts), files, report.message)
         console.print(table, highlight=False, markup=False)
-    if any(report.state in (Progress.REFUSED, Progress.FAILED) for _, report in told):
+    if any(report.state in (Progress.REFUSED, Progress.FAILED) for _, report in reports):
         raise typer.Exit(1)

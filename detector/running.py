@@ -75,7 +75,7 @@ class Running:
         traces: EpisodeTraces | None = None,
         view: View | None = None,
     ) -> None:
-        """Raises DetectorError where the Detector cannot run, OSError where a file or the port cannot be had."""
+        """Raises DetectorError where the Detector cannot run, OSError if a file or the port is unavailable."""
         self._loop = asyncio.get_running_loop()
         self._failed: asyncio.Future[None] = self._loop.create_future()
         self._rule_set = rule_set
@@ -102,7 +102,7 @@ class Running:
             onlooker=view,
         )
         requested = Requested(self._engine, self._evaluator.call)
-        self._outlet.actions.outcomes.heard = requested.heard
+        self._outlet.actions.outcomes.on_outcome = requested.on_outcome
         pulse = Pulse(self._loop)
         self.answers = Answers(
             self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence
@@ -203,11 +203,11 @@ class Running:
         return wanted
 
     def _fail(self, error: BaseException) -> None:
-        def tell() -> None:
+        def notify() -> None:
             if not self._failed.done():
                 self._failed.set_exception(error)
 
-        self._loop.call_soon_threadsafe(tell)
+        self._loop.call_soon_threadsafe(notify)
 
     def _summarise(self) -> None:
         self._evaluator.losses.sum_up()
@@ -233,14 +233,14 @@ def _server(port: int, answers: Answers) -> StatusServer:
 
 
 def _of_state(state: StateFile) -> Iterator[Loss]:
-    """What the state volume did not take or give."""
+    """What could not be written to or read from the state volume."""
     unwritten = "times the state volume could not be written"
     yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
     yield Loss("unreadable files of the state volume set aside", state.set_aside, cause="state_unreadable")
 
 
 def _of_traces(traces: EpisodeTraces) -> Iterator[Loss]:
-    """Spans that nobody got."""
+    """Spans that were not exported."""
     yield Loss("spans dropped because too many are in flight", traces.tracing.dropped, cause="spans_dropped")
     yield Loss(
         "spans that could not be exported", traces.tracing.failed, f"by {traces.tracing.endpoint}", cause="spans_failed"
@@ -248,7 +248,7 @@ def _of_traces(traces: EpisodeTraces) -> Iterator[Loss]:
 
 
 def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:
-    """What actions say that they lost."""
+    """What actions reported as lost."""
     for lost in outcomes.lost():
         cause = "action_" + re.sub(r"[^a-z]+", "_", lost.what.lower()).strip("_")
         what = f"{lost.what} (action {lost.which.action} of EventRule {lost.which.rule})"

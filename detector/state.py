@@ -1,6 +1,6 @@
 """The state volume: open episodes as one file, so that those without tasks survive a restart, even a kill -9.
 
-The file is replaced in one step by a thread of its own, so the evaluation never waits for the disk and nobody ever
+The file is replaced in one step by a thread of its own, so the evaluation never waits for the disk and no reader ever
 reads half a file. Only the newest set of episodes waits to be written: a slow disk writes less often, and what a kill
 costs is what happened since the last write. An episode that ended then is open again after the restart, and ends again,
 with the same id.
@@ -64,7 +64,7 @@ class StateFile:
     def load(self) -> list[OpenEpisode]:
         """The episodes that were open when the file was last written; none where there is no file.
 
-        A file that cannot be read is said and set aside, beside the other under a free name: nothing is restored then.
+        An unreadable file is logged and set aside under a free name: nothing is restored then.
         """
         try:
             text = self.path.read_bytes()

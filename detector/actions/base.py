@@ -1,7 +1,7 @@
-"""What an action is: a class with typed parameters that is told of a rule's episodes, one after the other.
+"""What an action is: a class with typed parameters that receives the episodes of a rule, one after the other.
 
-An action has a thread of its own: it may wait for disks and networks, and nobody else notices. What it raises ends its
-work for that episode and no other.
+An action has a thread of its own: it may wait for disks and networks without delaying anything else. What it raises
+ends its work for that episode and no other.
 """
 
 from __future__ import annotations
@@ -39,10 +39,12 @@ class Messenger(Protocol):
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """Queue a message; never waits. With the queue full it is dropped and counted."""
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
-        """Send a query to all who answer it and wait for the answers, at most so many seconds.
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
+        """Send a query to everyone who answers it, and wait at most `timeout` seconds for the answers.
 
-        Raises ActionError where there is no session, nobody answers, or the answer is an error.
+        Raises ActionError if there is no session, no answer, or an error as answer.
         """
 
 
@@ -75,7 +77,7 @@ class Setting:
     lose: Callable[[str, int, str], None]
     """Count what was lost: in a few words what, how many, and the reason. It is shown beside the detector's losses."""
     closing: threading.Event
-    """Set when the detector ends: whoever waits for something should give up soon."""
+    """Set when the detector stops: anything that waits should give up soon."""
 
 
 class Action(ABC, Generic[P]):
@@ -85,8 +87,8 @@ class Action(ABC, Generic[P]):
     two at a time, and for each episode in this order: `started`, `samples` and `ended` as it happens, `completed` last.
     Episodes overlap.
 
-    What `started`, `samples`, `ended` or `completed` raises is reported as the failure of that episode, which is then
-    not told of any more.
+    What `started`, `samples`, `ended` or `completed` raises is reported as the failure of that episode, which then
+    receives nothing more.
     """
 
     Parameters: ClassVar[type[BaseModel]]
@@ -96,7 +98,7 @@ class Action(ABC, Generic[P]):
     def problems(cls, parameters: P, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
         """What is wrong with parameters that their model cannot see, each with its place among them.
 
-        `detector check` tells it, and a rule with such an action is refused.
+        `detector check` reports it, and a rule with such an action is refused.
         """
         return ()
 
@@ -117,7 +119,7 @@ class Action(ABC, Generic[P]):
         """There is nothing more to come of it. It may not have ended, where the detector or the action ends."""
 
     def wake(self) -> float | None:
-        """Called between the others: do what is due now, and say in how many seconds to call again at the latest.
+        """Called between the others: do what is due now, and return the maximum number of seconds until the next call.
 
         None: when there is something new. What it raises is counted, and it is called again after a second.
         """

@@ -1,4 +1,4 @@
-"""Which actions there are, and whether a rule gives them what they ask for.
+"""Which actions there are, and whether a rule gives them the parameters that they require.
 
 Built-in actions are found as those of other packages are. Their parameters are fields of the rule, so they are known to
 be right once the rule is read.
@@ -52,7 +52,7 @@ def prepare(action: api.Action, streams: Sequence[str] | None = None) -> tuple[t
 
 
 def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with a rule's actions, as far as their classes can tell here."""
+    """What is wrong with a rule's actions, as far as their classes can check here."""
     yield from secret_problems(rule, detector)
     streams = [stream.name for stream in detector.spec.streams]
     for index, action in enumerate(rule.spec.actions):

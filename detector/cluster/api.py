@@ -42,7 +42,7 @@ class Resource(NamedTuple):
 class Api:
     """The verbs, for a namespace and resource each time.
 
-    Every verb raises `UnavailableError` where the server does not answer or asks to come back, and another `ApiError`
+    Every verb raises `UnavailableError` where the server does not answer or requests a retry, and another `ApiError`
     where it refuses.
     """
 

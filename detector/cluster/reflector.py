@@ -2,7 +2,7 @@
 
 A watch may lose its connection, or the server the history that it needs (410); and no watch proves that nothing was
 missed. So each watch lasts one resync period only, and whatever ends it, a fresh list follows. What the world looked
-like meanwhile does not matter: the list says what is.
+like in the meantime does not matter: the list is the current state.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Binds the models of a compiled rule to their files, and says what does not fit: file, inputs, shapes, outputs."""
+"""Binds the models of a compiled rule to their files, and reports what does not match: file, inputs, shapes,
+outputs.
+"""
 
 from __future__ import annotations
 
@@ -181,7 +183,7 @@ def _points(wanted: ModelPoints, payload: bytes) -> NDArray[np.float64]:
 
 
 def _known(wanted: ModelPoints | None) -> ModelPoints:
-    assert wanted is not None  # noqa: S101  the engine asks only for images and points
+    assert wanted is not None  # noqa: S101  the engine requests only images and points
     return wanted
 
 

@@ -32,7 +32,7 @@ _MAXIMUM_BYTES = 2**31
 
 
 class ModelError(ValueError):
-    """A model file that cannot be used; the text says why."""
+    """A model file that cannot be used; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)

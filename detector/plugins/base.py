@@ -62,7 +62,7 @@ class Plugin(ABC, Generic[P]):
 
     @classmethod
     def warm_up(cls) -> None:
-        """Called once where the plugin runs, before it is asked for anything: what takes long to load belongs here.
+        """Called once where the plugin runs, before any other call: slow loading belongs here.
 
         A value must be there within half a second, and that includes what is imported for it.
         """

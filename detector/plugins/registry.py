@@ -1,4 +1,4 @@
-"""Which plugins there are, and whether a rule gives them what they ask for."""
+"""Which plugins there are, and whether a rule gives them the parameters that they require."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 The two lists are those of one client, or one of each client of a pair. Samples of about the same stamp are compared:
 the objects are brought into one frame, matched by position (as many pairs within the gate as there can be, and of these
 the nearest), and what is left over is followed over time. The signal is the list of those that have been left over for
-long enough; a rule says e.g. `when: size(unmatched) > 0`.
+long enough; a rule uses e.g. `when: size(unmatched) > 0`.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def _frame(queries: Queries, of: ObjectList, sample: DecodedSample) -> Pose:
 
 
 def _points(of: ObjectList, sample: DecodedSample, frame: Pose) -> list[Point]:
-    """Where the objects are in the common frame; those that say no place are left out."""
+    """Where the objects are in the common frame; those without a position are left out."""
     objects = _at(sample.message, of.list)
     if not isinstance(objects, list):
         raise ValueError(f"a message of stream {of.stream} has no list at {of.list!r}")

@@ -14,12 +14,12 @@ from wayside.rules import RuleProblem
 
 @dataclass(frozen=True)
 class FileRules:
-    """What the files say."""
+    """The content of the files."""
 
     rule_set: RuleSet
     detector: Document
     rules: dict[str, Document]
-    """The selected rules by name, for errors to tell where."""
+    """The selected rules by name, for the places of errors."""
     warnings: tuple[str, ...]
     """Rules that are given but not evaluated, and why."""
 

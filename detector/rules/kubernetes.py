@@ -136,7 +136,7 @@ class _Known(Generic[Object]):
                 _log.warning("cannot read the %s %s; %s: %s", self._kind.__name__, name, what, error)
             self.unreadable[name] = str(error)
             return
-        assert isinstance(parsed, self._kind)  # noqa: S101  the shape says so
+        assert isinstance(parsed, self._kind)  # noqa: S101  the shape guarantees it
         self.unreadable.pop(name, None)
         self.objects[name] = parsed
 

@@ -1,4 +1,4 @@
-"""Which sources are installed, and whether a Detector gives them what they ask for."""
+"""Which sources are installed, and whether a Detector gives them the parameters that they require."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def prepare(source: DataSource) -> Make:
 
 
 def plugin_problems(detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with the Detector's sources, as far as their plugins can tell here."""
+    """What is wrong with the Detector's sources, as far as their plugins can check here."""
     for index, source in enumerate(detector.spec.sources):
         try:
             prepare(source)

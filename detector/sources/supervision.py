@@ -23,7 +23,7 @@ _LONGEST_PAUSE = 30.0
 """Seconds before a source that failed is run again: doubling from the first to the longest."""
 
 _STEADY = 60.0
-"""Seconds: a run that lasted this long was a good one, and after it the pauses begin anew."""
+"""Seconds: a run that lasted this long was a good one, and resets the backoff."""
 
 
 class State(StrEnum):
@@ -70,12 +70,12 @@ class SourceThread:
         """Begin; returns at once."""
         self._thread.start()
 
-    def tell_to_stop(self) -> None:
+    def request_stop(self) -> None:
         """From now on nothing of it is taken; returns at once."""
         self._feed.stop()
 
     def join(self, timeout: float) -> None:
-        """Wait for its end, for at most `timeout` seconds; then it is left behind, which is said and counted."""
+        """Wait for its end, for at most `timeout` seconds; then it is abandoned, logged and counted."""
         self._thread.join(timeout)
         if self._thread.is_alive():
             self._tally.add(Cause.LEFT_BEHIND, self.source.name)
@@ -92,7 +92,7 @@ class SourceThread:
             began = time.monotonic()
             try:
                 self._make().run(self._feed)
-            except BaseException as error:  # noqa: BLE001  somebody else's code, which must not end the detector
+            except BaseException as error:  # noqa: BLE001  third-party code, which must not end the detector
                 if self._feed.stopping:
                     break
                 if time.monotonic() - began >= _STEADY:
@@ -130,7 +130,7 @@ class Sources:
         """Run the Detector's sources; those that are the same, with the same streams, go on. May wait for ends.
 
         Raises:
-            PluginError: a source cannot be had; nothing has changed then.
+            PluginError: a source cannot be loaded; nothing has changed then.
         """
         wanted = {
             source.name: (source, tuple(stream for stream in detector.spec.streams if stream.source == source.name))
@@ -159,7 +159,7 @@ class Sources:
 
     def _stop(self, threads: Mapping[str, SourceThread]) -> None:
         for thread in threads.values():
-            thread.tell_to_stop()
+            thread.request_stop()
         deadline = time.monotonic() + self._timeout
         for name, thread in threads.items():
             thread.join(max(0.0, deadline - time.monotonic()))

@@ -1,6 +1,6 @@
 """Why a rule does or does not fire: what its next evaluation sees of each subject.
 
-The evaluation is watched, not repeated: it tells what it saw on the way, so looking changes nothing and nothing is
+The evaluation is watched, not repeated: it reports what it saw on the way, so looking changes nothing and nothing is
 computed for it beyond what is computed anyway.
 """
 
@@ -21,7 +21,7 @@ from wayside.names import parse_subject
 from wayside.rules import ClientSubject, FleetSubject, PairSubject
 
 MAXIMUM_SUBJECTS = 20
-"""So many subjects are told of, those with an open episode and those whose condition holds first."""
+"""Maximum number of subjects shown, those with an open episode or a true condition first."""
 
 _MAXIMUM_NOTES = 20
 
@@ -46,21 +46,21 @@ class Watching:
         run.counters.notes = []
 
     def is_over(self) -> bool:
-        """Whether the rule was evaluated meanwhile, is gone, or nobody waits any more; then the future says so."""
+        """Whether the rule was evaluated meanwhile, is gone, or nothing waits any more; then the future is set."""
         gone = self._engine.rules.get(self._run.rule.name) is not self._run
         if self._run.counters.ticks == self._ticks and not gone and not self.future.cancelled():
             return False
         notes, self._run.witness, self._run.counters.notes = self._run.counters.notes or [], None, None
         if self.future.set_running_or_notify_cancel():
             tick = self._run.counters.last_tick / 1e9
-            self.future.set_result(Explanation(tick, self._told(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))
+            self.future.set_result(Explanation(tick, self._statuses(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))
         return True
 
-    def _told(self) -> list[SubjectStatus]:
-        told = [status for _, status in sorted(self._seen, key=lambda each: (each[0], each[1].subject))]
-        if self._subject is not None and not told:
+    def _statuses(self) -> list[SubjectStatus]:
+        statuses = [status for _, status in sorted(self._seen, key=lambda each: (each[0], each[1].subject))]
+        if self._subject is not None and not statuses:
             return [SubjectStatus(self._subject, looked_at=False, why=self._why_not(self._subject))]
-        return told[:MAXIMUM_SUBJECTS]
+        return statuses[:MAXIMUM_SUBJECTS]
 
     def _see(self, evaluated: Evaluated) -> None:
         text, variables = evaluated.candidate.subject.text, evaluated.candidate.variables

@@ -1,6 +1,6 @@
 """Keeps the status of a running detector: taken by the evaluation thread, at most once a second, read by any other.
 
-So whoever asks neither waits for the evaluation nor holds it up, and the engine's counters are only ever read by the
+So a request neither waits for the evaluation nor delays it, and the engine's counters are only ever read by the
 thread that writes them. What costs something per sample is looked at in samples: latencies are those of the newest
 message of at most a few clients, once a second.
 """
@@ -41,10 +41,10 @@ _EVERY = 1_000_000_000
 """Nanoseconds between two statuses, and between two looks at a latency."""
 
 _LOOKED_AT = 16
-"""Of so many clients the newest sample's latency is looked at, for each stream or rule."""
+"""Number of clients whose newest sample counts for the latency of each stream or rule."""
 
 _RATES_OVER = 10
-"""Rates are over so many statuses."""
+"""Number of statuses over which rates are averaged."""
 
 _CLIENTS = 200
 
@@ -181,7 +181,7 @@ class StatusKeeper:
         )
 
     def _axis(self) -> int:
-        """The time that ages are told by: with clock Wall now, also where ticks are rare."""
+        """The reference time of ages: with clock Wall now, also where ticks are rare."""
         return self._now() if self._engine.on_wall_clock else self._engine.now
 
     def _clients(self) -> Iterator[ClientStatus]:

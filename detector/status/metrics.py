@@ -59,7 +59,7 @@ DETECTOR: tuple[tuple[str, type, str, Callable[[Status], float | None]], ...] = 
     ),
     ("certificate_renewals", CounterMetricFamily, "Number of certificate renewals", lambda s: s.certificate.renewals),
 )
-"""Without labels: name, kind, what it tells, and its value; None: not there."""
+"""Without labels: name, kind, help text, and value; None: absent."""
 
 STREAM: tuple[tuple[str, type, str, Callable[[StreamStatus], float | None]], ...] = (
     ("stream_samples", CounterMetricFamily, "Number of samples added to the buffer", lambda s: s.samples),

@@ -16,7 +16,7 @@ _DEMANDS = 10
 
 
 def status_view(status: Status) -> RenderableType:
-    """Everything that a status says, in a few tables."""
+    """A status as a few tables."""
     return Group(*_parts(status))
 
 
@@ -99,9 +99,9 @@ def _proving(status: Status) -> Iterator[RenderableType]:
 
 
 def _acting(status: Status) -> Iterator[RenderableType]:
-    """What became of the actions' work, of the rules that are told about."""
-    told = {rule.name for rule in status.rules}
-    actions = [each for each in status.actions if each.rule in told or status.explanation is None]
+    """The outcomes of the actions of the rules shown."""
+    shown = {rule.name for rule in status.rules}
+    actions = [each for each in status.actions if each.rule in shown or status.explanation is None]
     if not actions:
         return
     table = _table("action", "kind", "running", "done", "failed", "samples", "missing", "size", "files")

@@ -5,8 +5,8 @@ once, and is noted; what comes over the new one waits. Then the old one is withd
 after that what waited, without what was noted. So nothing is lost, nothing is taken twice, and on no key does a sample
 overtake another.
 
-A sample is known again by the timestamp that routers (and peers) give to each. Where nobody does, those that are equal
-in key and content are taken for the same, within the second or so in which both sessions are subscribed.
+A sample is known again by the timestamp that routers (and peers) give to each. Without timestamps, those that are equal
+in key and content count as the same, within the second or so in which both sessions are subscribed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from detector.streams.bursts import LONGEST
 from detector.streams.subscribing import Subscription
 
 MAXIMUM_NOTED = 1_000_000
-"""So many samples are noted, and so many wait, for one stream; beyond, the sessions are exchanged without more ado."""
+"""Maximum samples noted, and maximum samples waiting, for one stream; beyond, the sessions are exchanged at once."""
 
 _MAXIMUM_KEYS = 200_000
 

@@ -1,4 +1,4 @@
-"""Follows the clients' liveliness tokens, and tells what happens to them as arrivals for the intake.
+"""Follows the clients' liveliness tokens, and passes their changes as arrivals to the intake.
 
 When our connection to a router ends, Zenoh reports all tokens behind it as gone, a moment before the connection
 itself. So a token that is gone is looked at again shortly after: only if no router left since the token was declared,
@@ -34,7 +34,7 @@ Tokens = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
 
 
 def subscribe_tokens(session: zenoh.Session, key: str) -> Tokens:
-    """`key` is a pattern in key-format notation; tokens that are there are told of. Raises KeyPatternError, ZError."""
+    """`key` is a pattern in key-format notation; existing tokens are reported. Raises KeyPatternError, ZError."""
     expression = zenoh.KeyExpr.autocanonize(KeyPattern.parse(key).expression)
     return session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(_CHANNEL), history=True)
 
@@ -89,7 +89,7 @@ class TokenWatch:
             tokens = self._subscriber.handler
             try:
                 while True:
-                    self._tell([_report(tokens.recv())], tokens)
+                    self._apply([_report(tokens.recv())], tokens)
             except zenoh.ZError:  # undeclared, or the session is closed
                 with self._changed:
                     self._changed.wait_for(
@@ -103,7 +103,7 @@ class TokenWatch:
             self._compare()
 
     def _compare(self) -> None:
-        """Another session tells of all tokens that are there: those that it does not tell of are gone meanwhile."""
+        """Another session reports all existing tokens: those that it does not report are gone."""
         self._held = dict.fromkeys(self._held, self._connections.departures)
         tokens = self._subscriber.handler
         reports = [_report(each) for each in iter(tokens.try_recv, None)]
@@ -111,9 +111,9 @@ class TokenWatch:
         gone = [(key, zenoh.SampleKind.DELETE) for key in self._held if key not in there]
         new = [(key, kind) for key, kind in reports if kind == zenoh.SampleKind.DELETE or key not in self._held]
         if gone or new:
-            self._tell([*gone, *new], tokens)
+            self._apply([*gone, *new], tokens)
 
-    def _tell(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+    def _apply(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """What a report and those that follow it at once come to, a token at a time."""
         if reports[0][1] == zenoh.SampleKind.DELETE and not self._stop.wait(_SETTLE):
             reports.extend(_report(each) for each in iter(tokens.try_recv, None))

@@ -24,11 +24,11 @@ _FIELD = "spec.zenoh"
 
 
 class NetworkError(InputError, ValueError):
-    """The Zenoh session cannot be had as configured; the text names the field and the reason."""
+    """The Zenoh session cannot be opened as configured; the message names the field and the reason."""
 
 
 def material_of(config: Zenoh) -> Material:
-    """What to prove oneself with now. Raises NetworkError."""
+    """The present certificates and credentials. Raises NetworkError."""
     try:
         return read_material(config, _FIELD)
     except AccessError as error:
@@ -38,7 +38,7 @@ def material_of(config: Zenoh) -> Material:
 def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Session:
     """Opens a session. A peer or router connects in the background; a client must reach a router now.
 
-    `material`: default: what the configuration means now. Raises NetworkError.
+    `material`: default: that of the configuration. Raises NetworkError.
     """
     try:
         return zenoh.open(_settings(config, material_of(config) if material is None else material))
@@ -51,14 +51,14 @@ def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Sessi
 
 def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, Material] | None:
     """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
-    attempt, said = 0, ""
+    attempt, logged = 0, ""
     while not stop.is_set():
         try:
             material = material_of(config)
             return open_session(config, material), material
         except NetworkError as error:
-            if str(error) != said:
-                said = str(error)
+            if str(error) != logged:
+                logged = str(error)
                 log.warning("%s; retrying", error)
         stop.wait(_RETRY_SECONDS[min(attempt, len(_RETRY_SECONDS) - 1)])
         attempt += 1
@@ -66,7 +66,7 @@ def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, 
 
 
 class Connections:
-    """Who is connected to a session right now: says in the log when the last one goes, and when one is back."""
+    """The connections of a session: logs when the last one is lost, and when one is back."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._lock = threading.Lock()
@@ -89,7 +89,7 @@ class Connections:
         return left is not None and time.monotonic() - left <= seconds
 
     def close(self) -> None:
-        """From now on, connections end because we end them: nothing is said about it."""
+        """From now on, connections end because we end them: nothing is logged."""
         self._closing = True
 
     def _take(self, event: zenoh.TransportEvent) -> None:

@@ -20,7 +20,7 @@ class Cause(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class TallyEntry:
     """How often something happened."""
 
     cause: Cause
@@ -49,7 +49,7 @@ class Tally:
             before, _ = self._counts.get((cause, name), (0, ""))
             self._counts[cause, name] = before + count, last
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[TallyEntry]:
         """All that happened so far, in order of cause and name."""
         with self._lock:
-            return [Entry(*key, *value) for key, value in sorted(self._counts.items())]
+            return [TallyEntry(*key, *value) for key, value in sorted(self._counts.items())]

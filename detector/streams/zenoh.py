@@ -23,7 +23,7 @@ from detector.streams.inlets import Inlet
 from detector.streams.layouts import Pump, pump_for
 from detector.streams.liveliness import TokenWatch
 from detector.streams.membership import Membership
-from detector.streams.renewal import LOOK_EVERY, Renewal, Standing
+from detector.streams.renewal import LOOK_EVERY, CertificateState, Renewal
 from detector.streams.session import NetworkError, await_session, material_of, open_session
 from detector.streams.tally import Tally
 from wayside.api.stream import Stream
@@ -54,7 +54,7 @@ class Network:
         """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
 
         `answering` answers queries once there is a session. What was lost before the detector goes into the `tally`.
-        `on_failure` is told if a thread dies of an error. Certificates are looked at every so many seconds.
+        `on_failure` is called if a thread dies of an error. Certificates are checked every `look_every` seconds.
         """
         self._on_failure = on_failure
         self._config = config
@@ -85,7 +85,7 @@ class Network:
         self._thread.start()
 
     def publish(self, key: str, payload: bytes, encoding: str = EVENT_ENCODING) -> None:
-        """Queues an event, or what an action tells; never waits. With the queue full it is dropped and counted."""
+        """Enqueues an event or a message of an action; never waits. With the queue full it is dropped and counted."""
         with self._changed:
             if len(self._events) >= self._capacity or self._stop.is_set():
                 self.dropped_events += 1
@@ -93,10 +93,12 @@ class Network:
             self._events.append((key, payload, encoding))
             self._changed.notify()
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
-        """Sends a query to all who answer it, and waits for their answers, at most so many seconds.
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
+        """Sends a query to everyone who answers it, and waits at most `timeout` seconds for the answers.
 
-        Raises NetworkError where there is no session, nobody answers in time, or an answer is an error.
+        Raises NetworkError if there is no session, no answer in time, or an error as answer.
         """
         member = self._member
         if member is None:
@@ -122,7 +124,7 @@ class Network:
 
     @property
     def joined(self) -> bool:
-        """Whether there is a session: samples come in as soon as somebody is connected."""
+        """Whether there is a session: samples arrive as soon as there is a connection."""
         return self._member is not None
 
     @property
@@ -133,14 +135,14 @@ class Network:
 
     @property
     def listens(self) -> bool:
-        """Whether others may come by themselves, and it need not connect to anybody."""
+        """Whether others may come by themselves, and it need not connect itself."""
         return self._config.mode is not ZenohMode.CLIENT
 
     @property
-    def standing(self) -> Standing:
+    def certificate_state(self) -> CertificateState:
         """What is known of the certificates in use."""
         renewal = self._renewal
-        return Standing() if renewal is None else renewal.standing
+        return CertificateState() if renewal is None else renewal.certificate_state
 
     @property
     def dead(self) -> str | None:

@@ -70,5 +70,6 @@ def test_who_may_not_list_rules_is_told_so_in_one_line(control_plane: ControlPla
     assert answer.stdout == ""
     assert answer.stderr == (
         f"detector: cannot list the EventRules of namespace {namespace}: 401 Unauthorized: Unauthorized. "
-        "Check that KUBECONFIG points to the right cluster, and that its account may list eventrules.wayside.dev there\n"
+        "Check that KUBECONFIG points to the right cluster, and that its account may list "
+        "eventrules.wayside.dev there\n"
     )

@@ -79,7 +79,7 @@ def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
     before.take(open_one, speeds(10))
     before.finish(episode)
     before.close()
-    assert "waits in the spool" in before.outcome("e1").message
+    assert "stay in the spool" in before.outcome("e1").message
     way.restore()
     after = desk(spool=2**26)
     wait_until(lambda: scenario_or_none(database, "e2.keep").get("state") == "Interrupted")

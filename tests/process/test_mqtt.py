@@ -36,7 +36,7 @@ def mqtt(
     try:
         yield thread
     finally:
-        thread.tell_to_stop()
+        thread.request_stop()
         thread.join(PATIENCE)
     assert thread.state is State.STOPPED
 

@@ -289,13 +289,13 @@ def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
     begun = Event("h", "r", "car1", ("car1",), "episode1", at(1), at(1), None, None, {}, None)
     points = [a_sample(1 + k / 10, "points", MEGABYTE) for k in range(8)]
     begin = time.monotonic()
-    worker.tell(Begun(run, begun, Rendered(), resumed=False))
+    worker.enqueue(Begun(run, begun, Rendered(), resumed=False))
     for sample in points:
-        worker.tell(Sampled(run, [sample]))
-    worker.tell(Completed(run))
+        worker.enqueue(Sampled(run, [sample]))
+    worker.enqueue(Completed(run))
     assert time.monotonic() - begin < 30  # the disk stands still for twice as long
     go_on.set()
-    worker.tell_to_close()
+    worker.request_close()
     assert worker.join(60)
     tally = outcomes.tallies()[which]
     assert (tally.failed, tally.samples, tally.missing) == (1, 5, 3)

@@ -154,7 +154,7 @@ def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, a
         return sum(entry.count for entry in tally.entries() if entry.cause is Cause.FAILED)
 
     wait_for(lambda: failures() >= 3)
-    thread.tell_to_stop()
+    thread.request_stop()
     thread.join(PATIENCE)
     assert thread.state is State.STOPPED
     assert thread.last_error == error
@@ -167,7 +167,7 @@ def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_take
     Hanging.ended.clear()
     thread = a_thread("hanging", arrivals, tally)
     assert Hanging.began.wait(PATIENCE)  # what is told to stop before it runs, ends
-    thread.tell_to_stop()
+    thread.request_stop()
     thread.join(0.05)
     assert [(entry.cause, entry.count) for entry in tally.entries()] == [(Cause.LEFT_BEHIND, 1)]
     Hanging.ended.set()
@@ -225,9 +225,9 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
         ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed; did you mean once?"),
         (
             {"plugin": "unmet"},
-            "spec.sources[0].plugin: plugin unmet cannot be loaded: ModuleNotFoundError: No module named",
+            "spec.sources[0].plugin: cannot load plugin unmet: ModuleNotFoundError: No module named",
         ),
-        ({"plugin": "absent"}, "spec.sources[0].plugin: plugin absent cannot be loaded: AttributeError"),
+        ({"plugin": "absent"}, "spec.sources[0].plugin: cannot load plugin absent: AttributeError"),
         ({"plugin": "noparameters"}, "which is not a complete detector.sources.base.Source"),
         (
             {"plugin": "unfinished"},

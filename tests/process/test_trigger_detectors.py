@@ -273,7 +273,7 @@ def test_nobody_who_records_costs_only_the_recording(endpoint: str, tmp_path: Pa
     town.start()
     town.send("car1", {"v": 20})
     status = town.status_when(lambda status: any(each.running == 1 and each.current for each in status.actions))
-    assert "nobody answered" in next(iter(status.actions[0].current.values()))
+    assert "no response" in next(iter(status.actions[0].current.values()))
     town.send("car1", {"v": 1})
     town.status_when(lambda status: status.rules[0].ended == 1)
     status = town.status_when(lambda status: status.actions[0].failed == 1)

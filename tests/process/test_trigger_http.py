@@ -27,7 +27,9 @@ class NoNetwork:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         raise AssertionError(key)
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
         raise ActionError(f"{selector}: nobody answered")
 
 

@@ -1,4 +1,4 @@
-"""The database action: it turns what it is told of episodes into requests, and reports what became of them."""
+"""The database action: it turns episodes into requests, and reports their results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from wayside.api.database import Database as Place
 _log = logging.getLogger(__name__)
 
 FLUSH = 0.2
-"""Documents wait at most so many seconds for others to be sent with."""
+"""Maximum seconds that a document waits for others, to be sent in one batch."""
 
 
 @dataclass(slots=True)
@@ -55,7 +55,7 @@ class Database(Action[DatabaseAction]):
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
         self._awake = False
-        self._told_away = False
+        self._reported_away = False
 
     def started(self, episode: Episode) -> None:
         """Make the scenario known in the database, as one that is not complete."""
@@ -108,7 +108,7 @@ class Database(Action[DatabaseAction]):
         """Complete the scenario; the episode goes on in another."""
         self._finish(writing, Completion(), continues=True)
         writing.go_on(*self._open(writing.episode, str(begin), resumed=False))
-        self._take(writing, list(writing.said.values()))
+        self._take(writing, list(writing.latest.values()))
 
     def _add(self, scenario: Scenario, made: Made) -> None:
         document = made.document if not made.files else self._with_files(scenario, made)
@@ -129,7 +129,7 @@ class Database(Action[DatabaseAction]):
             self._flush(made.collection)
 
     def _with_files(self, scenario: Scenario, made: Made) -> bytes:
-        """The document, once the files that it refers to are written; it says which could not be."""
+        """The document, once the files that it refers to are written; it names those that could not be."""
         if self.parameters.dry_run or self._folder is None:
             scenario.files += len(made.files)
             return made.document
@@ -168,7 +168,7 @@ class Database(Action[DatabaseAction]):
                 losing(count, why)
 
     def completed(self, episode: Episode, completion: Completion) -> None:
-        """Queue what makes the scenario complete, or what says why it is not."""
+        """Enqueue the request that completes the scenario, or records why it is incomplete."""
         writing = self._writings[episode.id]
         writing.episode = episode
         self._finish(writing, completion, continues=False)
@@ -184,8 +184,8 @@ class Database(Action[DatabaseAction]):
             writing.trouble = writing.trouble or incomplete or ("" if complete else why)
             if not continues:
                 state = OutcomeState.FAILED if writing.trouble else OutcomeState.DONE
-                said = writing.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
-                self._report(episode, state, said, writing, completion)
+                message = writing.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
+                self._report(episode, state, message, writing, completion)
 
         if self._store is None:
             confirm(not incomplete, incomplete)
@@ -202,7 +202,7 @@ class Database(Action[DatabaseAction]):
                 self._connect()
             except ActionError as error:
                 _log.error("action %s of EventRule %s: %s", self.setting.action, self.setting.rule.name, error)
-        self._tell_whether_away()
+        self._report_availability()
         if not self._batches:
             return None
         left = self._due - time.monotonic()
@@ -212,16 +212,16 @@ class Database(Action[DatabaseAction]):
             self._flush(collection)
         return None
 
-    def _tell_whether_away(self) -> None:
-        """Say of each open episode that its documents have to wait, or no longer have to."""
+    def _report_availability(self) -> None:
+        """Report for each open episode whether its documents have to wait."""
         away = self._store.away if self._store is not None else ""
-        if bool(away) != self._told_away:
-            self._told_away = bool(away)
+        if bool(away) != self._reported_away:
+            self._reported_away = bool(away)
             for writing in self._writings.values():
                 self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is unavailable: {away}")
 
     def close(self) -> None:
-        """Let go of the queue; the last action that does waits for it, a few seconds."""
+        """Release the queue; the last action that does so waits a few seconds for it."""
         for collection in list(self._batches):
             self._flush(collection)
         if self._place is not None:

@@ -10,7 +10,7 @@ from detector.actions.database.attachments import Attachment
 
 
 class FolderError(Exception):
-    """A file could not be written; the text says why."""
+    """A file could not be written; the message gives the reason."""
 
 
 class Folder:

@@ -1,7 +1,7 @@
 """Requests in their order: in memory, and on disk while the server is away.
 
 The spool's records are always older than what is in memory. Where neither has room, what is *new* finds none, and
-whoever puts it learns that at once; what is in the queue stays whole.
+the caller learns that at once; what is in the queue stays whole.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Queue:
     """Several threads put and move to the disk, one takes."""
 
     def __init__(self, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` is told what cannot be read of the spool."""
+        """`lose` receives what cannot be read from the spool."""
         self.changed = threading.Condition()
-        """Held for a moment where the memory changes, and told of it."""
+        """Held briefly while the memory changes, and notified of it."""
         self._disk = threading.Lock()
         """Held while records are moved, taken or removed; taken before the other."""
         self._spool = spool
@@ -57,7 +57,7 @@ class Queue:
         return self._bytes + (0 if self._spool is None else self._spool.bytes)
 
     def has_room(self, size: int) -> bool:
-        """Whether so many bytes fit into the memory."""
+        """Whether this number of bytes fits into the memory."""
         return not self._bytes or self._bytes + size <= self._capacity
 
     def add(self, write: Write) -> None:

@@ -57,7 +57,9 @@ class Scenario:
 
 
 def type_id(rule: EventRule) -> str:
-    """A version of a rule: its scenarios are of one type. A rule from a file has no generation: its text tells."""
+    """A version of a rule: its scenarios are of one type. A rule from a file has no generation: its text identifies
+    it.
+    """
     version = str(rule.metadata.generation)
     if not rule.metadata.generation:
         version = hashlib.sha256(_text(rule).encode()).hexdigest()[:12]
@@ -108,7 +110,7 @@ def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue
 
 
 def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
-    """Scenarios that an earlier run left open: nobody writes them any more."""
+    """Scenarios that an earlier run left open: nothing writes them any more."""
     find = {"holder": holder, "rule": rule, "action": action, "state": OPEN}
     change = {"find": find, "change": {"$set": {"state": INTERRUPTED, "interrupted": True}}, "many": True}
     return Write(database, SCENARIOS, changes=[change])

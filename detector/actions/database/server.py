@@ -51,7 +51,7 @@ class UnavailableError(Exception):
 
 
 class RefusedError(Exception):
-    """The request as a whole cannot be done, now or later; the text says why."""
+    """The request as a whole cannot be done, now or later; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ class Server:
 
         Raises UnavailableError, RefusedError.
         """
-        with self._told():
+        with self._driver_errors():
             try:
                 return self._insert(write) if write.documents else self._change(write)
             except BulkWriteError as error:
@@ -131,7 +131,7 @@ class Server:
 
         Raises UnavailableError, RefusedError.
         """
-        with self._told(), pymongo.timeout(_COUNTING):
+        with self._driver_errors(), pymongo.timeout(_COUNTING):
             for collection, count in sorted(write.expected.items()):
                 found = self._client[write.database][collection].count_documents({"scenario": write.completes})
                 if found < count:
@@ -139,7 +139,7 @@ class Server:
         return ""
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _driver_errors(self) -> Iterator[None]:
         """The driver's errors as ours."""
         try:
             yield
@@ -159,7 +159,7 @@ class Server:
         collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]
         if (write.database, write.collection) not in self._indexed:
             try:
-                collection.create_index("scenario")  # what everybody asks for
+                collection.create_index("scenario")  # what most queries filter by
             except OperationFailure as error:  # it goes without
                 _log.warning("database: cannot create the index on %s: %s", write.collection, self._short(error))
             self._indexed.add((write.database, write.collection))

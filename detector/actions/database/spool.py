@@ -2,7 +2,7 @@
 
 Records are appended to segments (files that are numbered in their order) and synced before they count as kept. They
 are read in the same order; a segment is removed once all its records are done, so after a crash a few records come
-again. Each record carries its length and checksum: what a crash cut off is found and left out, and told.
+again. Each record carries its length and checksum: what a crash cut off is found, left out and reported.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SEGMENT = 8 * 2**20
 
 
 class SpoolError(Exception):
-    """The folder cannot be used; the text says why and what to do."""
+    """The folder cannot be used; the message gives the reason and the remedy."""
 
 
 @dataclass(slots=True)

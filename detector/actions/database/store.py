@@ -24,18 +24,18 @@ from detector.actions.database.work import Write
 _log = logging.getLogger(__name__)
 
 _LONGEST = 5.0
-"""Between two attempts lie at most so many seconds."""
+"""Maximum seconds between two attempts."""
 _SUSPECT = 3
-"""After so many connections that ended with one request, while the server answers others, it is the request."""
+"""Number of connections lost with one request, while the server answers others, after which the request is to blame."""
 
 _PATIENCE = 10
-"""So many tenths of a second somebody who puts waits for room before the disk is asked."""
+"""Tenths of a second that a producer waits for room before the disk is used."""
 
 _LAST_TRY = 0.5
-"""At the end, a server that is away gets so many seconds more."""
+"""Extra seconds at the end for a server that is unavailable."""
 
-_ANEW = 1.0
-"""After an unexpected error the queue rests so many seconds."""
+_RESTART_DELAY = 1.0
+"""Seconds that the queue pauses after an unexpected error."""
 
 Confirm = Callable[[bool, str], None]
 """Told that a scenario is complete in the database, or that it is not, and why."""
@@ -45,7 +45,7 @@ class Store:
     """The queue, and the thread that empties it."""
 
     def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` is told what is lost of an earlier run's records."""
+        """`lose` receives what is lost of the records of an earlier run."""
         self._server = server
         self._lose = lose
         self._queue = Queue(spool, lose)
@@ -75,7 +75,7 @@ class Store:
         return self._queue.bytes
 
     def first_time(self, what: object) -> bool:
-        """Whether it is asked for the first time."""
+        """Whether this is the first call."""
         with self._lock:
             new = what not in self._seen
             self._seen.add(what)
@@ -102,7 +102,7 @@ class Store:
                 self._queue.spill()
 
     def put_change(self, write: Write, confirm: Confirm | None = None) -> None:
-        """Queue what is said about scenarios: small, and never dropped."""
+        """Enqueue a change of a scenario: small, and never dropped."""
         with self._lock:
             if not self._left:
                 if confirm is not None:
@@ -137,7 +137,7 @@ class Store:
                 self._lose("times the database queue was restarted", 1, self._server.redact(error))
                 _log.error("database: restarting the queue: %s", type(error).__name__)
                 _log.debug("in the queue", exc_info=error)
-                time.sleep(_ANEW)
+                time.sleep(_RESTART_DELAY)
         self._leave()
 
     def _late(self) -> bool:
@@ -156,14 +156,14 @@ class Store:
     def _send(self, write: Write, patience: int = _SUSPECT) -> bool:
         """Write it, however often that takes; False where there is no more time.
 
-        `patience`: after so many connections that ended with it, documents are looked for that are to blame.
+        `patience`: after this number of connections lost with it, the documents to blame are searched.
         """
         pause, broke = 0.05, 0
         while True:
             try:
                 doubts = self._doubts or self._queue.damaged or self._queue.inherited
-                lacking = self._server.lacks(write) if doubts else ""
-                matched, refused = self._server.write(scenarios.give_up(write, lacking) if lacking else write)
+                missing = self._server.lacks(write) if doubts else ""
+                matched, refused = self._server.write(scenarios.give_up(write, missing) if missing else write)
             except RefusedError as error:
                 return self._divide(write, str(error))
             except UnavailableError as error:
@@ -182,7 +182,7 @@ class Store:
             if not all(self._reject(write, each.index, each.why) for each in refused):
                 return False
             if write.completes:
-                self._confirm(write, matched, lacking or (refused[0].why if refused else ""))
+                self._confirm(write, matched, missing or (refused[0].why if refused else ""))
             return True
 
     def _divide(self, write: Write, why: str) -> bool:

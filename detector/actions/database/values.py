@@ -16,7 +16,7 @@ _DEPTH = 100
 
 
 class UnfitError(ValueError):
-    """A message that cannot be a document; the text says why."""
+    """A message that cannot be a document; the error gives the reason."""
 
 
 def encoded(document: Mapping[str, Any]) -> bytes:

@@ -1,4 +1,4 @@
-"""Tasks as files, one each: the same loop works without a cluster, and whoever reads the folder sees the demands."""
+"""Tasks as files, one each: the same loop works without a cluster, and the folder shows the demands."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ Result = TypeVar("Result")
 
 
 class FileTaskStore:
-    """The tasks of one holder in a folder: `<name>.yaml` each, replaced in one step, so that nobody reads half a task.
+    """The tasks of one holder in a folder: `<name>.yaml` each, replaced in one step, so that no reader sees half a
+    task.
 
     A task's creationTimestamp is its event's start, to the second: the same drive gives the same files.
     """

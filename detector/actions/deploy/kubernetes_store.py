@@ -97,7 +97,7 @@ class KubernetesTaskStore:
             return _stored(await self._api.patch(TASKS, self._namespace, metadata.name, patch))
 
     def _own(self, obj: JsonObject) -> StoredTask | None:
-        """The task if it is the holder's and can be read; one of a newer version is left alone, and it is said once."""
+        """The task if it is the holder's and can be read; one of a newer version is ignored, and logged once."""
         try:
             stored = _stored(obj)
         except ValidationError as error:

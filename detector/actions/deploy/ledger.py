@@ -25,11 +25,11 @@ class Ledger:
         self.demands: Mapping[str, Demand] | None = None
         """None before the first `accept`: until then nothing may be changed, least of all ended."""
         self.stored: dict[str, StoredTask] | None = None
-        """None before the first snapshot: until then nobody knows what is there."""
+        """None before the first snapshot: until then the content of the store is unknown."""
         self.held: set[str] = set()
         """Demands whose task this process has seen live."""
         self.surrendered: set[str] = set()
-        """Demands whose task somebody else ended; they stay without one."""
+        """Demands whose task another client ended; they stay without a task."""
         self._ends: dict[str, int] = {}
 
     def accept(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> list[str]:
@@ -47,7 +47,7 @@ class Ledger:
         return self._due([*(name for name in before if name not in demands), *changed])
 
     def see(self, change: Snapshot | Update) -> list[str]:
-        """Take over what the store says."""
+        """Apply a change of the store."""
         known = self.stored or {}
         if isinstance(change, Snapshot):
             # What we wrote after the snapshot was taken is newer than it.
@@ -91,7 +91,7 @@ class Ledger:
             _log.warning("another client ended the task %s, which is still demanded; it stays ended", name)
 
     def end_of(self, name: str) -> int | None:
-        """When the demand ended, in nanoseconds since the epoch; None where nobody said."""
+        """When the demand ended, in nanoseconds since the epoch; None if it is unknown."""
         return self._ends.get(name)
 
     def _due(self, names: Iterable[str]) -> list[str]:

@@ -42,11 +42,11 @@ class DeployCounts:
 
     created: int = 0
     recreated: int = 0
-    """Created again, since somebody deleted them while they were demanded."""
+    """Recreated, because another client deleted them while they were demanded."""
     adopted: int = 0
     """Found there when they were to be created: made by a request whose answer was lost."""
     replaced: int = 0
-    """Deleted to be created anew, since what is demanded differs in what cannot be changed."""
+    """Deleted to be recreated, because the demand differs in an immutable field."""
     patched: int = 0
     ended: int = 0
     retried: int = 0
@@ -71,10 +71,10 @@ class DemandReconciler:
 
         Args:
             store: the holder's tasks.
-            now: nanoseconds since the epoch: when a task ends whose demand is gone and nobody says since when.
+            now: nanoseconds since the epoch: the end of a task whose demand is gone at an unknown time.
             concurrency: how many tasks are changed at the same time; the changes of one task are always in order.
             permitted: nothing is changed while this is not set, e.g. `HolderLease.held`. Default: always permitted.
-            traces: told of the tasks that were created.
+            traces: receives the tasks that were created.
         """
         self._traces = traces
         self._store = store
@@ -89,16 +89,16 @@ class DemandReconciler:
         self._away = Backoff(0.1, 5.0)
         self._reachable = asyncio.Event()
         self._pause = 0.0
-        self._said: set[tuple[Step, str]] = set()
+        self._logged: set[tuple[Step, str]] = set()
         self._stopping = asyncio.Event()
         self._deadline = 0.0
         self.counts = DeployCounts()
         self.looks = 0
-        """How often the store has told all that it has."""
+        """Number of snapshots of the store."""
 
     @property
     def pending(self) -> int:
-        """How many tasks are not yet as demanded and are being worked on."""
+        """Number of tasks in the work queue."""
         return len(self._queue)
 
     def update(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
@@ -114,7 +114,7 @@ class DemandReconciler:
             self._handed = (dict(demands), {**(waiting[1] if waiting else {}), **ended})
             loop = self._loop
         if waiting is None and loop is not None:
-            with suppress(RuntimeError):  # the loop is closed: nobody is left to act, and the next start makes good
+            with suppress(RuntimeError):  # the loop is closed: the next start reconciles
                 loop.call_soon_threadsafe(self._accept)
 
     async def run(self) -> None:
@@ -135,7 +135,7 @@ class DemandReconciler:
                 task.cancel()
 
     def stop(self, deadline: float = 3.0) -> None:
-        """Let `run` do what is due, for at most `deadline` seconds, and return. Live tasks stay alive."""
+        """Let `run` finish its work within `deadline` seconds, and return. Live tasks stay alive."""
         self._deadline = deadline
         self._stopping.set()
 
@@ -201,7 +201,7 @@ class DemandReconciler:
             try:
                 await self._change(step, name, demand, stored)
             except TaskRefusedError:
-                # Perhaps only because it is not what we thought: ended, deleted or made anew meanwhile.
+                # Possibly only because our copy is outdated: ended, deleted or recreated in the meantime.
                 current = await self._store.get(name)
                 self._ledger.put(name, current)
                 if self._ledger.next(name) is step and _same(current, stored):
@@ -256,8 +256,8 @@ class DemandReconciler:
 
     def _refused(self, step: Step, name: str, error: TaskRefusedError) -> None:
         self.counts.refused[error.reason] += 1
-        if (step, error.reason) not in self._said:
-            self._said.add((step, error.reason))
+        if (step, error.reason) not in self._logged:
+            self._logged.add((step, error.reason))
             _log.error(
                 "cannot %s the task %s (further failures of this kind are counted, not logged): %s",
                 step.value,

@@ -18,7 +18,7 @@ class StoredTask:
 
     task: ApplicationTask
     version: int
-    """Grows with each change of anything in the store, so that of two states the newer one can be told."""
+    """Grows with each change of anything in the store, so that the newer one of two states is known."""
 
     @property
     def live(self) -> bool:
@@ -27,7 +27,7 @@ class StoredTask:
 
     @property
     def leaving(self) -> bool:
-        """Whether somebody deleted it and the store has not yet removed it."""
+        """Whether it is deleted but not yet removed from the store."""
         return self.task.metadata.deletion_timestamp is not None
 
 
@@ -49,7 +49,7 @@ class Update:
 
 
 class StoreError(Exception):
-    """The store did not do what was asked."""
+    """The store did not carry out a request."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -63,15 +63,15 @@ class StoreUnavailableError(StoreError):
     def __init__(self, reason: str, message: str, retry_after: float = 0.0) -> None:
         super().__init__(reason, message)
         self.retry_after = retry_after
-        """Seconds that it asks to wait; 0 where it does not say."""
+        """Seconds to wait as the store requests; 0 if it gives none."""
 
 
 class TaskRefusedError(StoreError):
-    """The store will not have it, until somebody changes something."""
+    """The store refuses it; retrying without a change is useless."""
 
 
 class TaskExistsError(StoreError):
-    """A task of this name exists, perhaps somebody else's."""
+    """A task of this name exists, perhaps of another holder."""
 
 
 class TaskStore(Protocol):
@@ -81,7 +81,7 @@ class TaskStore(Protocol):
         """What is, then what changes, with a fresh snapshot at least every half minute. Never ends, raises nothing."""
 
     async def get(self, name: str) -> StoredTask | None:
-        """The holder's task of this name; None if there is none, or it is somebody else's."""
+        """The holder's task of this name; None if there is none, or it belongs to another holder."""
 
     async def create(self, task: ApplicationTask) -> StoredTask:
         """Store a new task. `TaskExistsError` if the name is taken."""
@@ -120,7 +120,7 @@ def belongs_to(task: ApplicationTask, holder: str) -> bool:
 
 
 def manifest(task: ApplicationTask) -> dict[str, Any]:
-    """The task as it is sent or written: without the fields that say nothing."""
+    """The task as it is sent or written: without empty fields."""
     document = task.to_json()
     document["metadata"] = {key: value for key, value in document["metadata"].items() if value}
     event = task.spec.event

@@ -1,4 +1,4 @@
-"""Headers and certificates of a request, read anew for each: a Secret that is renewed is used from then on."""
+"""Headers and certificates of a request, read again for each: a renewed Secret takes effect at once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wayside.api.actions.http import HttpAccess, HttpHeader
 
 @dataclass(frozen=True, slots=True)
 class Headers:
-    """The headers that the resource asks for, and which texts in them are secret."""
+    """The headers that the resource gives, and which texts in them are secret."""
 
     values: Mapping[str, str]
     secrets: tuple[str, ...]
@@ -64,7 +64,7 @@ def _value(header: HttpHeader, at: str) -> str:
 
 
 class TlsContexts:
-    """The TLS context of one endpoint, made anew when its files change."""
+    """The TLS context of one endpoint, rebuilt when its files change."""
 
     def __init__(self) -> None:
         self._made: tuple[object, ssl.SSLContext] | None = None

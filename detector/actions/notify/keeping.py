@@ -1,7 +1,7 @@
-"""What an action keeps on the state volume: what is not yet told, what is rendered for open episodes, dead letters.
+"""What an action keeps on the state volume: undelivered events, rendered texts of open episodes, dead letters.
 
-Where the Detector has no state volume, or its disk refuses, everything else goes on: what would not survive is counted,
-and so is what nobody was told of.
+Without a state volume, or if its disk fails, everything else continues: events that would not survive are counted,
+and so are undelivered ones.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Keeping:
             )
 
     def waiting(self) -> list[Notice]:
-        """What earlier runs did not tell, oldest first."""
+        """Undelivered events of earlier runs, oldest first."""
         found: list[Notice] = []
         for key, document in list(self._kept(_NOTICE).items()):
             try:
@@ -67,10 +67,10 @@ class Keeping:
         return found
 
     def keep(self, notice: Notice) -> None:
-        """Until `told`."""
+        """Until `delivered`."""
         self._put(_NOTICE + notice.id, notice.to_json())
 
-    def told(self, notices: Iterable[Notice]) -> None:
+    def delivered(self, notices: Iterable[Notice]) -> None:
         """These need not be kept any more."""
         self._drop([_NOTICE + notice.id for notice in notices])
 
@@ -100,7 +100,7 @@ class Keeping:
         self._drop([_OPEN + episode])
 
     def lose(self, notices: Iterable[Notice], why: str, attempts: int) -> None:
-        """Nobody will be told of these: they become dead letters, and are counted."""
+        """These are given up: they become dead letters, and are counted."""
         lost = list(notices)
         self._setting.lose(_LOST, len(lost), why)
         for notice in lost:
@@ -120,7 +120,7 @@ class Keeping:
                     self._letters.write(letter)
             except (OSError, ValueError) as error:
                 self._setting.lose("dead letters that could not be written", 1, str(error))
-        self.told(lost)
+        self.delivered(lost)
 
     def close(self, keep: bool) -> None:
         """The last call. Without `keep` nothing is left for the next start."""

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from detector.access import AccessError, secret_text
 from detector.actions.base import Messenger
 from detector.actions.http import HttpClient, HttpError, Verdict, judge
-from detector.actions.http.answer import wait_asked
+from detector.actions.http.answer import retry_after_seconds
 from detector.actions.notify.outbox import Delivery, Fate
 from wayside.api.actions.http import HttpAccess
 from wayside.api.actions.notify import ContentMode, NotifyHttp, NotifyZenoh
@@ -56,7 +56,7 @@ def _header_value(text: str) -> str:
 
 
 class Poster:
-    """Posts to one endpoint, and says what follows from its answer."""
+    """Posts to one endpoint, and interprets its response."""
 
     def __init__(self, access: HttpAccess, field: str) -> None:
         """`field` is where `access` stands in the rule."""
@@ -73,7 +73,9 @@ class Poster:
             return Delivery(Fate.DELIVERED, why)
         if verdict is Verdict.FINAL:
             return Delivery(Fate.REFUSED, why)
-        return Delivery(Fate.AGAIN, why, asked=wait_asked(answer.retry_after, time.time()), whole=answer.busy)
+        return Delivery(
+            Fate.AGAIN, why, retry_after=retry_after_seconds(answer.retry_after, time.time()), whole=answer.busy
+        )
 
 
 class HttpTarget:

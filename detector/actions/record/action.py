@@ -90,7 +90,7 @@ class Record(Action[api.Record]):
         self._settle(current, over=True)
 
     def wake(self) -> float | None:
-        """Flushes what waits, says how far recordings are, and deletes those that are too old."""
+        """Flushes queued samples, reports the progress of recordings, and deletes those that are too old."""
         now = time.monotonic()
         if now - self._expired >= _EXPIRE_SECONDS:
             self._expired = now
@@ -109,7 +109,7 @@ class Record(Action[api.Record]):
             self._settle(current, over=True)
 
     def _know(self, episode: Episode) -> _Open | None:
-        """What is known of the episode now is what its recording tells."""
+        """Update what the recording describes with the present state of the episode."""
         current = self._open.get(episode.id)
         if current is not None:
             current.episode = episode
@@ -143,7 +143,7 @@ class Record(Action[api.Record]):
         """A new recording. Raises NoRoomError, OSError."""
         surroundings = self.setting.surroundings()
         folder = Folder.create(self._destination(surroundings), description.rule, description.name, self._dropped)
-        return Recording(folder, description.told(), self.parameters, surroundings, start=start)
+        return Recording(folder, description.fields(), self.parameters, surroundings, start=start)
 
     def _tidy(self) -> None:
         """What earlier runs left behind is completed, beside this thread; what is too old is deleted."""

@@ -28,7 +28,7 @@ def compressor(compression: Compression) -> Compress:
 
 
 def decompress(name: str, data: bytes, size: int) -> bytes:
-    """The chunk of so many bytes. Raises ValueError where it cannot be read."""
+    """The chunk of `size` bytes. Raises ValueError where it cannot be read."""
     try:
         match name:
             case "":

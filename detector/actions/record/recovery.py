@@ -48,24 +48,24 @@ def _recovered(destination: Destination, path: Path) -> Kept | None:
     files = sorted(path.glob("*.mcap"), key=lambda each: int(each.stem.rpartition("_")[2]))
     folder.claim(sum(each.stat().st_size for each in path.iterdir()), 0, len(files))
     folder.use_room()
-    told = folder.described()
+    fields = folder.described()
     try:
         last = files[-1:]
-        found = () if told is None else ((_part(file, folder, told, file in last)) for file in files)
+        found = () if fields is None else ((_part(file, folder, fields, file in last)) for file in files)
         parts = [part for part in found if part is not None]
         samples = sum(part.contents.messages for part in parts)
-        if told is None or not samples:
+        if fields is None or not samples:
             folder.remove()
             return None
         return folder.publish(
-            parts, with_ending(told, cut=REASON, samples=samples, files=[part.name for part in parts])
+            parts, with_ending(fields, cut=REASON, samples=samples, files=[part.name for part in parts])
         )
     except OSError:
         folder.leave()
         raise
 
 
-def _part(path: Path, folder: Folder, told: dict[str, Any], last: bool) -> Part | None:
+def _part(path: Path, folder: Folder, fields: dict[str, Any], last: bool) -> Part | None:
     """The file, completed; None where nothing of it can be read: it is deleted.
 
     The last one is looked through even if it seems complete: the disk may not have had all of it.
@@ -80,7 +80,7 @@ def _part(path: Path, folder: Folder, told: dict[str, Any], last: bool) -> Part 
             return None
         try:
             file.add_metadata(METADATA_CUT, {"reason": REASON})
-            file.add_metadata(METADATA_END, ending(with_ending(told, cut=REASON, samples=file.contents.messages)))
+            file.add_metadata(METADATA_END, ending(with_ending(fields, cut=REASON, samples=file.contents.messages)))
             file.finish()
         finally:
             file.give_up()

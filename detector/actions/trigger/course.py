@@ -1,7 +1,7 @@
-"""The course of one recording elsewhere: what has been confirmed, and what is to be asked next, and when.
+"""The course of one recording elsewhere: what is confirmed, and the next request and its time.
 
 Level, not edge: as long as the episode lasts, the other system is to record, and afterwards it is not to. What is not
-confirmed is asked again, later and later, until it is given up. A start is asked for even where the episode is over
+confirmed is requested again with backoff, until it is given up. A start is requested even if the episode is over
 meanwhile, since the other system may hold what led to it in its buffer.
 
     START ─confirmed→ HOLD ─end or maximumDuration→ STOP ─confirmed→ AWAIT ─over→ FINISHED
@@ -25,7 +25,7 @@ FOREVER = float("inf")
 
 
 class Step(Enum):
-    """What is to be asked."""
+    """The next request."""
 
     START = "start"
     HOLD = "hold"
@@ -43,14 +43,14 @@ class Limits:
     give_up: float
     """A request that is not confirmed."""
     renew: float | None
-    """Until a start is said again."""
+    """Until a start is repeated."""
 
 
 class Course:
     """One recording elsewhere."""
 
     def __init__(self, order: Order, limits: Limits, now: float, onset: float, *, resumed: bool = False) -> None:
-        """`onset` is when the condition began to hold; `resumed`: another run of the detector may have asked before."""
+        """`onset` is when the condition began to hold; `resumed`: another run of the detector may have requested it."""
         self.order = order
         self._limits = limits
         self.onset = onset
@@ -58,7 +58,7 @@ class Course:
         """When the episode ended."""
         self.step = Step.START
         self.due = now
-        """When to ask next."""
+        """Time of the next request."""
         self.failures = 0
         """Requests in a row that were not confirmed."""
         self.confirmed = resumed
@@ -68,9 +68,9 @@ class Course:
         self.problem = ""
         """Why it did not go as it should; empty where it did."""
         self.note = ""
-        """What else there is to say."""
+        """Further information."""
         self.report = Report(Progress.UNKNOWN)
-        """The last that was said of the recording."""
+        """The last report about the recording."""
         self.lost_stop = False
         """Whether the stop was given up."""
         self._since = now
@@ -78,18 +78,18 @@ class Course:
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to ask."""
+        """Whether no request is left."""
         return self.step is Step.FINISHED
 
     def end(self, now: float, ended: float) -> None:
-        """The episode has `ended`, or nobody wants the recording any more."""
+        """The episode has `ended`, or the recording is no longer wanted."""
         if self.ended is None:
             self.ended = ended
             if self.step is Step.HOLD:
                 self._to(Step.STOP, now)
 
     def look(self, now: float) -> Step | None:
-        """What is to be asked now; None: nothing yet."""
+        """The request to send now; None: none yet."""
         if self.step is Step.HOLD and now >= self._limit:
             self.note = "its maximumDuration ended it before the episode ended" if self.ended is None else self.note
             self._to(Step.STOP, now)
@@ -102,7 +102,7 @@ class Course:
         return min(self.due, self._limit) if self.step is Step.HOLD else self.due
 
     def failed(self, now: float, why: str, *, silent: bool) -> None:
-        """The request was not confirmed; `silent`: nobody answered, so it may have arrived nevertheless."""
+        """The request was not confirmed; `silent`: there was no answer, so it may have arrived nevertheless."""
         self.failures += 1
         self.unanswered = self.unanswered or silent
         self.due = now + min(_FIRST_WAIT * 2 ** min(self.failures - 1, 10), _LONGEST_WAIT)
@@ -111,7 +111,7 @@ class Course:
         if self.step is Step.START:
             self.problem = f"gave up starting it: {why}"
             if self.unanswered:
-                self._to(Step.STOP, now)  # else it might record what nobody waits for
+                self._to(Step.STOP, now)  # else it might record for nothing
             else:
                 self.step = Step.FINISHED
         elif self.step is Step.STOP:
@@ -123,7 +123,7 @@ class Course:
             self.step = Step.FINISHED
 
     def answered(self, now: float, report: Report) -> None:
-        """The other system answered what `look` said to ask."""
+        """The other system answered the request that `look` returned."""
         if report.progress is Progress.REFUSED and self.step in (Step.START, Step.STOP):
             self.failed(now, report.message, silent=False)
             return

@@ -1,4 +1,5 @@
-"""Which recordings elsewhere have been asked for and not yet stopped: kept on the state volume, for the next start.
+"""The recordings on other systems that were requested and not yet stopped: kept on the state volume, for the next
+start.
 
 Without it, a recording whose episode ended just when the detector was killed would go on until its maximumDuration. The
 file is small and replaced in one step; it is written by the action's own thread.
@@ -20,11 +21,11 @@ _log = logging.getLogger(__name__)
 _VERSION = 1
 
 
-class Journal:
+class OrderJournal:
     """The orders of one action that are not finished."""
 
     def __init__(self, path: Path) -> None:
-        """Raises nothing: a journal that cannot be read or written is said, and done without."""
+        """Raises nothing: a journal that cannot be read or written is logged, and ignored."""
         self._path = path
         self._written: list[str] | None = None
         self.failures = 0

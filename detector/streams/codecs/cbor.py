@@ -23,7 +23,7 @@ stack."""
 
 
 class CborDecoder:
-    """Reads CBOR of any shape; it carries no stamp that could be known without asking the user."""
+    """Reads CBOR of any shape; only the stream knows which field is its stamp."""
 
     def decode(self, payload: bytes) -> Any:
         """The value. Raises DecodeError for anything but one CBOR data item, nested at most MAX_DEPTH deep."""
@@ -39,7 +39,7 @@ class CborDecoder:
         raise DecodeError("not CBOR: there are bytes after the data item")
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: which field is the stamp is for the stream to say."""
+        """None: the stream defines which field is the stamp."""
         return None
 
 

@@ -1,7 +1,7 @@
 """CDR: reads a few fields, by a function whose source is generated for the type and the paths (see `cdr_walk`).
 
 It finds what rosbags finds, and makes every check that rosbags makes, also of what it skips. A payload that fails one
-is decoded whole, so that the decoder says what is wrong.
+is decoded whole, so that the decoder reports what is wrong.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ None for a path that leads to nothing."""
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """A byte order: how an encapsulation says it, and how struct and numpy do."""
+    """A byte order: in an encapsulation, in struct and in numpy."""
 
     representation: bytes
     mark: int

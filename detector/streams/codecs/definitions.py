@@ -55,7 +55,7 @@ class DefinitionsError(ValueError):
 
 @lru_cache(maxsize=512)
 def parsed(definition: Definition) -> Typesdict:
-    """The type, and those that the text holds beside it. Raises DefinitionsError, which tells the line."""
+    """The type, and those that the text holds beside it. Raises DefinitionsError, which gives the line."""
     text = _SEPARATOR.sub("=" * 80, definition.text.replace("\r\n", "\n")).rstrip() + "\n"
     try:
         return get_types_from_msg(text, definition.name)
@@ -99,7 +99,7 @@ def merged(definitions: Sequence[Definition]) -> Typesdict:
 def check(definitions: Sequence[Definition], new: Typesdict, known: Mapping[str, Any]) -> None:
     """That fields are there once, of types that are new or known, and that no type holds itself.
 
-    Raises DefinitionsError, which tells the field.
+    Raises DefinitionsError, which gives the field.
     """
     problems = [
         (definition.name, f"{_place(definition, name, field)} {problem}")

@@ -22,7 +22,7 @@ _read = msgspec.json.Decoder().decode
 
 
 class JsonDecoder:
-    """Reads JSON of any shape; it carries no stamp that could be known without asking the user."""
+    """Reads JSON of any shape; only the stream knows which field is its stamp."""
 
     def decode(self, payload: bytes) -> Any:
         """The value. Raises DecodeError for anything but one JSON value in UTF-8, nested at most MAX_DEPTH deep."""
@@ -36,7 +36,7 @@ class JsonDecoder:
         return _with_doubles(value, MAX_DEPTH)
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: which field is the stamp is for the stream to say."""
+        """None: the stream defines which field is the stamp."""
         return None
 
     def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:

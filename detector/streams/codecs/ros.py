@@ -36,7 +36,7 @@ class RosTypes:
     """Message types by their names, e.g. geometry_msgs/msg/PoseStamped."""
 
     def __init__(self, load: Callable[[], Typestore]) -> None:
-        """`load` gives the types when they are first asked for: the classes of a release take 0.1 s to make."""
+        """`load` gives the types at their first use: the classes of a release take 0.1 s to make."""
         self._load = load
 
     @cached_property

@@ -38,7 +38,7 @@ def image(payload: bytes) -> NDArray[np.float32]:
     """The pixels of a sensor_msgs/msg/Image as (height, width, 3) in the order R, G, B, or (height, width, 1) if gray.
 
     Raises:
-        DecodeError: no such message, an encoding that is not known, or fewer bytes than it says.
+        DecodeError: no such message, an encoding that is not known, or fewer bytes than it declares.
     """
     message = _message(payload, IMAGE)
     if message.encoding not in _PIXELS:
@@ -64,7 +64,7 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
     """The points of a sensor_msgs/msg/PointCloud2 as (points, fields), without those that have a NaN there or no place.
 
     Raises:
-        DecodeError: no such message, a field that it does not have, or fewer bytes than it says.
+        DecodeError: no such message, a field that it does not have, or fewer bytes than it declares.
     """
     message = _message(payload, POINT_CLOUD)
     described = {field.name: field for field in message.fields}

@@ -23,7 +23,7 @@ from detector.actions import (
     registry,
 )
 from detector.actions.host import ActionHost
-from detector.actions.outcomes import Tally, Which
+from detector.actions.outcomes import ActionTally, Which
 from detector.actions.worker import SILENT
 from detector.assembly import inlets
 from detector.engine.engine import Engine
@@ -143,20 +143,20 @@ class Site:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         self.published.append((key, payload))
 
-    def ask(self, *_: Any) -> list[bytes]:
+    def query(self, *_: Any) -> list[bytes]:
         raise ActionError("nobody")
 
     def follow(self, *rules: EventRule) -> None:
         entries = inlets(DETECTOR)
         self.host.follow(rules, Surroundings(DETECTOR, entries.decoders, entries.types))
         self.engine.set_rules(compiled(DETECTOR, *rules))
-        self.host.tell(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.take(self.engine.now))
 
     def take(self, *speeds: tuple[float, str, float], until: float) -> None:
         self.engine.advance([arrival(seconds, client, {"v": v}) for seconds, client, v in speeds], at(until))
-        self.host.tell(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.take(self.engine.now))
 
-    def tally(self, action: str) -> Tally:
+    def tally(self, action: str) -> ActionTally:
         return self.host.outcomes.tallies()[Which("fast", action)]
 
     def when(self, true: Callable[[], bool]) -> None:

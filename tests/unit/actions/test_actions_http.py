@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from detector.actions.http import Answer, HttpClient, HttpError, Verdict, judge
-from detector.actions.http.answer import wait_asked
+from detector.actions.http.answer import retry_after_seconds
 from tests.certificates import Authority
 from tests.http_servers import Behaviour, answers, drips, echoes_headers, endpoint, endpoint_for, hangs, nobody, sends
 from wayside.api.actions.http import HttpAccess, HttpHeader
@@ -222,7 +222,7 @@ def test_what_follows_from_a_status(status: int, verdict: str) -> None:
     ],
 )
 def test_retry_after_is_understood_in_both_forms(text: str, seconds: float) -> None:
-    assert wait_asked(text, 1_767_225_600.0) == seconds
+    assert retry_after_seconds(text, 1_767_225_600.0) == seconds
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from detector import entrypoints
 from detector.actions import Action
 from detector.actions.registry import OFFERS, action_problems, prepare
-from detector.assembly import RuleBook, inlets
+from detector.assembly import RuleIndex, inlets
 from detector.checking import check_documents
 from tests.driving import a_detector, a_rule
 from wayside.api.documents import load_documents
@@ -92,9 +92,9 @@ def test_check_tells_line_and_column(tmp_path: Path) -> None:
 
 
 def test_a_rule_whose_action_is_refused_goes_on_as_it_last_was() -> None:
-    book, detector = RuleBook(), a_detector()
-    book.compile([rule("lamp", colour="red")], detector, inlets(detector).fields)
-    (kept,), (refusal,) = book.compile([rule("lamp")], detector, inlets(detector).fields)
+    index, detector = RuleIndex(), a_detector()
+    index.compile([rule("lamp", colour="red")], detector, inlets(detector).fields)
+    (kept,), (refusal,) = index.compile([rule("lamp")], detector, inlets(detector).fields)
     assert kept.name == "r"
     assert refusal.kept
     assert "plugin.parameters.colour" in str(refusal)

@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.catalog.catalog import Catalog, ChoiceError, Entry, catalog, choose
+from detector.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
 from detector.catalog.markdown import markdown_view
 from detector.catalog.page import page
 from detector.cli import app
@@ -25,11 +25,11 @@ HOSTILE = "</script><b>x</b> | `a` **b** \"'&\n## heading"
 ACTIONS = next(dimension for dimension in SCHEME if dimension.name == "typeOfAction")
 
 
-def an_entry(name: str, place: str = "rules.yaml:1", description: str = "", **values: list[str]) -> Entry:
-    return Entry(name, place, description, Classification.model_validate(values))
+def an_entry(name: str, place: str = "rules.yaml:1", description: str = "", **values: list[str]) -> CatalogEntry:
+    return CatalogEntry(name, place, description, Classification.model_validate(values))
 
 
-def names(entries: tuple[Entry, ...]) -> list[str]:
+def names(entries: tuple[CatalogEntry, ...]) -> list[str]:
     return [each.name for each in entries]
 
 

@@ -108,7 +108,9 @@ def test_an_error_of_a_condition_names_client_and_stream(desk: Desk) -> None:
 
 def test_samples_that_name_no_client_are_counted_with_a_key(desk: Desk) -> None:
     path = desk.drive("drive.jsonl", (0.5, {"v": 3}), (2.0, {"v": 3}), key="vehicles/no name/speed")
-    said = "2 samples of stream speed dropped because neither key nor message names a client; the last: the key vehicles/no name/"
+    said = (
+        "2 samples of stream speed dropped because neither key nor message names a client; the last: the key vehicles/"
+    )
     assert said in desk.replay(path).said
 
 
@@ -169,8 +171,8 @@ def test_with_clock_data_a_header_that_is_seconds_behind_is_named_with_its_strea
     recording = recorded(stamped("pose", 0.1), stamped("speed", 5.2, v=1))
     path = write_lines(desk.folder / "drive.jsonl", *recording)
     warning = (
-        "warning: the stamps of stream speed are 5.1 s further behind the receive times than those of stream pose: with "
-        "clock Data this makes its samples late; set the clock of the sender, give streams[speed].stamp"
+        "warning: the stamps of stream speed are 5.1 s further behind the receive times than those of stream pose: "
+        "with clock Data this makes its samples late; set the clock of the sender, give streams[speed].stamp"
     )
     assert warning in desk.replay(path).said
     ran = desk.run("check", "--strict", "detector.yaml", "rules.yaml", "--recording", str(path))

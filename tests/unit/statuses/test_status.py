@@ -21,7 +21,7 @@ from detector.status.keeping import StatusKeeper
 from detector.status.model import CertificateStatus, Explanation, RuleState, Status, read_status, to_json
 from detector.status.table import status_view
 from detector.streams.answering import Answering
-from detector.streams.asking import NoAnswerError, ask
+from detector.streams.querying import NoAnswerError, query_detectors
 from detector.streams.zenoh import Network
 from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.ports import free_endpoint
@@ -192,13 +192,13 @@ def answering(endpoint: str) -> Iterator[None]:
 def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoint: str) -> None:
     config = Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])
     for holder in ("d", "*"):
-        (answer,) = ask(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 30)
+        (answer,) = query_detectors(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 30)
         assert answer.key == "wayside/detectors/d/status"
         assert b"'rule': 'r', 'subject': 'a+b~c'" in answer.payload
     with pytest.raises(NoAnswerError, match="does not answer 'nonsense'"):
-        ask(config, "d", "nonsense", {}, 30)
+        query_detectors(config, "d", "nonsense", {}, 30)
     with pytest.raises(NoAnswerError, match=r"no response from detector other at tcp/.* within 0.5 s: is it running"):
-        ask(config, "other", "status", {}, 0.5)
+        query_detectors(config, "other", "status", {}, 0.5)
 
 
 @pytest.mark.usefixtures("answering")

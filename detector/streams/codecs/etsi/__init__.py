@@ -44,7 +44,7 @@ class EtsiDecoder:
         return self._read(payload)[1]
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: most messages tell their time only together with the receive time."""
+        """None: most messages give their time only together with the receive time."""
         return None
 
     def stamp_near(self, payload: bytes, received: int) -> int | None:

@@ -1,7 +1,7 @@
 """ASN.1 definitions from files that the user brings: read and resolved by asn1tools (MIT).
 
-asn1tools says what types there are. What it leaves out is looked up in the text itself: which type an open type holds,
-as `{Type IDENTIFIED BY value}` of an information object set tells it.
+asn1tools gives the types. What it leaves out is looked up in the text itself: which type an open type holds,
+as `{Type IDENTIFIED BY value}` of an information object set gives it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class OwnDefinitions:
         return None
 
     def _walk(self, found: Any, name: str = "") -> asn1.Type:
-        """`name` is the type's, where the compiled type itself does not say it."""
+        """`name` is the type's, where the compiled type itself does not give it."""
         made = self._done.get(id(found))
         if made is None:
             made = self._done[id(found)] = (found, self._convert(found, name or found.type_name))

@@ -1,6 +1,6 @@
 """What is around an ITS message on the air: GeoNetworking, the security envelope, BTP. It is taken off, not checked.
 
-Which of them are there is told by the bytes. A message begins with its protocol version and a message number that is
+The bytes show which of them are present. A message begins with its protocol version and a message number that is
 not zero, GeoNetworking's basic header has a zero in that place, and BTP begins with a port from 2001 on. Signatures
 are not verified: a rule that must rely on who sent a message needs a receiver that verifies before it forwards.
 
@@ -43,10 +43,10 @@ _UNSECURED, _SIGNED, _ENCRYPTED = 0x80, 0x81, 0x82
 
 
 _DATA_PRESENT = 0x40
-"""The bit in the preamble of a SignedDataPayload that says it holds the data."""
+"""The bit in the preamble of a SignedDataPayload for the presence of the data."""
 
 _NESTED = 4
-"""A secured packet may hold another; so many and no more."""
+"""Maximum nesting of secured packets."""
 
 
 def message_in(payload: bytes) -> bytes:

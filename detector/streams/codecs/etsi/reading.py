@@ -1,7 +1,7 @@
 """From ASN.1 types to functions that read UPER (ITU-T X.691) into plain maps, lists, strings and doubles.
 
 A function is made once for each type. It makes values plain on the way: CHOICE → {name: value}, BIT STRING → list of
-names, ENUMERATED → name, numbers as `quantities` says. Names of components have `_` for `-`, so that expressions can
+names, ENUMERATED → name, numbers as `quantities` defines. Names of components have `_` for `-`, so that expressions can
 write them behind a point. What is not sent is not in the map.
 """
 
@@ -46,7 +46,7 @@ class Readers:
             case asn1.Boolean():
                 return lambda bits: bits.take(1) == 1
             case asn1.Null():
-                return lambda bits: True  # in a CHOICE, that it is there is all it says; null would read as unknown
+                return lambda bits: True  # in a CHOICE its presence is its value; null would read as unknown
             case asn1.Integer():
                 return _integer(kind)
             case asn1.Enumerated():
@@ -239,7 +239,7 @@ def _text(kind: asn1.Text) -> Read:
 
 
 def _counted(size: asn1.Size, take: Callable[[Bits, int], Any], join: Callable[[list[Any]], Any]) -> Read:
-    """Reads a length as `size` says, then so many things."""
+    """Reads a length as `size` defines, then that number of items."""
 
     def unbounded(bits: Bits) -> Any:
         return join([take(bits, length) for length in bits.lengths()])
