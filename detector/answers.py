@@ -26,7 +26,7 @@ from wayside.times import format_time
 Result = TypeVar("Result")
 
 _PATIENCE = 5.0
-"""Seconds in which the evaluation should have time for a question."""
+"""Seconds to wait for the evaluation."""
 
 _RUNS = 20
 """Maximum number of episodes per action whose last message is shown."""
@@ -36,7 +36,7 @@ _SILENT = 30.0
 
 
 class Answers:
-    """Answers requests, on whichever thread they come."""
+    """Answers requests, on any thread."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Answers:
         return answer(given)
 
     def status(self) -> Status:
-        """The newest status, with what only the shell knows."""
+        """The newest status, with the parts that the engine does not know."""
         latest, outlet = self._evaluator.status.latest, self._outlet()
         dropped = [
             Drops("event_unpublished", "events not published", outlet.network.dropped_events),

@@ -1,4 +1,4 @@
-"""From the resources to an engine: decoders, keys and compiled rules. Live operation and replay do it alike."""
+"""From the resources to an engine: decoders, keys and compiled rules. Live operation and replay share it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Inlets:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A rule that is not evaluated as it is written, and why."""
+    """A rule that is refused, with the reason."""
 
     rule: EventRule
     problems: tuple[RuleProblem, ...]
@@ -188,7 +188,7 @@ class RuleIndex:
     def compile(
         self, rules: Sequence[EventRule], detector: Detector, fields: Mapping[str, Fields]
     ) -> tuple[list[CompiledRule], list[Refusal]]:
-        """The rules to evaluate, and those that are not evaluated as they are written."""
+        """The rules to evaluate, and the refused ones."""
         compiled: list[CompiledRule] = []
         refused: list[Refusal] = []
         good: dict[str, EventRule] = {}

@@ -1,4 +1,4 @@
-"""What the detector proves itself with on a network, as one whole: certificates, key and password of one moment.
+"""The certificates, key and password of the detector for a network, all read at one moment.
 
 The files may change at any time, one after the other. So they are read, tried as a pair, and read again: what is given
 on belongs together, and stays what it is while a session uses it.
@@ -15,7 +15,7 @@ from detector.access import AccessError, Login, TlsFiles, login, tls_files
 from wayside.api.access import Access
 
 _ATTEMPTS = 5
-"""So often files that change while they are read are read again."""
+"""Number of attempts to read files that change in the meantime."""
 
 
 @dataclass(frozen=True, slots=True)

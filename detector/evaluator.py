@@ -42,13 +42,13 @@ _log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 _DRAIN_EVERY = 0.05
-"""Seconds between two looks at the intake, so that its queue stays short however rare the ticks are."""
+"""Seconds between two reads of the intake, so that its queue stays short even if ticks are rare."""
 
 _LOG_EVERY = 1.0
-"""Seconds between two looks at what was lost: there are counters for each rule and stream."""
+"""Seconds between two checks for losses: there are counters for each rule and stream."""
 
 _STALL = 1_000_000_000
-"""Nanoseconds: a tick that is overdue by more is not made up for, and a clock that stepped back further is believed."""
+"""Nanoseconds: a tick that is overdue by more is skipped, and a larger step back of the clock is accepted."""
 
 
 class Recorder(Protocol):
@@ -58,7 +58,7 @@ class Recorder(Protocol):
         """Samples that the engine takes in now."""
 
     def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
-        """What comes from now on belongs to these streams."""
+        """The following arrivals belong to these streams."""
 
     def control(self, time: int, document: Mapping[str, Any]) -> None:
         """Another input of the engine, at a time in nanoseconds since the epoch."""
@@ -80,17 +80,17 @@ class Outlet(Protocol):
         """The consequences for actions other than deploy, in order."""
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
-        """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
+        """All demands by task name, and the ends of those that are gone (nanoseconds)."""
 
 
 class Onlooker(Observer, Protocol):
-    """Sees what is evaluated, on the evaluation's thread. It decides nothing, and never waits."""
+    """Observes the evaluation, on its thread. It decides nothing, and never waits."""
 
     def attend(self, engine: Engine) -> None:
         """The engine has other rules from now on."""
 
     def looked(self, engine: Engine, events: Sequence[Event]) -> None:
-        """The engine has taken in what came, and these events happened."""
+        """The engine has consumed the arrivals, and these events happened."""
 
 
 class Evaluator:
@@ -125,7 +125,7 @@ class Evaluator:
         self._wanted: RuleSet | None = None
         self._stopping = False
         self._urgent = False
-        """Whether samples came that rules are evaluated with, since the last look began."""
+        """Whether samples for rules with onSample arrived since the last look began."""
         self._ended = False
         self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
         self._overload = Overload()
@@ -169,7 +169,7 @@ class Evaluator:
         self._thread.start()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
-        """Have something done on the evaluation's thread, between two looks; thread-safe. Gives what it returns."""
+        """Run a function on the thread of the evaluation, between two looks; thread-safe. The future has its result."""
         future: Future[Result] = Future()
         with self._wake:
             if self._ended:
@@ -197,7 +197,7 @@ class Evaluator:
             self._wake.notify()
 
     def stop(self) -> None:
-        """Take in what has arrived, run what is due and end; returns when that is done."""
+        """Consume the remaining arrivals, run due ticks and end; returns when that is done."""
         with self._wake:
             self._stopping = True
             self._wake.notify()
@@ -224,7 +224,7 @@ class Evaluator:
                 self._sweeper.look()
             self._finish()
             self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
-        except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
+        except BaseException as error:  # noqa: BLE001  the supervisor must learn of any end of the evaluation
             self._on_failure(error)
         finally:
             with self._wake:
@@ -234,13 +234,13 @@ class Evaluator:
 
     def _hurry(self) -> None:
         """Look at the intake now; thread-safe."""
-        if not self._urgent:  # else the next look, which has not drained the intake yet, finds what came
+        if not self._urgent:  # else the next look, which has not drained the intake yet, finds the arrivals
             with self._wake:
                 self._urgent = True
                 self._wake.notify()
 
     def _finish(self) -> None:
-        """Nothing more comes: evaluate what is still to be evaluated, as the replay of the recording will."""
+        """The end of input: evaluate the remaining ticks, as the replay of the recording does."""
         end = self._engine.now
         for events in self._engine.finish():
             self._hand_over(events)
@@ -254,7 +254,7 @@ class Evaluator:
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
 
     def _look(self, wanted: RuleSet | None) -> None:
-        """Take in what has arrived and run the ticks that are due."""
+        """Consume the arrivals and run the due ticks."""
         now = self._now()
         events: list[Event] = []
         if now + _STALL < self._intake.last:
@@ -284,7 +284,7 @@ class Evaluator:
         _log.info("EventRule %s is %s", rule, "paused; its open episodes are kept" if paused else "evaluated again")
 
     def _adapt(self, spent: int) -> None:
-        """Leave out more where the look took too long, and less when it is calm again."""
+        """Thin more evaluations after a slow look, and fewer once looks are fast again."""
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
             text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"

@@ -46,7 +46,7 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each detector.")] = False,
     timeout: Timeout = 3.0,
 ) -> None:
-    """Say what running detectors take in, evaluate and lose; of a rule also what it sees, and what is unknown."""
+    """Show what running detectors receive, evaluate and lose; for a rule also its values, and what is unknown."""
     if subject is not None and rule is None:
         refuse("--subject requires --rule")
     given = {"rule": rule, "subject": subject, "wait": f"{min(timeout * 0.6, 99):.3f}"} if rule is not None else {}
@@ -82,7 +82,7 @@ def evaluate(
 def pause(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
-    """Do not evaluate a rule until it is resumed; its open episodes hold."""
+    """Do not evaluate a rule until it is resumed; its open episodes are kept."""
     _print_replies("pause", rule, inquire("pause", {"rule": rule}, detector, name, connect, timeout))
 
 
@@ -107,7 +107,7 @@ def inquire(
     timeout: float,
     payload: bytes | None = None,
 ) -> list[Reply]:
-    """Ask the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
+    """Query the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
     with importing():
         from detector.rules.files import load_rules
         from detector.streams.querying import query_detectors

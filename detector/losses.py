@@ -24,7 +24,7 @@ from wayside.rules import PairSubject
 _log = logging.getLogger(__name__)
 
 _APART = 1_000_000_000
-"""Nanoseconds: streams whose delays differ by more are not of one time."""
+"""Nanoseconds: streams whose delays differ by more have diverging stamps."""
 
 _EVERY = 60.0
 """Seconds between two lines about the same kind of loss: bad input may come a thousand times a second."""
@@ -47,7 +47,7 @@ class Loss:
 
 
 class Losses:
-    """Says what is new in the counters of an engine and its intake."""
+    """Logs what is new in the counters of an engine and its intake."""
 
     def __init__(
         self, engine: Engine, intake: Intake | None = None, monotonic: Callable[[], float] = time.monotonic
@@ -100,7 +100,9 @@ class Losses:
                 yield f"{of_rule}: {often}" if often else of_rule
 
     def doubts(self) -> Iterator[Finding]:
-        """Streams whose stamps do not fit the clock; where counters watch ages, rules that use or lack old samples."""
+        """Streams whose stamps do not match the clock; where counters watch ages, rules that use or lack old
+        samples.
+        """
         yield from (finding for _, finding in self._apart())
         spec = self._engine.detector.spec
         for name, rule in self._engine.counters.rules.items():
@@ -134,7 +136,7 @@ class Losses:
         return run is not None and isinstance(run.rule.subject, PairSubject)
 
     def _apart(self) -> Iterator[tuple[str, Finding]]:
-        """With clock Data, streams whose stamps do not fit those of the others: a name for each line, and it."""
+        """With clock Data, streams whose stamps diverge from those of the others: a key and a finding for each."""
         counters = self._engine.counters
         all_unstamped = counters.delays.keys() <= counters.unstamped.keys()
         right = _right(counters.delays)
@@ -230,7 +232,7 @@ def _often(rule: RuleCounters, *, in_pairs: bool) -> Iterator[str]:
 
 
 def _right(delays: Mapping[str, int]) -> tuple[str, int]:
-    """The stream whose stamps are taken as right, and its delay in nanoseconds.
+    """The stream with the reference stamps, and its delay in nanoseconds.
 
     No stamp lies after its receipt, so the smallest delay is right; where all do, that nearest to the receipt.
     """

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 
 _YOUNG = 100_000
-"""So many new containers start a search among the young ones."""
+"""Number of new containers that starts a search among the young ones."""
 
 _SWEEP, _TRIM = 5.0, 60.0
 """Seconds after which the young ones are searched in any case, and free memory is given back: both milliseconds."""

@@ -75,7 +75,7 @@ class LiveOutlet:
             _log.error("cannot join the network of the changed Detector; correct it: %s", error)
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
-        """Have what is open written to the state volume, where there is one."""
+        """Write the open episodes to the state volume, if there is one."""
         if self._state is not None:
             self._state.save(episodes())
 
@@ -88,7 +88,7 @@ class LiveOutlet:
         self.actions.dispatch(consequences if self._traces is None else self._traces.consequences(consequences))
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
-        """See `Messenger`: for the actions, which need not know that the network may be another tomorrow."""
+        """See `Messenger`: for the actions, which are independent of changes of the network."""
         self.network.publish(key, payload, encoding)
 
     def query(

@@ -23,7 +23,7 @@ class Restored:
 
 
 async def what_was_open(store: TaskStore, state: StateFile | None) -> Restored:
-    """Look at both. Waits for as long as the store is away; cancel it to give up."""
+    """Read both. Waits while the store is unavailable; cancel it to give up."""
     async with aclosing(store.follow()) as changes:
         async for change in changes:
             if isinstance(change, Snapshot):

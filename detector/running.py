@@ -1,4 +1,4 @@
-"""A detector at work: intake, evaluation, network, event log and recording, wired, started and ended in order."""
+"""A detector at work: intake, evaluation, network, event log and recording, wired, started and stopped in order."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class Running:
         self._summarise()
 
     async def until(self, stopping: asyncio.Event) -> None:
-        """Wait for the end. Raises what ended the evaluation, if it was that."""
+        """Wait for the end. Raises the error that ended the evaluation, if any."""
         async with asyncio.TaskGroup() as group:
             ending = group.create_task(stopping.wait())
             self._failed.add_done_callback(lambda _: ending.cancel())
@@ -166,7 +166,7 @@ class Running:
             self._failed.result()
 
     async def follow(self, changes: AsyncIterator[RuleSet]) -> None:
-        """Take over each change of the Detector and its rules."""
+        """Apply each change of the Detector and its rules."""
         async for wanted in changes:
             detector, before = self._good(wanted.detector), self._rule_set.detector.spec
             self._rule_set = replace(wanted, detector=detector)
@@ -190,11 +190,11 @@ class Running:
         )
 
     def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
-        """What takes a stream's messages; what happens to tokens is never dropped lightly."""
+        """The inputs for the messages of a stream; changes of tokens are dropped last."""
         return self._intake.patient_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
 
     def _good(self, wanted: Detector) -> Detector:
-        """The changed Detector; the last one where it cannot run."""
+        """The changed Detector, or the last good one if it cannot run."""
         try:
             _checked(wanted)
         except DetectorError as error:
@@ -223,7 +223,7 @@ def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:
 
 
 def _server(port: int, answers: Answers) -> StatusServer:
-    # Not at the top: only a detector that is scraped owes the time to import it.
+    # Not at the top: only a detector that is scraped needs the import.
     from detector.status.metrics import Metrics  # noqa: PLC0415
 
     metrics = Metrics(answers.status)

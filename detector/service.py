@@ -1,4 +1,4 @@
-"""`detector run`: wires streams, evaluation, actions and rules together, and ends in good order on SIGTERM.
+"""`detector run`: wires streams, evaluation, actions and rules together, and stops cleanly on SIGTERM.
 
 Zenoh ─▶ intake ─▶ evaluator (thread, owns the engine) ─▶ events: Zenoh, file
                       ▲                                └▶ demands: reconciler ─▶ tasks (API server, or files)
@@ -44,7 +44,7 @@ class Named:
     namespace: str | None
     output: Path | None
     holder: str
-    """By whose name tasks are emitted: the Detector's, or `<name>.<pod>` where several pods run it."""
+    """The holder of the tasks: the name of the Detector, or `<name>.<pod>` if several pods run it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 _VERSION = 1
 _RETRY = 5.0
-"""Seconds after which a write that failed is tried again, if nothing changes before."""
+"""Seconds after which a failed write is retried, if nothing changes before."""
 
 
 def state_file(detector: Detector, holder: str) -> StateFile | None:
@@ -56,7 +56,7 @@ class StateFile:
         self._closing = False
         self._thread: threading.Thread | None = None
         self.failures = 0
-        """Writes that the disk refused; each was tried again."""
+        """Number of failed writes; each was retried."""
         self.last_failure = ""
         self.set_aside = 0
         """Files that could not be read."""
@@ -112,7 +112,7 @@ class StateFile:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what waits; returns when that is done, or the disk has refused it."""
+        """Write what waits; returns when that has succeeded or failed."""
         with self._changed:
             self._closing = True
             self._changed.notify()

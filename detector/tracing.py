@@ -29,7 +29,7 @@ class EpisodeTraces:
         self.tracing = tracing
 
     def event(self, event: Event) -> Event:
-        """The event, with where its episode stands."""
+        """The event, with the trace context of its episode."""
         return msgspec.structs.replace(event, traceparent=str(self._context(event.rule, event.episode)))
 
     def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:

@@ -1,4 +1,4 @@
-"""Runs the actions of all rules, follows changes of the rules, and ends in good order.
+"""Runs the actions of all rules, follows changes of the rules, and stops them cleanly.
 
 engine ─▶ consequences ─▶ host ─▶ a worker for each action of each rule, with a thread of its own
                                       └▶ outcomes: status, follow-ups on Zenoh

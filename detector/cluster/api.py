@@ -154,4 +154,5 @@ class Api:
         except (aiohttp.ClientError, TimeoutError, OSError) as error:
             raise UnavailableError(0, "NoAnswer", f"{method} {url}: {error or type(error).__name__}") from error
         except json.JSONDecodeError as error:
-            raise UnavailableError(0, "NoAnswer", f"{method} {url}: the answer is cut or no JSON: {error}") from error
+            text = f"{method} {url}: the response is truncated or not JSON: {error}"
+            raise UnavailableError(0, "NoAnswer", text) from error

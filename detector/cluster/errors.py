@@ -45,7 +45,7 @@ class ConflictError(RefusedError):
 
 
 class GoneError(RefusedError):
-    """The server no longer has the history from which to continue a watch: list again."""
+    """The resource version is too old to continue a watch: list again."""
 
 
 _UNAVAILABLE_CODES = frozenset({401, 408, 429})

@@ -15,7 +15,7 @@ KIND = "plugin"
 
 
 class Outages:
-    """Notes when a plugin goes and comes back; in a replay, knows it beforehand."""
+    """Notes when a plugin stops and runs again; in a replay, reads it from the recording."""
 
     def __init__(self, recorded: Callable[[], Iterable[Mapping[str, Any]]] | None = None) -> None:
         """`recorded` gives the controls of an intake file; it is called when the first plugin is."""

@@ -1,7 +1,7 @@
 """The process of one plugin signal, as the detector sees it: started, called, stopped, and restarted.
 
 One that does not give its value within the patience is killed, and its state with it; it is started again after growing
-pauses, three times, and then stays stopped until its rule changes.
+pauses, three times, and then stays stopped until the rule changes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from wayside.rules import CompiledPlugin
 _log = logging.getLogger(__name__)
 
 PATIENCE = 0.5
-"""Seconds in which a live plugin must give its value: less than the stall from which on ticks are not made up for."""
+"""Seconds in which a live plugin must give its value: less than the stall after which ticks are skipped."""
 
 START_PATIENCE = 60.0
 """Seconds in which a plugin must have started, where one waits for it."""
@@ -97,7 +97,9 @@ class SignalProcess:
         return self._ready
 
     def request_value(self, call: PluginCall, queries: Queries, patience: float) -> Value:
-        """The signal's value. Raises PluginFailedError where the plugin failed, StoppedError where it is no more."""
+        """The signal's value. Raises PluginFailedError where the plugin failed, StoppedError if its process has
+        stopped.
+        """
         wire = self._wire
         assert wire is not None  # noqa: S101  it is ready
         self._subjects.add(call.subject)

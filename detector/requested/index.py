@@ -1,8 +1,8 @@
 """The index of requested recordings: what a request leads to, and its response. Pure.
 
-A recording is known by the id that its requester chose, so that a request that is sent twice does nothing twice. Those
-that are over stay in the index for a while: a later request returns their result, and a start that arrives after its
-own stop begins nothing.
+A recording is known by the id that its requester chose, so that a request that is sent twice does nothing twice.
+Recordings that are over stay in the index for a while: a later request returns their result, and a start that arrives
+after its own stop begins nothing.
 """
 
 from __future__ import annotations

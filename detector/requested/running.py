@@ -79,7 +79,7 @@ def begin(
 
 
 def _about(cause: dict[str, Any]) -> tuple[str, tuple[str, ...]]:
-    """Whom the requester's event is about; the subject stands in names of files."""
+    """The subject of the requester's event; it is part of file names."""
     subject = cause.get("subject")
     if isinstance(subject, str) and len(subject) <= 256:
         try:

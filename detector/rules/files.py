@@ -31,7 +31,7 @@ def load_rules(detector: str | Path, rules: Iterable[str | Path], check: Check =
     """Read exactly one Detector, and the rules that it selects.
 
     Args:
-        detector: a file or folder. It may hold other kinds too; they are not looked at.
+        detector: a file or folder. It may hold other kinds too; they are ignored.
         rules: files or folders, likewise. EventRules beside the detector count only if they are given here.
         check: finds what keeps the Detector from running.
 

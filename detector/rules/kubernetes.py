@@ -19,7 +19,7 @@ DETECTORS = Resource(API_VERSION, Detector.plural)
 EVENT_RULES = Resource(API_VERSION, EventRule.plural)
 
 _COALESCING = 0.05
-"""Seconds: what `kubectl apply` sends in one go is taken over in one go."""
+"""Seconds: changes of one `kubectl apply` take effect together."""
 
 Object = TypeVar("Object", bound=Kind)
 

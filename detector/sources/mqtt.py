@@ -19,7 +19,7 @@ from detector.sources.base import Feed, Source, SourceError
 from wayside.api.access import Access
 
 _LOOK_EVERY = 0.2
-"""Seconds: how long a look for messages takes at most, and so how soon the source stops."""
+"""Maximum seconds of one wait for messages, and so of the stop of the source."""
 
 
 class MqttParameters(Access):

@@ -1,4 +1,4 @@
-"""Runs sources: each on a thread of its own, started again when it fails, and left behind where it does not stop."""
+"""Runs sources: each on a thread of its own, restarted when it fails, and abandoned if it does not stop."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class SourceThread:
         self._thread.start()
 
     def request_stop(self) -> None:
-        """From now on nothing of it is taken; returns at once."""
+        """Ignore its further messages; returns at once."""
         self._feed.stop()
 
     def join(self, timeout: float) -> None:
@@ -167,5 +167,5 @@ class Sources:
 
 
 def _delivered(streams: Iterable[Stream]) -> list[dict[str, Any]]:
-    """What matters of streams to who delivers them; how long samples are kept or believed does not."""
+    """The settings of streams that matter to a source; those of buffering do not."""
     return [stream.model_dump(exclude={"buffer", "stale_after", "stamp", "latched"}) for stream in streams]

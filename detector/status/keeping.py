@@ -1,7 +1,7 @@
 """Keeps the status of a running detector: taken by the evaluation thread, at most once a second, read by any other.
 
 So a request neither waits for the evaluation nor delays it, and the engine's counters are only ever read by the
-thread that writes them. What costs something per sample is looked at in samples: latencies are those of the newest
+thread that writes them. Work per sample is limited: latencies are those of the newest
 message of at most a few clients, once a second.
 """
 
@@ -94,7 +94,7 @@ class StatusKeeper:
 
     @property
     def silence(self) -> float:
-        """Seconds since the evaluation last did what was due; for any thread."""
+        """Seconds since the last look of the evaluation; for any thread."""
         return time.monotonic() - self._beat
 
     def arrived(self, arrivals: Sequence[Arrival]) -> None:
@@ -103,7 +103,7 @@ class StatusKeeper:
             self._last.update((arrival.stream, arrival) for arrival in arrivals)
 
     def refused(self, refusals: Iterable[Refusal]) -> None:
-        """These rules, of those that are wanted now, are not evaluated as they are written."""
+        """Set the rules that are refused now."""
         self._refusals = {refusal.rule.name: refusal for refusal in refusals}
         self._taken = 0
 
@@ -263,7 +263,7 @@ class StatusKeeper:
         return islice((sample.received for sample in newest if sample is not None), _LOOKED_AT)
 
     def _forget(self, streams: Iterable[str]) -> None:
-        """What is kept of streams and rules that are gone."""
+        """Forget streams and rules that are gone."""
         for of_streams in (self._stream_latencies, self._last):
             for name in of_streams.keys() - {*streams}:
                 of_streams.pop(name)

@@ -176,12 +176,12 @@ class ActionStatus(msgspec.Struct, frozen=True, rename="camel"):
 
 
 class CertificateStatus(msgspec.Struct, frozen=True, rename="camel"):
-    """What the detector proves itself with on Zenoh."""
+    """The certificate of the detector on Zenoh."""
 
     expires: float | None = None
     """When the first certificate of its own chain expires, seconds since the epoch; None: it has none."""
     renewals: int = 0
-    """How often new certificates or passwords were taken into use."""
+    """Number of renewals of certificates or passwords."""
     problem: str = ""
     """Why what the files hold now is not used."""
 

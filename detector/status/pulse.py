@@ -16,7 +16,7 @@ class Pulse:
         self._sent: float | None = None
 
     def silence(self) -> float:
-        """Seconds for which the loop has owed an answer; 0.0 where it owes none. From any thread."""
+        """Seconds for which the callback has been overdue; 0.0 if it is not. From any thread."""
         with self._lock:
             if self._sent is None:
                 self._sent = time.monotonic()

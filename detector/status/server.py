@@ -12,7 +12,7 @@ Page = Callable[[], tuple[bool, bytes]]
 _TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 _POLL = 0.1
-"""Seconds in which the server notices that it is to end."""
+"""Maximum seconds until the server notices its stop."""
 
 _PATIENCE = 10.0
 """Seconds that a client may take to send its request, so that none keeps a thread for ever."""
@@ -22,7 +22,7 @@ class StatusServer:
     """Serves pages from `start` to `close`."""
 
     def __init__(self, port: int, pages: Mapping[str, Page]) -> None:
-        """Listens on all addresses of the machine; port 0 takes a free one. Raises OSError where the port is taken."""
+        """Listens on all addresses of the machine; port 0 selects a free one. Raises OSError if the port is in use."""
 
         class Handler(BaseHTTPRequestHandler):
             timeout = _PATIENCE
@@ -43,7 +43,7 @@ class StatusServer:
                 self.wfile.write(text)
 
             def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the base class names it
-                """Say nothing: a probe comes every few seconds."""
+                """Log nothing: a probe comes every few seconds."""
 
         try:
             self._server = _Server(("", port), Handler)

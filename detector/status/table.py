@@ -88,7 +88,7 @@ def _parts(status: Status) -> Iterator[RenderableType]:
 
 
 def _proving(status: Status) -> Iterator[RenderableType]:
-    """What the detector proves itself with, where that is certificates or does not do."""
+    """The certificate of the detector, if it has one or there is a problem."""
     certificate = status.certificate
     if certificate.expires is not None:
         left = certificate.expires - status.taken

@@ -57,7 +57,7 @@ class Answering:
                 return
             try:
                 self._reply(query)
-            except Exception as error:  # noqa: BLE001  one bad question must not silence the detector
+            except Exception as error:  # noqa: BLE001  one bad query must not silence the detector
                 _log.warning("cannot answer a query of %s: %s", query.key_expr, error)
             finally:
                 query.drop()  # type: ignore[no-untyped-call]  # ends the query, whatever was replied

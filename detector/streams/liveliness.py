@@ -20,10 +20,10 @@ from wayside.keys import KeyPattern
 log = logging.getLogger(__name__)
 
 _SETTLE = 0.2
-"""Seconds between a report that a token is gone and the belief in it."""
+"""Seconds until a reported loss of a token takes effect."""
 
 _DOUBT = 10.0
-"""Seconds after a router left in which tokens that were declared before are not believed to be dropped."""
+"""Seconds after a router left in which losses of tokens declared before are ignored."""
 
 _CHANNEL = 16_384
 
@@ -40,7 +40,7 @@ def subscribe_tokens(session: zenoh.Session, key: str) -> Tokens:
 
 
 class TokenWatch:
-    """Tells of tokens while a session is open; at the last one's end, that nothing is known of them any more."""
+    """Reports tokens while a session is open; at the end of the last one, that their state is unknown."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class TokenWatch:
         self._connections = connections
         self._stop = threading.Event()
         self._held: dict[str, int] = {}
-        """The tokens that are there, and how many routers had left when they were declared."""
+        """The existing tokens, and the number of routers that had left when they were declared."""
         self._subscriber = subscriber
         self._following: tuple[Tokens, Connections] | None = None
         self._changed = threading.Condition()
@@ -114,7 +114,7 @@ class TokenWatch:
             self._apply([*gone, *new], tokens)
 
     def _apply(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
-        """What a report and those that follow it at once come to, a token at a time."""
+        """Apply a report and those that follow it at once, a token at a time."""
         if reports[0][1] == zenoh.SampleKind.DELETE and not self._stop.wait(_SETTLE):
             reports.extend(_report(each) for each in iter(tokens.try_recv, None))
         newest = dict(reports)

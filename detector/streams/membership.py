@@ -18,8 +18,9 @@ from detector.streams.tally import Tally
 from wayside.api.stream import Stream
 
 _CHANNEL = 16_384
-"""So many samples of a stream wait for its thread while the evaluation holds the interpreter's lock. Once they are full
-Zenoh's own queues fill, and then it is the sender's congestion control that decides whether it waits or drops."""
+"""Maximum number of samples of a stream that wait for its thread while the evaluation holds the interpreter's lock.
+Once they are full Zenoh's own queues fill, and then it is the sender's congestion control that decides whether it
+waits or drops."""
 
 _PATIENCE = 10.0
 """Seconds for which a session is kept that is not wanted any more, but on which an answer is still waited for."""
@@ -64,7 +65,7 @@ class Membership:
         self.close()
 
     def close(self, timeout: float = 2.0) -> None:
-        """Leave at once; it frees the threads that wait for something to come, or to go out."""
+        """Leave at once; this frees the threads that wait to receive or to send."""
         self.connections.close()
         self.session.close()  # type: ignore[no-untyped-call]
         if self._answering is not None:

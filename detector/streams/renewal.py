@@ -27,7 +27,7 @@ from wayside.api.zenoh import Zenoh, ZenohMode
 log = logging.getLogger(__name__)
 
 LOOK_EVERY = 10.0
-"""Seconds between two looks at the files; a kubelet takes about a minute to change them."""
+"""Seconds between two checks of the files; a kubelet takes about a minute to change them."""
 
 _AT_LEAST, _AT_MOST = 1.0, 10.0
 """Seconds for which both sessions are subscribed: time for the subscription to be known, and for both to be level."""
@@ -50,7 +50,7 @@ class CertificateState:
 
 
 class Renewal:
-    """Looks at the files of one network until it is stopped, on a thread of its own."""
+    """Watches the files of one network until it is stopped, on a thread of its own."""
 
     def __init__(
         self,

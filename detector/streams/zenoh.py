@@ -75,7 +75,7 @@ class Network:
         self._make_answering = answering
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
         self.dropped_events = 0
-        """Events that found the queue full, or that Zenoh refused."""
+        """Events dropped because the queue was full, or that Zenoh refused."""
 
     def start(self) -> None:
         """Opens the session: a client's in the background until it succeeds, else at once (raises NetworkError)."""
@@ -140,7 +140,7 @@ class Network:
 
     @property
     def certificate_state(self) -> CertificateState:
-        """What is known of the certificates in use."""
+        """The state of the certificates in use."""
         renewal = self._renewal
         return CertificateState() if renewal is None else renewal.certificate_state
 
@@ -148,7 +148,7 @@ class Network:
     def dead(self) -> str | None:
         """What has ended that never should, so that nothing comes in any more; None where all is alive.
 
-        A router that is away is no such thing: the session seeks it.
+        A router that is unavailable does not count: the session reconnects.
         """
         if self._stop.is_set() or not self._thread.ident:
             return None

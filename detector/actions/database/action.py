@@ -148,7 +148,7 @@ class Database(Action[DatabaseAction]):
         return encoded({**bson.decode(made.document), "filesMissing": missing})
 
     def _flush(self, collection: str) -> None:
-        """Queue what there is for a collection."""
+        """Enqueue the documents of a collection."""
         batch = self._batches.pop(collection)
         if self._store is None:
             return
@@ -195,7 +195,9 @@ class Database(Action[DatabaseAction]):
             self._store.put_change(write, confirm if write.completes else None)
 
     def wake(self) -> float | None:
-        """Queue what has waited long enough. The first time, what an earlier run left on disk is taken up."""
+        """Enqueue documents that have waited long enough. The first call also resumes what an earlier run left on
+        disk.
+        """
         if not self._awake:
             self._awake = True
             try:

@@ -1,6 +1,6 @@
 """Requests in their order: in memory, and on disk while the server is away.
 
-The spool's records are always older than what is in memory. Where neither has room, what is *new* finds none, and
+The spool's records are always older than what is in memory. If both are full, *new* requests are rejected, and
 the caller learns that at once; what is in the queue stays whole.
 """
 
@@ -19,7 +19,7 @@ from detector.actions.database.work import Write, unpacked
 _log = logging.getLogger(__name__)
 
 MEMORY = 64 * 2**20
-"""So many bytes wait in memory at most."""
+"""Maximum bytes in memory."""
 
 
 class Queue:
@@ -38,7 +38,7 @@ class Queue:
         self._bytes = 0
         self._inherited = 0 if spool is None else spool.records
         self.full = spool is None
-        """The disk takes nothing more for now."""
+        """The disk accepts nothing more for now."""
         self.damaged = False
         """Something in the spool could not be read in this run."""
         if spool is not None and spool.damaged:
@@ -129,7 +129,7 @@ class Queue:
         return not self._memory
 
     def close(self) -> list[Write]:
-        """What found no place on the disk, and is lost with the process."""
+        """Bytes that do not fit on the disk, and are lost with the process."""
         self.spill()
         with self._disk, self.changed:
             left = list(self._memory)

@@ -47,7 +47,7 @@ class Scenario:
     bytes: int = 0
     files: int = 0
     lost: Counter[str] = field(default_factory=Counter)
-    """What is not there and should be, by reason."""
+    """Missing parts, by reason."""
 
     def saw(self, client: str, stream: str, time: int) -> None:
         """Note a client's sample."""
@@ -119,7 +119,7 @@ def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
 def finish(
     scenario: Scenario, episode: Episode, completion: Completion, detector: Detector, incomplete: str
 ) -> list[Write]:
-    """Say all that is known in the end. The last request makes it complete, where it is not `incomplete`."""
+    """Write the final documents. The last request makes it complete, where it is not `incomplete`."""
     labels = {client.name: client.labels for client in detector.spec.clients}
     clients = [
         {
@@ -163,7 +163,7 @@ def finish(
 
 
 def why_incomplete(scenario: Scenario, episode: Episode | None, completion: Completion) -> str:
-    """Why not all of it is there; empty where it is. Without the episode, another scenario follows."""
+    """Why it is incomplete; empty if it is complete. Without the episode, another scenario follows."""
     reasons = [f"{count} lost: {reason}" for reason, count in sorted(scenario.lost.items())]
     if completion.missing:
         reasons.append(f"{completion.missing} lost: the samples arrived faster than the action could process them")

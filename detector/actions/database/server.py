@@ -42,7 +42,7 @@ _COUNTING = 60.0
 
 
 class UnavailableError(Exception):
-    """The server did not do it, and may later; the text is for people."""
+    """The server is unavailable; a later attempt may succeed."""
 
     def __init__(self, text: str, *, broke: bool = False) -> None:
         super().__init__(text)
@@ -63,7 +63,7 @@ class Refused:
 
 
 class Redactor:
-    """Takes whatever is secret in a connection string out of texts."""
+    """Removes the secrets of a connection string from texts."""
 
     def __init__(self, uri: str) -> None:
         secrets = {uri}

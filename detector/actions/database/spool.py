@@ -165,7 +165,7 @@ class Spool:
             self._tail = None
 
     def close(self) -> None:
-        """Let go of the folder; the records stay."""
+        """Release the folder; the records stay."""
         self._close_tail()
         self._lock.close()
 

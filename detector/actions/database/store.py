@@ -38,7 +38,7 @@ _RESTART_DELAY = 1.0
 """Seconds that the queue pauses after an unexpected error."""
 
 Confirm = Callable[[bool, str], None]
-"""Told that a scenario is complete in the database, or that it is not, and why."""
+"""Called with whether a scenario is complete in the database, and the reason if it is not."""
 
 
 class Store:

@@ -40,7 +40,7 @@ class FileTaskStore:
     """
 
     def __init__(self, folder: Path, holder: str, interval: float = 0.5) -> None:
-        """Prepare; `interval`: seconds between two looks at what others changed."""
+        """Prepare; `interval`: seconds between two scans for changes by others."""
         self._folder = _Folder(folder, holder)
         self._lock = asyncio.Lock()
         self._interval = interval

@@ -111,9 +111,9 @@ class HolderLease:
         """Set while this process may emit tasks. An outage of the API server does not clear it: no other process can
         have taken over."""
         self.attempts = 0
-        """How often it was looked at, to renew or acquire it."""
+        """Number of attempts to renew or acquire it."""
         self.failures = 0
-        """How many of the attempts failed."""
+        """Number of failed attempts."""
 
     async def run(self) -> None:
         """Acquire and renew until `stop`, then release."""
@@ -179,7 +179,7 @@ class HolderLease:
         return {"apiVersion": LEASES.api_version, "kind": "Lease", "metadata": metadata, "spec": spec}
 
     def _lapsed(self, lease: JsonObject) -> bool:
-        """Whether we have seen the Lease unchanged for as long as it promises to hold."""
+        """Whether we have seen the Lease unchanged for its duration."""
         version, now = lease["metadata"]["resourceVersion"], self._monotonic()
         if self._seen is None or self._seen[0] != version:
             self._seen = (version, now)

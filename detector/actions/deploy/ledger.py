@@ -1,4 +1,4 @@
-"""What is demanded beside what is stored: for each task, which step comes next. No waiting, no I/O."""
+"""The demanded and the stored tasks, and the next step for each. No waiting, no I/O."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Ledger:
         return self._due((change.name,))
 
     def put(self, name: str, stored: StoredTask | None) -> None:
-        """Take over the answer to a change of our own."""
+        """Apply the response to a change of our own."""
         if self.stored is None:
             self.stored = {}
         if stored is None:

@@ -50,9 +50,9 @@ class DeployCounts:
     patched: int = 0
     ended: int = 0
     retried: int = 0
-    """Attempts that found the store away or busy."""
+    """Attempts that failed because the store was unavailable or busy."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Attempts that the store refused, by its reason. Each is made again at the next resync."""
+    """Attempts that the store refused, by its reason. Each is retried at the next resync."""
 
 
 class DemandReconciler:

@@ -58,7 +58,7 @@ class StoreError(Exception):
 
 
 class StoreUnavailableError(StoreError):
-    """The store is away or busy: the same may succeed soon."""
+    """The store is unavailable or busy: a retry may succeed soon."""
 
     def __init__(self, reason: str, message: str, retry_after: float = 0.0) -> None:
         super().__init__(reason, message)
@@ -78,7 +78,7 @@ class TaskStore(Protocol):
     """The tasks of one holder. Every method but `follow` raises a `StoreError`."""
 
     def follow(self) -> AsyncGenerator[Snapshot | Update, None]:
-        """What is, then what changes, with a fresh snapshot at least every half minute. Never ends, raises nothing."""
+        """A snapshot, then changes, with a new snapshot at least every half minute. Never ends, raises nothing."""
 
     async def get(self, name: str) -> StoredTask | None:
         """The holder's task of this name; None if there is none, or it belongs to another holder."""
