@@ -16,7 +16,7 @@ from detector.findings import (
     UNKNOWN_RULE,
 )
 from detector.models.binding import bind_models
-from detector.sources.registry import plugin_problems
+from detector.sources.registry import source_problems
 from wayside.api import Detector, EventRule
 from wayside.api.detector import Clock
 from wayside.api.documents import Document, Problem
@@ -49,7 +49,7 @@ def findings(documents: Sequence[Document]) -> Findings:
             try:
                 problems += [
                     document.problem(each.path, each.message, INVALID_DETECTOR.name)
-                    for each in plugin_problems(document.object)
+                    for each in source_problems(document.object)
                 ]
                 entries = inlets(document.object)
                 detectors.append((document, document.object, entries))

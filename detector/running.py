@@ -26,7 +26,7 @@ from detector.plugins.processes import ProcessHost
 from detector.requested import Requested
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
-from detector.sources.registry import plugin_problems
+from detector.sources.registry import source_problems
 from detector.sources.supervision import Sources
 from detector.state import StateFile
 from detector.status.pulse import Pulse
@@ -267,7 +267,7 @@ def _unused(path: Path) -> Path:
 def _checked(detector: Detector) -> Inlets:
     """What its streams need. Raises DetectorError, also where a plugin is missing or refuses its parameters."""
     entries = inlets(detector)
-    problems = list(plugin_problems(detector))
+    problems = list(source_problems(detector))
     if problems:
         raise DetectorError(problems)
     return entries

@@ -16,7 +16,7 @@ from typing import Any
 
 from detector.actions.base import Action, Messenger, Setting, Surroundings
 from detector.actions.outcomes import Outcomes, Which
-from detector.actions.registry import DEPLOY, prepare
+from detector.actions.registry import DEPLOY, prepare_action
 from detector.actions.worker import MAXIMUM_BYTES, Worker
 from detector.engine.consequences.consequences import Begun, Consequence, Run
 from wayside.api import EventRule
@@ -137,7 +137,7 @@ class ActionHost:
         )
 
         def make() -> Action[Any]:
-            offered, parameters = prepare(action)
+            offered, parameters = prepare_action(action)
             return offered(parameters, setting)
 
         return make

@@ -26,7 +26,7 @@ DEPLOY = "deploy"
 """The action that is none of these: its tasks are reconciled (detector/actions/deploy)."""
 
 
-def prepare(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
+def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
     """The class of an action other than deploy, and its parameters; `streams` are those that parameters may name.
 
     Raises PluginError; the paths begin at the action.
@@ -59,7 +59,7 @@ def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem
         if action.field != DEPLOY:
             at = ("spec", "actions", index)
             try:
-                offered, parameters = prepare(action, streams)
+                offered, parameters = prepare_action(action, streams)
             except PluginError as error:
                 for path, text in error.problems:
                     yield RuleProblem((*at, *path), text)

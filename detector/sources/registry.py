@@ -21,7 +21,7 @@ Make = Callable[[], Source[Any]]
 """Makes a source for one run."""
 
 
-def prepare(source: DataSource) -> Make:
+def prepare_source(source: DataSource) -> Make:
     """Loads the plugin and checks its parameters.
 
     Raises PluginError; the paths begin at the entry in `spec.sources`.
@@ -31,11 +31,11 @@ def prepare(source: DataSource) -> Make:
     return lambda: plugin(parameters)
 
 
-def plugin_problems(detector: Detector) -> Iterator[RuleProblem]:
+def source_problems(detector: Detector) -> Iterator[RuleProblem]:
     """What is wrong with the Detector's sources, as far as their plugins can check here."""
     for index, source in enumerate(detector.spec.sources):
         try:
-            prepare(source)
+            prepare_source(source)
         except PluginError as error:
             for path, text in error.problems:
                 yield RuleProblem(("spec", "sources", index, *path), text)

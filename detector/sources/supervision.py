@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Any
 
 from detector.sources.base import Feed, Putter
-from detector.sources.registry import Make, prepare
+from detector.sources.registry import Make, prepare_source
 from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
 from wayside.api.source import DataSource
@@ -55,7 +55,7 @@ class SourceThread:
         self.streams = streams
         self.state = State.RUNNING
         self.last_error = ""
-        self._make: Make = prepare(source)
+        self._make: Make = prepare_source(source)
         self._tally = tally
         self._first_pause, self._longest_pause = first_pause, longest_pause
         self._feed = Feed(streams, putter, lambda key: tally.add(Cause.UNROUTED, source.name, last=key))

@@ -263,7 +263,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
 @pytest.mark.parametrize(
     ("given", "problem"),
     [
-        ({"tls": {"ca": "missing.crt"}}, "spec.zenoh.tls.ca: missing.crt cannot be read: No such file"),
+        ({"tls": {"ca": "missing.crt"}}, "spec.zenoh.tls.ca: cannot read missing.crt: No such file"),
         ({"tlsSecret": "absent"}, "spec.zenoh.tlsSecret: the Secret absent is not mounted at"),
         (
             {"credentials": {"username": "u", "passwordVariable": "WAYSIDE_UNSET"}},
@@ -271,7 +271,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
         ),
         (
             {"credentials": {"username": "u", "passwordFile": "missing"}},
-            "spec.zenoh.credentials.passwordFile: missing cannot be read",
+            "spec.zenoh.credentials.passwordFile: cannot read missing",
         ),
     ],
 )
@@ -302,11 +302,11 @@ def test_a_secret_is_a_folder_and_a_password_is_never_shown(tmp_path: Path, monk
     folder.mkdir()
     (folder / "username").write_text("detector\n")
     access = Access.model_validate({"credentialsSecret": "login", "tlsSecret": "login"})
-    with pytest.raises(AccessError, match="password cannot be read"):
+    with pytest.raises(AccessError, match="cannot read .*password"):
         login(access, "spec.zenoh")
     (folder / "password").write_text("sesame\n")
     found = login(access, "spec.zenoh")
     assert found == Login("detector", "sesame")
     assert "sesame" not in repr(found)
-    with pytest.raises(AccessError, match=r"spec\.zenoh\.tlsSecret: .*ca\.crt cannot be read"):
+    with pytest.raises(AccessError, match=r"spec\.zenoh\.tlsSecret: cannot read .*ca\.crt"):
         tls_files(access, "spec.zenoh")

@@ -224,7 +224,7 @@ def test_a_disk_that_is_full_from_the_start_is_told(small_disk: Path, monkeypatc
     with pytest.raises(ActionError, match=r"cannot start the recording: less than 0 of the disk would be free"):
         bench.action.started(an_episode())
     somebody_else_fills_the_disk(monkeypatch)
-    with pytest.raises(ActionError, match=r"cannot begin: writing failed: .*No space left on device"):
+    with pytest.raises(ActionError, match=r"cannot start the recording: writing failed: .*No space left on device"):
         bench.action.started(an_episode())
     assert sorted(each.name for each in small_disk.rglob("*")) == ["filler", "r"]
 

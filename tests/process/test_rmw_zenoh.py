@@ -172,7 +172,7 @@ def test_a_key_of_another_type_is_dropped_counted_and_said(receiver: Receiver, v
     assert arrival.payload == b"last"
     wait_for(lambda: receiver.counted(Cause.MISFIT) == 2)
     (line,) = [line for line in receiver.losses() if "do not match the stream" in line]
-    assert "town/vehicles/car1/pose/on/foot does not read <domain>/<topic>" in line
+    assert "town/vehicles/car1/pose/on/foot is not of the form <domain>/<topic>" in line
     Node(vehicle, "vehicles/car1/pose", type_name="nav_msgs/msg/Odometry").publish(cdr(odometry()))
     wait_for(lambda: receiver.counted(Cause.MISFIT) == 3)
     (line,) = [line for line in receiver.losses() if "do not match the stream" in line]

@@ -20,7 +20,7 @@ from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.sources import Feed, Source
-from detector.sources.registry import OFFERS, plugin_problems
+from detector.sources.registry import OFFERS, source_problems
 from detector.sources.supervision import Sources, SourceThread, State
 from detector.streams.tally import Cause, Tally
 from tests.driving import a_detector, a_stream
@@ -241,7 +241,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
     ],
 )
 def test_what_is_wrong_with_a_source_is_told_with_its_field(source: dict[str, Any], problem: str) -> None:
-    found = [str(each) for each in plugin_problems(a_detector_of({"name": "s", **source}))]
+    found = [str(each) for each in source_problems(a_detector_of({"name": "s", **source}))]
     assert len(found) == 1
     assert problem in found[0]
 

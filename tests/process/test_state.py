@@ -284,7 +284,9 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
         process.wait()
     car.close()
     with running(tmp_path, "--record-intake", str(tmp_path / "intake.mcap")) as process:
-        wait_for(lambda: b"1 open episodes of the state volume" in (tmp_path / "log").read_bytes(), "it is back")
+        wait_for(
+            lambda: b"restored 1 open episodes from the state volume" in (tmp_path / "log").read_bytes(), "it is back"
+        )
         car = Car(endpoint)
         car.value = 3.0
         car.wait_for(lambda: len(events_in(events)) == 2 and not kept(), "the episode ends")

@@ -216,7 +216,7 @@ def test_what_is_not_allowed_is_refused(rsu: Peer, town: Peer) -> None:
         assert asked(rsu.endpoint, RecordingRequest(do="start", id=f"x{number}")).state is Progress.RECORDING
     full = asked(rsu.endpoint, RecordingRequest(do="start", id="x8"))
     assert full.message == "8 recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
-    with pytest.raises(ValueError, match="start which recording"):
+    with pytest.raises(ValueError, match="start: give the id of the recording"):
         asked(rsu.endpoint, RecordingRequest(do="start"))
 
 

@@ -15,7 +15,7 @@ from detector.actions.base import Action, ActionError, Setting
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.documents import Documents, Made
 from detector.actions.database.episodes import Writing
-from detector.actions.database.folder import Folder, FolderError
+from detector.actions.database.folder import AttachmentFolder, FolderError
 from detector.actions.database.scenario import Scenario
 from detector.actions.database.store import Store
 from detector.actions.database.stores import acquire, release
@@ -50,7 +50,7 @@ class Database(Action[DatabaseAction]):
         super().__init__(parameters, setting)
         self._place: Place | None = None
         self._store: Store | None = None
-        self._folder: Folder | None = None
+        self._folder: AttachmentFolder | None = None
         self._writings: dict[str, Writing] = {}
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
@@ -241,7 +241,9 @@ class Database(Action[DatabaseAction]):
         self._place, self._store = place, store
         self._folder = None
         if place.files is not None:
-            self._folder = Folder(Path(place.files.path), place.files.bytes.bytes if place.files.bytes else None)
+            self._folder = AttachmentFolder(
+                Path(place.files.path), place.files.bytes.bytes if place.files.bytes else None
+            )
         rule = self.setting.rule.name
         behind = (self.parameters.database, self.setting.holder, rule, self.setting.action)
         if store.first_time(behind):

@@ -13,7 +13,7 @@ class FolderError(Exception):
     """A file could not be written; the message gives the reason."""
 
 
-class Folder:
+class AttachmentFolder:
     """Where attachments go, up to a number of bytes."""
 
     def __init__(self, path: Path, capacity: int | None) -> None:

@@ -41,7 +41,7 @@ _COUNTING = 60.0
 """How long it may take to count a scenario's documents."""
 
 
-class UnavailableError(Exception):
+class DatabaseUnavailableError(Exception):
     """The server is unavailable; a later attempt may succeed."""
 
     def __init__(self, text: str, *, broke: bool = False) -> None:
@@ -50,7 +50,7 @@ class UnavailableError(Exception):
         """The connection ended with this request: it may be the request's own doing."""
 
 
-class RefusedError(Exception):
+class WriteRefusedError(Exception):
     """The request as a whole cannot be done, now or later; the message gives the reason."""
 
 
@@ -118,7 +118,7 @@ class Server:
     def write(self, write: Write) -> tuple[int, list[Refused]]:
         """Do it: how many documents changes have matched, and what was refused of it; all else is done.
 
-        Raises UnavailableError, RefusedError.
+        Raises DatabaseUnavailableError, WriteRefusedError.
         """
         with self._driver_errors():
             try:
@@ -129,7 +129,7 @@ class Server:
     def lacks(self, write: Write) -> str:
         """What the scenario that the request completes does not have of its documents; empty where it has all.
 
-        Raises UnavailableError, RefusedError.
+        Raises DatabaseUnavailableError, WriteRefusedError.
         """
         with self._driver_errors(), pymongo.timeout(_COUNTING):
             for collection, count in sorted(write.expected.items()):
@@ -144,16 +144,16 @@ class Server:
         try:
             yield
         except DocumentTooLarge as error:
-            raise RefusedError(self.redact(error)) from None
+            raise WriteRefusedError(self.redact(error)) from None
         except ConnectionFailure as error:
             broke = isinstance(error, AutoReconnect) and not isinstance(
                 error, NetworkTimeout | NotPrimaryError | ServerSelectionTimeoutError
             )
-            raise UnavailableError(self._short(error), broke=broke) from None
+            raise DatabaseUnavailableError(self._short(error), broke=broke) from None
         except PyMongoError as error:
-            raise UnavailableError(self._short(error)) from None
+            raise DatabaseUnavailableError(self._short(error)) from None
         except (BSONError, OverflowError, ValueError, TypeError) as error:
-            raise RefusedError(self.redact(error)) from None
+            raise WriteRefusedError(self.redact(error)) from None
 
     def _insert(self, write: Write) -> tuple[int, list[Refused]]:
         collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]
@@ -180,10 +180,10 @@ class Server:
     def _refused(self, details: Mapping[str, Any], *, inserting: bool) -> list[Refused]:
         """What of a request was refused; that a document is there already is as it should be.
 
-        Raises UnavailableError where the rest is not safe yet, or another detector made the same at the same time.
+        Raises DatabaseUnavailableError if the rest is not safe yet, or another client made the same at the same time.
         """
         if not inserting and any(_there_already(each) for each in details.get("writeErrors", ())):
-            raise UnavailableError("another client is writing the same document")
+            raise DatabaseUnavailableError("another client is writing the same document")
         refused = [
             Refused(int(each["index"]), self.redact(each.get("errmsg", "")))
             for each in details.get("writeErrors", ())
@@ -191,7 +191,7 @@ class Server:
         ]
         concerns: Sequence[Mapping[str, Any]] = details.get("writeConcernErrors", ())
         if concerns:
-            raise UnavailableError(self.redact(concerns[0].get("errmsg", "the write concern is not satisfied")))
+            raise DatabaseUnavailableError(self.redact(concerns[0].get("errmsg", "the write concern is not satisfied")))
         return refused
 
     def _short(self, error: PyMongoError) -> str:

@@ -17,7 +17,7 @@ import bson
 
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.queue import Queue
-from detector.actions.database.server import RefusedError, Server, UnavailableError
+from detector.actions.database.server import DatabaseUnavailableError, Server, WriteRefusedError
 from detector.actions.database.spool import Spool
 from detector.actions.database.work import Write
 
@@ -164,9 +164,9 @@ class Store:
                 doubts = self._doubts or self._queue.damaged or self._queue.inherited
                 missing = self._server.lacks(write) if doubts else ""
                 matched, refused = self._server.write(scenarios.give_up(write, missing) if missing else write)
-            except RefusedError as error:
+            except WriteRefusedError as error:
                 return self._divide(write, str(error))
-            except UnavailableError as error:
+            except DatabaseUnavailableError as error:
                 self._note_away(str(error))
                 broke = broke + 1 if error.broke and self._server.answers() else 0
                 if broke >= patience:

@@ -17,7 +17,7 @@ from detector.actions.base import Action, ActionError, Setting, Surroundings
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from detector.actions.record.description import Description
 from detector.actions.record.destination import Destination, Kept, NoRoomError, destination
-from detector.actions.record.folder import Folder
+from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.recording import Recording, reason
 from detector.actions.record.recovery import REASON, recover
 from detector.actions.record.series import Series
@@ -142,7 +142,9 @@ class Record(Action[api.Record]):
     def _begin(self, description: Description, start: int | None) -> Recording:
         """A new recording. Raises NoRoomError, OSError."""
         surroundings = self.setting.surroundings()
-        folder = Folder.create(self._destination(surroundings), description.rule, description.name, self._dropped)
+        folder = RecordingFolder.create(
+            self._destination(surroundings), description.rule, description.name, self._dropped
+        )
         return Recording(folder, description.fields(), self.parameters, surroundings, start=start)
 
     def _tidy(self) -> None:

@@ -28,7 +28,7 @@ Dropped = Callable[[Sequence[Kept]], None]
 """Told of recordings that were deleted to make room."""
 
 
-class Folder:
+class RecordingFolder:
     """A hidden folder, locked by this process. Counts what it claims of the destination."""
 
     def __init__(
@@ -53,7 +53,7 @@ class Folder:
             raise
 
     @classmethod
-    def create(cls, destination: Destination, rule: str, name: str, dropped: Dropped) -> Folder:
+    def create(cls, destination: Destination, rule: str, name: str, dropped: Dropped) -> RecordingFolder:
         """A new one. A number is added to the name where there is one already. Raises NoRoomError, OSError."""
         parent = destination.path / rule
         parent.mkdir(exist_ok=True)

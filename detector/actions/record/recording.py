@@ -26,7 +26,7 @@ from detector.actions.record.description import (
     with_ending,
 )
 from detector.actions.record.destination import Kept, NoRoomError
-from detector.actions.record.folder import Folder
+from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.mcap_file import McapFile, SyncError
 from detector.actions.record.stamps import Stamps
 from detector.engine.buffering.lanes import latched_topics
@@ -45,7 +45,7 @@ class Recording:
 
     def __init__(
         self,
-        folder: Folder,
+        folder: RecordingFolder,
         description: Mapping[str, Any],
         parameters: Record,
         surroundings: Surroundings,

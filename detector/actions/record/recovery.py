@@ -11,7 +11,7 @@ from typing import Any
 from detector.actions.record.bag import Part
 from detector.actions.record.description import METADATA_CUT, METADATA_END, ending, with_ending
 from detector.actions.record.destination import DROPPED, PARTIAL, Destination, Kept, hidden
-from detector.actions.record.folder import Folder
+from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.salvage import contents_of, salvage
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def recover(destination: Destination, left: Iterable[Path]) -> list[Kept]:
 
 def _recovered(destination: Destination, path: Path) -> Kept | None:
     name = path.name.removeprefix(".").removesuffix(PARTIAL)
-    folder = Folder(destination, path, name, lambda dropped: None, forced=True)
+    folder = RecordingFolder(destination, path, name, lambda dropped: None, forced=True)
     files = sorted(path.glob("*.mcap"), key=lambda each: int(each.stem.rpartition("_")[2]))
     folder.claim(sum(each.stat().st_size for each in path.iterdir()), 0, len(files))
     folder.use_room()
@@ -65,7 +65,7 @@ def _recovered(destination: Destination, path: Path) -> Kept | None:
         raise
 
 
-def _part(path: Path, folder: Folder, fields: dict[str, Any], last: bool) -> Part | None:
+def _part(path: Path, folder: RecordingFolder, fields: dict[str, Any], last: bool) -> Part | None:
     """The file, completed; None where nothing of it can be read: it is deleted.
 
     The last one is looked through even if it seems complete: the disk may not have had all of it.

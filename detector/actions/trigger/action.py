@@ -16,7 +16,7 @@ from typing import Any
 
 from detector.actions.base import Action, ActionError, Setting
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
-from detector.actions.trigger.course import FOREVER, Course, Limits, Step
+from detector.actions.trigger.course import FOREVER, Course, CourseStep, Limits
 from detector.actions.trigger.detectors import OtherDetector
 from detector.actions.trigger.endpoints import HttpEndpoint
 from detector.actions.trigger.journal import OrderJournal
@@ -112,7 +112,7 @@ class Trigger(Action[api.Trigger]):
         now = time.monotonic()
         if self._left and now >= self._claim:
             self._stop_left(now)
-        due: list[tuple[float, Course, Step]] = []
+        due: list[tuple[float, Course, CourseStep]] = []
         for course in self._courses.values():
             step = course.look(now)
             if step is not None and self._next_attempt(course.order) <= now:
@@ -136,20 +136,20 @@ class Trigger(Action[api.Trigger]):
             stops = [
                 course
                 for course in self._courses.values()
-                if course.look(max(now, course.due)) is Step.STOP and self._next_attempt(course.order) <= now
+                if course.look(max(now, course.due)) is CourseStep.STOP and self._next_attempt(course.order) <= now
             ]
             if not stops:
                 break
-            self._request(stops[0], Step.STOP)
+            self._request(stops[0], CourseStep.STOP)
             self._forget_finished()
         if self._journal is None:
             for course in self._courses.values():
-                if course.step in (Step.START, Step.STOP):
+                if course.step in (CourseStep.START, CourseStep.STOP):
                     self._lose(course, "the detector is stopping")
         self._courses = {identity: each for identity, each in self._courses.items() if not each.finished}
         for identity, course in self._courses.items():
             problem = course.problem or f"the detector stopped before its {course.step.value} was confirmed"
-            state = OutcomeState.DONE if course.step is Step.AWAIT else OutcomeState.FAILED
+            state = OutcomeState.DONE if course.step is CourseStep.AWAIT else OutcomeState.FAILED
             self._report(identity, self._outcome(state, course, problem if state is OutcomeState.FAILED else ""))
 
     @property
@@ -194,7 +194,7 @@ class Trigger(Action[api.Trigger]):
     def _next_attempt(self, order: Order) -> float:
         return self._silent.get(self._system.place(order), (0, 0.0))[1]
 
-    def _request(self, course: Course, step: Step) -> None:
+    def _request(self, course: Course, step: CourseStep) -> None:
         order, begin = course.order, time.monotonic()
         place = self._system.place(order)
         try:
@@ -211,11 +211,11 @@ class Trigger(Action[api.Trigger]):
             waits = f": {report.message}" if report.message else ""
             self._report_progress(course, f"at {place}: {report.progress.value}{waits}")
 
-    def _send(self, course: Course, step: Step, now: float) -> Report:
+    def _send(self, course: Course, step: CourseStep, now: float) -> Report:
         order = course.order
-        if step is Step.AWAIT:
+        if step is CourseStep.AWAIT:
             return self._system.status(order)
-        if step is Step.STOP:
+        if step is CourseStep.STOP:
             return self._system.stop(order, 0.0 if course.ended is None else now - course.ended)
         return self._system.start(order, now - course.onset, again=course.confirmed)
 
@@ -224,7 +224,7 @@ class Trigger(Action[api.Trigger]):
         for identity, order in self._left.items():
             course = Course(order, self._limits, now, now, resumed=True)
             course.confirmed = False  # that it is not known there any more is as good as stopped
-            course.step = Step.STOP
+            course.step = CourseStep.STOP
             course.end(now, now)
             self._courses[identity] = course
             _log.info("stopping recording %s, which was not stopped before the restart", identity)

@@ -16,7 +16,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from detector.engine.samples.sample import MISSING, FieldReader, Fields
-from detector.streams.codecs.cdr_source import Source, UnwalkableError
+from detector.streams.codecs.cdr_source import CdrSource, UnwalkableError
 from detector.streams.codecs.cdr_values import PADDING
 from detector.streams.codecs.cdr_walk import Tree, Walk
 from detector.streams.codecs.paths import Path, complete, shortest, spread
@@ -96,7 +96,7 @@ def _readable(types: RosTypes, type_name: str, path: Path) -> Path:
 
 def _walker(types: RosTypes, type_name: str, paths: Sequence[Path], order: _Order) -> _Walker:
     """A function that reads the paths, none of which lies below another one. Raises UnwalkableError."""
-    code = Source(order.sign)
+    code = CdrSource(order.sign)
     walk = Walk(types, code)
     mark = code.encapsulation()
     walk.message(type_name, _tree(paths))

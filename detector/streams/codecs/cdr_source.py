@@ -21,7 +21,7 @@ class UnwalkableError(ValueError):
 
 
 @dataclass
-class Source:
+class CdrSource:
     """Lines that read a payload `p`; the position is `base + constant`, of which `base` is a variable."""
 
     sign: str

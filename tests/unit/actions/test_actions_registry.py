@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from detector import entrypoints
 from detector.actions import Action
-from detector.actions.registry import OFFERS, action_problems, prepare
+from detector.actions.registry import OFFERS, action_problems, prepare_action
 from detector.assembly import RuleIndex, inlets
 from detector.checking import check_documents
 from tests.driving import a_detector, a_rule
@@ -52,7 +52,7 @@ def rule(name: str, **parameters: Any) -> Any:
 
 def test_an_action_gets_its_parameters_as_its_model() -> None:
     (action,) = rule("lamp", colour="red").spec.actions
-    assert prepare(action) == (Lamp, LampParameters(colour="red"))
+    assert prepare_action(action) == (Lamp, LampParameters(colour="red"))
 
 
 @pytest.mark.parametrize(
