@@ -302,7 +302,7 @@ def test_a_secret_is_a_folder_and_a_password_is_never_shown(tmp_path: Path, monk
     folder.mkdir()
     (folder / "username").write_text("detector\n")
     access = Access.model_validate({"credentialsSecret": "login", "tlsSecret": "login"})
-    with pytest.raises(AccessError, match="cannot read .*password"):
+    with pytest.raises(AccessError, match=r"cannot read .*password"):
         login(access, "spec.zenoh")
     (folder / "password").write_text("sesame\n")
     found = login(access, "spec.zenoh")
