@@ -58,8 +58,8 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
         query_detectors(process.network, "d", "status", {"rule": "slow"}, PATIENCE)
     assert metrics["rule_episodes_open", "fast"] == 1
     assert metrics["process_resident_memory_bytes",] > 0
-    assert "looked" in process.page("/healthz")
-    assert "looked" in process.page("/readyz")
+    assert "the last evaluation" in process.page("/healthz")
+    assert "the last evaluation" in process.page("/readyz")
 
 
 def test_a_rule_is_asked_paused_and_resumed_by_commands(process: Process) -> None:
