@@ -72,7 +72,7 @@ class Nobody:
     def publish(self, *_: Any) -> None:
         raise AssertionError
 
-    def ask(self, *_: Any) -> list[bytes]:
+    def query(self, *_: Any) -> list[bytes]:
         raise AssertionError
 
 

@@ -18,7 +18,9 @@ SECRETS_FOLDER = "/etc/wayside/secrets"
 
 
 class AccessError(ValueError):
-    """A certificate or password that is not where the resource says; the text names the field, never a secret."""
+    """A certificate or password that is not where the resource places it; the message names the field, never a
+    secret.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,11 +126,11 @@ def _text(path: Path, field: str) -> str:
     try:
         return path.read_text(encoding="utf-8").removesuffix("\n")
     except UnicodeDecodeError as error:
-        raise AccessError(f"{field}: {path} is no UTF-8 text: write it anew") from error
+        raise AccessError(f"{field}: {path} is not UTF-8 text: rewrite the file as UTF-8") from error
     except OSError as error:
         raise _unreadable(path, field, error) from error
 
 
 def _unreadable(path: Path, field: str, error: OSError) -> AccessError:
     reason = error.strerror or type(error).__name__
-    return AccessError(f"{field}: {path} cannot be read: {reason}: put it there, or correct the field")
+    return AccessError(f"{field}: cannot read {path}: {reason}: create the file, or correct the field")

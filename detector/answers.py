@@ -1,4 +1,4 @@
-"""What a running detector answers to those who ask: its status, and what a rule with onDemand says.
+"""What a running detector answers to requests: its status, and the result of a rule with onDemand.
 
 Some also change something: a rule is paused, or evaluated again; a recording begins, or ends.
 """
@@ -26,17 +26,17 @@ from wayside.times import format_time
 Result = TypeVar("Result")
 
 _PATIENCE = 5.0
-"""Seconds in which the evaluation should have time for a question."""
+"""Seconds to wait for the evaluation."""
 
 _RUNS = 20
-"""Of so many episodes it is told what an action last said."""
+"""Maximum number of episodes per action whose last message is shown."""
 
 _SILENT = 30.0
-"""Seconds without a look after which the evaluation is taken for dead; one that is merely slow says so itself."""
+"""Seconds without an evaluation after which it is considered dead; a slow one reports that itself."""
 
 
 class Answers:
-    """Answers requests, on whichever thread they come."""
+    """Answers requests, on any thread."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class Answers:
     ) -> None:
         """`outlet` gives the outlet: the network that it has changes with the Detector, as do the `sources`.
 
-        `pulse` tells for how many seconds the event loop has not run.
+        `pulse` returns the seconds for which the event loop has not run.
         """
         self._pulse = pulse
         self._evaluator = evaluator
@@ -63,21 +63,21 @@ class Answers:
         }
 
     def answer(self, what: str, given: Mapping[str, str], payload: bytes) -> bytes:
-        """The answer as JSON. Raises ValueError where there is none; the text says why."""
+        """The answer as JSON. Raises ValueError if there is none; the message gives the reason."""
         if what == RECORDINGS:
             return self._requested.answer(payload)
         answer = self._answers.get(what)
         if answer is None:
             known = ", ".join([*self._answers, RECORDINGS])
-            raise ValueError(f"a detector does not answer {what!r}: ask for one of {known}")
+            raise ValueError(f"unknown request {what!r}: the detector answers {known}")
         return answer(given)
 
     def status(self) -> Status:
-        """The newest status, with what only the shell knows."""
+        """The newest status, with the parts that the engine does not know."""
         latest, outlet = self._evaluator.status.latest, self._outlet()
         dropped = [
             Drops("event_unpublished", "events not published", outlet.network.dropped_events),
-            Drops("event_unwritten", "events missing in events.jsonl", outlet.unwritten),
+            Drops("event_unwritten", "events not written to events.jsonl", outlet.unwritten),
         ]
         sources = [
             SourceStatus(each.source.name, each.source.plugin, each.state.value, each.messages, each.last_error)
@@ -94,33 +94,33 @@ class Answers:
         return msgspec.structs.replace(
             latest,
             connected=outlet.network.connected,
-            certificate=CertificateStatus(**asdict(outlet.network.standing)),
+            certificate=CertificateStatus(**asdict(outlet.network.certificate_state)),
             drops=[*latest.drops, *dropped],
             sources=sources,
             actions=actions,
         )
 
     def healthy(self) -> tuple[bool, bytes]:
-        """Whether all goes on that no waiting brings back, for /healthz: a restart is the remedy for it alone."""
+        """Whether everything runs that only a restart can repair, for /healthz."""
         silent, hung, dead = self._evaluator.status.silence, self._pulse(), self._outlet().network.dead
-        lines = [f"the evaluation looked {silent:.1f} s ago"]
+        lines = [f"the last evaluation was {silent:.1f} s ago"]
         if hung >= _SILENT:
-            lines.append(f"the event loop has not run for {hung:.1f} s: tasks and the Lease stay as they are")
+            lines.append(f"the event loop has been blocked for {hung:.1f} s: tasks and the Lease are not updated")
         if dead is not None:
-            lines.append(f"nothing is received any more: {dead}")
+            lines.append(f"receiving has stopped: {dead}")
         return silent < _SILENT and hung < _SILENT and dead is None, "".join(f"{line}\n" for line in lines).encode()
 
     def ready(self) -> tuple[bool, bytes]:
         """Whether samples can come in and be evaluated, for /readyz.
 
-        Who listens is ready with nobody connected: else no Service would lead anyone to it.
+        A detector that listens is ready without connections: otherwise no Service would route to it.
         """
         well, text = self.healthy()
         network = self._outlet().network
         if not network.joined:
             return False, text + b"no Zenoh session yet\n"
         if not network.listens and not network.connected:
-            return False, text + b"nobody is connected on Zenoh: it is sought, and the buffer is kept\n"
+            return False, text + b"nothing is connected on Zenoh: reconnecting, the buffer is kept\n"
         return well, text
 
     def _status(self, given: Mapping[str, str]) -> bytes:
@@ -160,10 +160,10 @@ class Answers:
         try:
             return future.result(_PATIENCE)
         except TimeoutError:
-            raise ValueError(f"the evaluation did not get to it within {_PATIENCE:g} s: it is too slow") from None
+            raise ValueError(f"the evaluation did not answer within {_PATIENCE:g} s: it is overloaded") from None
 
     def _explanation(self, rule: str, subject: str | None, wait: str) -> Explanation | None:
-        """What the rule's next evaluation sees; None where there is none within so many seconds."""
+        """What the rule's next evaluation sees; None if there is none within `wait` seconds."""
         if not re.fullmatch(r"[0-9]{1,2}(\.[0-9]{1,3})?", wait):
             raise ValueError(f"wait={wait}: give seconds below 100, e.g. wait=2.5")
         watching = None
@@ -182,7 +182,7 @@ class Answers:
 def _rule(given: Mapping[str, str]) -> str:
     rule = given.get("rule")
     if not rule:
-        raise ValueError("which rule? Ask with ?rule=NAME")
+        raise ValueError("rule is missing: give ?rule=NAME")
     return rule
 
 

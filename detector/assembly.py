@@ -1,4 +1,4 @@
-"""From the resources to an engine: decoders, keys and compiled rules. Live operation and replay do it alike."""
+"""From the resources to an engine: decoders, keys and compiled rules. Live operation and replay share it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from wayside.rules import (
 
 
 class DetectorError(InputError, ValueError):
-    """A Detector that cannot run; `problems` says why."""
+    """A Detector that cannot run; `problems` gives the reasons."""
 
     def __init__(self, problems: Iterable[RuleProblem]) -> None:
         self.problems = tuple(problems)
@@ -56,7 +56,7 @@ class Inlets:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A rule that is not evaluated as it is written, and why."""
+    """A rule that is refused, with the reason."""
 
     rule: EventRule
     problems: tuple[RuleProblem, ...]
@@ -64,7 +64,7 @@ class Refusal:
     """Whether its last good version goes on."""
 
     def __str__(self) -> str:
-        what = "is refused, and goes on as it last was" if self.kept else "is refused"
+        what = "is refused; keeping its last good version" if self.kept else "is refused"
         return f"EventRule {self.rule.name} {what}: {'; '.join(map(str, self.problems))}"
 
 
@@ -88,7 +88,7 @@ def inlets(detector: Detector) -> Inlets:
             if stream.type not in defined:  # else it is known what is wrong with its definition
                 problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
         except DefinitionError as error:
-            if asn1 is not None or not detector.spec.asn1:  # else what is wrong with the modules is told already
+            if asn1 is not None or not detector.spec.asn1:  # else what is wrong with the modules is reported already
                 field = "encoding" if stream.type is None else "type"
                 problems.append(RuleProblem(("spec", "streams", index, field), str(error)))
         else:
@@ -166,15 +166,15 @@ def _asn1(detector: Detector, problems: list[RuleProblem]) -> OwnDefinitions | N
 
 
 def offer_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with what a rule asks of installed packages: its plugin signals and its actions."""
+    """What is wrong with the installed packages that a rule uses: its plugin signals and its actions."""
     yield from plugin_problems(rule, detector)
     yield from action_problems(rule, detector)
 
 
-class RuleBook:
-    """Compiles rules, time and again. A rule that is refused goes on as it last was, and never harms the others.
+class RuleIndex:
+    """Compiles rules repeatedly. A refused rule keeps its last good version, and never affects others.
 
-    So a slip of the pen in a rule that is being edited ends no episode.
+    So a typo in a rule that is being edited ends no episode.
     """
 
     def __init__(self) -> None:
@@ -188,7 +188,7 @@ class RuleBook:
     def compile(
         self, rules: Sequence[EventRule], detector: Detector, fields: Mapping[str, Fields]
     ) -> tuple[list[CompiledRule], list[Refusal]]:
-        """The rules to evaluate, and those that are not evaluated as they are written."""
+        """The rules to evaluate, and the refused ones."""
         compiled: list[CompiledRule] = []
         refused: list[Refusal] = []
         good: dict[str, EventRule] = {}

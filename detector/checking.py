@@ -16,7 +16,7 @@ from detector.findings import (
     UNKNOWN_RULE,
 )
 from detector.models.binding import bind_models
-from detector.sources.registry import plugin_problems
+from detector.sources.registry import source_problems
 from wayside.api import Detector, EventRule
 from wayside.api.detector import Clock
 from wayside.api.documents import Document, Problem
@@ -40,7 +40,7 @@ def check_documents(documents: Sequence[Document]) -> list[Problem]:
 
 
 def findings(documents: Sequence[Document]) -> Findings:
-    """What is to be said of the Detectors, and of the rules with each Detector that selects them."""
+    """The findings about the Detectors, and about the rules with each Detector that selects them."""
     problems: list[Problem] = []
     warnings: list[Problem] = []
     detectors: list[tuple[Document, Detector, Inlets]] = []
@@ -49,7 +49,7 @@ def findings(documents: Sequence[Document]) -> Findings:
             try:
                 problems += [
                     document.problem(each.path, each.message, INVALID_DETECTOR.name)
-                    for each in plugin_problems(document.object)
+                    for each in source_problems(document.object)
                 ]
                 entries = inlets(document.object)
                 detectors.append((document, document.object, entries))
@@ -61,7 +61,7 @@ def findings(documents: Sequence[Document]) -> Findings:
     any_detector = any(isinstance(document.object, Detector) for document in documents)
     rules = [document for document in documents if isinstance(document.object, EventRule)]
     if rules and not any_detector:
-        missing = "a rule is checked against its Detector: give the Detector's file as well"
+        missing = "a rule is checked against its Detector: give the file of the Detector as well"
         problems.append(rules[0].problem((), missing, MISSING_DETECTOR.name))
     wrong = {
         detector.name: dependency_problems(
@@ -91,8 +91,8 @@ def _without_stamps(document: Document, detector: Detector, entries: Inlets) -> 
         for index, stream in without:
             yield document.problem(
                 ("spec", "streams", index),
-                f"stream {stream.name} carries no stamp, and others do: with clock Data the receive time counts for "
-                "it; give its stamp, e.g. msg.time or sample.received, or write clock: Wall",
+                f"stream {stream.name} has no stamp, unlike others: with clock Data its receive time is used; "
+                "give its stamp, e.g. msg.time or sample.received, or write clock: Wall",
                 STREAM_WITHOUT_STAMPS.name,
             )
 
@@ -103,7 +103,7 @@ def _unignored(document: Document, warnings: Iterable[Problem]) -> Iterator[Prob
 
 
 def _has_stamp(stream: Stream, fields: Fields | None) -> bool:
-    """Whether its messages can tell the sender's time."""
+    """Whether its messages can give the time of the sender."""
     if stream.stamp is not None or stream.encoding is Encoding.UPER:
         return True
     if stream.encoding is not Encoding.CDR:
@@ -155,7 +155,7 @@ def summary(documents: Sequence[Document]) -> str:
     if not counts:
         return looked
     others = ", ".join(_counted(count, kind) for kind, count in sorted(counts.items()))
-    return f"{looked} (not looked at: {others}; see `application-manager render`)"
+    return f"{looked} (not checked: {others}; see `application-manager render`)"
 
 
 def _counted(count: int, kind: str) -> str:

@@ -1,4 +1,4 @@
-"""The command `detector`: run, replay, check, and the commands that ask one that runs.
+"""The command `detector`: run, replay, check, and the commands that query a running one.
 
 Declared here, and in the modules of commands that are added below; what a command runs is imported when it runs.
 """
@@ -32,7 +32,7 @@ app = typer.Typer(
 )
 
 _EXPECTED = (InputError, OSError)
-"""Errors of the input: said in one line, without a trace."""
+"""Errors of the input: printed in one line, without a trace."""
 
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
 RuleFiles = Annotated[
@@ -42,7 +42,9 @@ RuleFiles = Annotated[
 
 @app.callback()
 def _main(
-    debug: Annotated[bool, typer.Option(commandline.DEBUG, help="Show the trace of an error, and log more.")] = False,
+    debug: Annotated[
+        bool, typer.Option(commandline.DEBUG, help="Show the stack trace of an error, and log more.")
+    ] = False,
 ) -> None:
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.INFO,
@@ -58,7 +60,8 @@ def run(
     detector: DetectorFile = None,
     rules: RuleFiles = None,
     name: Annotated[
-        str | None, typer.Option(help="The Detector to run: it and its EventRules are read from the API server.")
+        str | None,
+        typer.Option(help=("The Detector to run: the detector reads it and its EventRules from the API server.")),
     ] = None,
     namespace: Annotated[
         str | None, typer.Option(help="With --name: the namespace. Default: the kubeconfig's, or the pod's.")
@@ -67,8 +70,10 @@ def run(
         bool,
         typer.Option(
             "--as-pod",
-            help="With --name: one of several that run this Detector, each in a pod of its own. The holder is "
-            "<name>.<pod>, by the environment variable POD_NAME.",
+            help=(
+                "With --name: this is one of several pods that run this Detector. The holder is <name>.<pod>; "
+                "the environment variable POD_NAME gives the pod."
+            ),
         ),
     ] = False,
     output: Annotated[
@@ -76,11 +81,12 @@ def run(
         typer.Option(help="A folder for events.jsonl and, without a cluster, the tasks. Default there: out."),
     ] = None,
     record_intake: Annotated[
-        Path | None, typer.Option(help="Write all that the engine consumes into this file, for an exact replay.")
+        Path | None,
+        typer.Option(help=("Write everything that the engine consumes into this file, for an exact replay.")),
     ] = None,
     metrics_port: Annotated[
         int | None,
-        typer.Option(help="Serve /metrics, /healthz and /readyz on this port; 0: on a free one.", min=0, max=65535),
+        typer.Option(help="Serve /metrics, /healthz and /readyz on this port; 0: on any free port.", min=0, max=65535),
     ] = None,
     foxglove: Annotated[
         str | None,
@@ -100,11 +106,11 @@ def run(
     if (name is None) == (detector is None):
         refuse("give either --detector FILE and --rules FILE, or --name NAME")
     if name is not None and rules:
-        refuse("--rules goes with --detector; with --name the rules are read from the API server")
+        refuse("--rules requires --detector; with --name the rules are read from the API server")
     if detector is not None and namespace is not None:
-        refuse("--namespace goes with --name; a Detector in a file says its namespace itself")
+        refuse("--namespace requires --name; a Detector in a file names its namespace itself")
     if detector is not None and as_pod:
-        refuse("--as-pod goes with --name; a Detector in a file is held by its name")
+        refuse("--as-pod requires --name; the holder of a Detector in a file is its name")
     with importing():
         import asyncio
 
@@ -146,8 +152,8 @@ def _holder_in_pod(name: str) -> str:
         return TypeAdapter(Holder).validate_python(f"{name}.{pod}" if pod else "")
     except ValidationError:
         refuse(
-            f"--as-pod: the holder {name}.{pod} is none: give POD_NAME by the downward API (metadata.name); the "
-            "two names have room for 252 characters"
+            f"--as-pod: {name}.{pod} is not a valid holder: set POD_NAME by the downward API "
+            "(metadata.name); both names together may have 252 characters"
         )
 
 
@@ -164,7 +170,7 @@ def replay(
     detector: DetectorFile = None,
     rules: RuleFiles = None,
     as_one: Annotated[
-        bool, typer.Option("--as-one", help="Play all recordings as one, merged by time: they are of one drive.")
+        bool, typer.Option("--as-one", help=("Play all recordings as one, merged by time: they belong to one drive."))
     ] = False,
     results: Annotated[
         list[Kind] | None,
@@ -220,11 +226,15 @@ def topics(
         list[Path] | None,
         typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these."),
     ] = None,
-    as_yaml: Annotated[bool, typer.Option("--yaml", help="Print a Detector with streams that take all of it.")] = False,
+    as_yaml: Annotated[
+        bool, typer.Option("--yaml", help="Print a Detector with streams that match all of it.")
+    ] = False,
     live: Annotated[bool, typer.Option("--live", help="Listen on Zenoh instead of reading recordings.")] = False,
     connect: Annotated[
         list[str] | None,
-        typer.Option(help="With --live: Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: the local network's."),
+        typer.Option(
+            help="With --live: Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: those of the local network."
+        ),
     ] = None,
     seconds: Annotated[float, typer.Option(help="With --live: how long to listen.", min=0.1)] = 5.0,
 ) -> None:
@@ -232,7 +242,7 @@ def topics(
     if live == bool(recordings):
         refuse("give recordings, or --live")
     if connect and not live:
-        refuse("--connect goes with --live")
+        refuse("--connect requires --live")
     with importing():
         from detector.commands.topics import list_live_topics, list_topics
 
@@ -249,9 +259,10 @@ def try_(
         list[Path], typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these.")
     ],
     stream: Annotated[
-        str | None, typer.Option(help="As `detector topics --yaml` names it; default: the one that has the fields.")
+        str | None,
+        typer.Option(help=("As `detector topics --yaml` names it. Default: the stream that has the fields.")),
     ] = None,
-    every: Annotated[str, typer.Option(help="How often to look.")] = "100ms",
+    every: Annotated[str, typer.Option(help="Time between two evaluations.")] = "100ms",
 ) -> None:
     """Print the values of one expression over the messages of recordings, by client; no file is needed."""
     with importing():
@@ -281,7 +292,7 @@ def new(
 
 @app.command()
 def schema(
-    output: Annotated[Path | None, typer.Option(help="The file to write; default: print it.")] = None,
+    output: Annotated[Path | None, typer.Option(help="The file to write. Default: print it.")] = None,
 ) -> None:
     """Write the JSON Schema of all kinds, for editors that complete and check YAML."""
     with importing():
@@ -303,11 +314,13 @@ def check(
         list[Path] | None,
         typer.Option(
             "--recording",
-            help="Also look at this recording and replay it: warn of fields and streams that are not in it, and where "
-            "rules use old samples; may be repeated.",
+            help=(
+                "Also replay this recording: warn of fields and streams that it does not contain, and of rules "
+                "that use old samples. May be repeated."
+            ),
         ),
     ] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where there is a warning, too.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")] = False,
     ignore: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Do not report the warnings of this name; may be repeated."),

@@ -1,4 +1,4 @@
-"""What the detector proves itself with on a network, as one whole: certificates, key and password of one moment.
+"""The certificates, key and password of the detector for a network, all read at one moment.
 
 The files may change at any time, one after the other. So they are read, tried as a pair, and read again: what is given
 on belongs together, and stays what it is while a session uses it.
@@ -15,7 +15,7 @@ from detector.access import AccessError, Login, TlsFiles, login, tls_files
 from wayside.api.access import Access
 
 _ATTEMPTS = 5
-"""So often files that change while they are read are read again."""
+"""Number of attempts to read files that change in the meantime."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def read_material(access: Access, at: str) -> Material:
             raise AccessError(f"{at}: {problem}")
         ca, certificate, key = before
         return Material(ca, certificate, key, files.verify_name, credentials, tls=True)
-    raise AccessError(f"{at}: {files.certificate or files.ca} changes all the time: it is looked at again")
+    raise AccessError(f"{at}: {files.certificate or files.ca} keeps changing while it is read; it is read again later")
 
 
 def expiry(pem: bytes) -> float:
@@ -67,7 +67,7 @@ def _read(files: TlsFiles) -> tuple[bytes | None, bytes | None, bytes | None]:
 def _content(path: Path | None) -> bytes | None:
     try:
         return None if path is None else path.read_bytes()
-    except OSError:  # replaced just now: the next attempt tells
+    except OSError:  # just being replaced: the next attempt decides
         return None
 
 
@@ -78,7 +78,7 @@ def _problem(files: TlsFiles) -> str | None:
         if files.ca is not None:
             context.load_verify_locations(files.ca)
     except (OSError, ssl.SSLError) as error:
-        return f"{files.ca} holds no certificates that can be read ({_reason(error)}): give PEM"
+        return f"{files.ca} contains no readable certificates ({_reason(error)}): give PEM"
     if files.certificate is None or files.key is None:
         return None
     try:
@@ -86,8 +86,8 @@ def _problem(files: TlsFiles) -> str | None:
         expires = expiry(files.certificate.read_bytes())
     except (OSError, ssl.SSLError, ValueError) as error:
         if "KEY_VALUES_MISMATCH" in str(error):
-            return f"{files.key} is not the key of {files.certificate}: give both of one pair"
-        return f"{files.certificate} and {files.key} are no certificate and key ({_reason(error)}): give PEM"
+            return f"{files.key} is not the key of {files.certificate}: give a certificate and its own key"
+        return f"{files.certificate} and {files.key} are not a certificate and a key ({_reason(error)}): give PEM"
     now = datetime.datetime.now(datetime.UTC).timestamp()
     return f"{files.certificate} expired {now - expires:.0f} s ago: renew it" if expires <= now else None
 

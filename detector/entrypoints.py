@@ -1,7 +1,8 @@
 """What installed packages offer: classes of one kind, each with a model of its parameters.
 
-A package says by an entry point what it brings; whoever writes a resource names it and gives it parameters. Whatever is
-wrong with that (nothing of that name, a module that does not load, parameters that it refuses) is told with its field.
+A package declares what it provides by an entry point; a resource names it and gives it parameters. Whatever is
+wrong with that (nothing of that name, a module that does not load, parameters that it refuses) is reported with its
+field.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _OWN = "wayside"
 
 
 class PluginError(ValueError):
-    """A plugin that is not there, cannot be loaded, or refuses its parameters; `problems` says where and why.
+    """A plugin that is not there, cannot be loaded, or refuses its parameters; `problems` gives places and reasons.
 
     The paths begin at the part of the resource that names the plugin.
     """
@@ -49,7 +50,7 @@ class Offers(Generic[T]):
     model: type[BaseModel]
     """What `Parameters` derives from."""
     guide: str
-    """Where it is told how to write one, e.g. docs/plugins.md."""
+    """The guide for writing one, e.g. docs/plugins.md."""
     shipped: tuple[EntryPoint, ...] = ()
     """Those that need no installed package."""
 
@@ -92,15 +93,15 @@ def _load(offers: Offers[T], name: str) -> type[T]:
     if entry is None:
         close = difflib.get_close_matches(name, entries, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(entries) or 'none'}"
-        raise LookupError(f"no {what} is installed here; {hint} ({offers.guide})")
+        raise LookupError(f"no {what} is installed; {hint} ({offers.guide})")
     try:
         offered: Any = entry.load()
-    except Exception as error:  # somebody else's module, which may raise whatever it likes
-        raise LookupError(f"{what} cannot be loaded: {type(error).__name__}: {error}{_remedy(entry, error)}") from error
+    except Exception as error:  # a third-party module, which may raise anything
+        raise LookupError(f"cannot load {what}: {type(error).__name__}: {error}{_remedy(entry, error)}") from error
     base = f"{offers.base.__module__}.{offers.base.__qualname__}"
     complete = inspect.isclass(offered) and issubclass(offered, offers.base) and not inspect.isabstract(offered)
     if not complete:
-        raise LookupError(f"{what} is {entry.value}, which is no complete {base} ({offers.guide})")
+        raise LookupError(f"{what} is {entry.value}, which is not a complete {base} ({offers.guide})")
     model = getattr(offered, "Parameters", None)
     if not (inspect.isclass(model) and issubclass(model, offers.model)):
         raise LookupError(f"{what}: give {entry.value} a class Parameters({offers.model.__name__}) ({offers.guide})")

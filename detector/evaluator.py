@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from typing import Any, Protocol, TypeVar
 
 from detector.actions.base import Surroundings
-from detector.assembly import RuleBook, inlets
+from detector.assembly import RuleIndex, inlets
 from detector.engine.consequences.consequences import Consequence
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, to_task
@@ -42,13 +42,13 @@ _log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 _DRAIN_EVERY = 0.05
-"""Seconds between two looks at the intake, so that its queue stays short however rare the ticks are."""
+"""Seconds between two reads of the intake, so that its queue stays short even if ticks are rare."""
 
-_SAY_EVERY = 1.0
-"""Seconds between two looks at what was lost: there are counters for each rule and stream."""
+_LOG_EVERY = 1.0
+"""Seconds between two checks for losses: there are counters for each rule and stream."""
 
 _STALL = 1_000_000_000
-"""Nanoseconds: a tick that is overdue by more is not made up for, and a clock that stepped back further is believed."""
+"""Nanoseconds: a tick that is overdue by more is skipped, and a larger step back of the clock is accepted."""
 
 
 class Recorder(Protocol):
@@ -58,10 +58,10 @@ class Recorder(Protocol):
         """Samples that the engine takes in now."""
 
     def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
-        """What comes from now on belongs to these streams."""
+        """The following arrivals belong to these streams."""
 
     def control(self, time: int, document: Mapping[str, Any]) -> None:
-        """Something else that the engine is told, at a time in nanoseconds since the epoch."""
+        """Another input of the engine, at a time in nanoseconds since the epoch."""
 
 
 class Outlet(Protocol):
@@ -71,26 +71,26 @@ class Outlet(Protocol):
         """What started and ended, in order."""
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
-        """What is open may have changed; `episodes` tells what is, and is to be called at once or not at all."""
+        """Open episodes may have changed; `episodes` returns them, and must be called at once or not at all."""
 
     def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
         """These rules are evaluated from now on."""
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
-        """What actions other than deploy are told, in order."""
+        """The consequences for actions other than deploy, in order."""
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
-        """All that is demanded now, by task name, and when those that no longer are ended (nanoseconds)."""
+        """All demands by task name, and the ends of those that are gone (nanoseconds)."""
 
 
 class Onlooker(Observer, Protocol):
-    """Sees what is evaluated, on the evaluation's thread. It decides nothing, and never waits."""
+    """Observes the evaluation, on its thread. It decides nothing, and never waits."""
 
     def attend(self, engine: Engine) -> None:
         """The engine has other rules from now on."""
 
     def looked(self, engine: Engine, events: Sequence[Event]) -> None:
-        """The engine has taken in what came, and these events happened."""
+        """The engine has consumed the arrivals, and these events happened."""
 
 
 class Evaluator:
@@ -108,7 +108,7 @@ class Evaluator:
         outages: Outages | None = None,
         onlooker: Onlooker | None = None,
     ) -> None:
-        """`now` gives nanoseconds since the epoch; `on_failure` is told if the thread dies of an error.
+        """`now` gives nanoseconds since the epoch; `on_failure` is called if the thread dies of an error.
 
         `outages` are those of the engine's plugins: they are recorded, so that a replay knows them.
         """
@@ -120,12 +120,12 @@ class Evaluator:
         self._on_failure = on_failure
         self._outages = outages or Outages()
         self._onlooker = engine.instruments.observer = onlooker
-        self._rule_book = RuleBook()
+        self._rule_index = RuleIndex()
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
         self._stopping = False
         self._urgent = False
-        """Whether samples came that rules are evaluated with, since the last look began."""
+        """Whether samples for rules with onSample arrived since the last look began."""
         self._ended = False
         self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
         self._overload = Overload()
@@ -169,7 +169,7 @@ class Evaluator:
         self._thread.start()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
-        """Have something done on the evaluation's thread, between two looks; thread-safe. Gives what it returns."""
+        """Run a function on the thread of the evaluation, between two looks; thread-safe. The future has its result."""
         future: Future[Result] = Future()
         with self._wake:
             if self._ended:
@@ -180,13 +180,13 @@ class Evaluator:
         return future
 
     def ask(self, rule: str) -> Future[list[OnDemandResult]]:
-        """Evaluate a rule with onDemand now; thread-safe. Gives what it says of each subject, or NoAnswerError."""
+        """Evaluate a rule with onDemand now; thread-safe. Gives its result for each subject, or NoAnswerError."""
         return self.call(lambda: self._ask(rule))
 
     def pause_rule(self, rule: str, paused: bool) -> Future[None]:
         """Do not evaluate the rule from now on, or (not `paused`) again; thread-safe.
 
-        Gives NoAnswerError where there is no such rule. A detector that starts anew has no paused rules.
+        Gives NoAnswerError where there is no such rule. A restarted detector has no paused rules.
         """
         return self.call(lambda: self._pause_rule(rule, paused))
 
@@ -197,7 +197,7 @@ class Evaluator:
             self._wake.notify()
 
     def stop(self) -> None:
-        """Take in what has arrived, run what is due and end; returns when that is done."""
+        """Consume the remaining arrivals, run due ticks and end; returns when that is done."""
         with self._wake:
             self._stopping = True
             self._wake.notify()
@@ -205,7 +205,7 @@ class Evaluator:
 
     def _run(self) -> None:
         try:
-            stopping, say_due = False, time.monotonic()
+            stopping, log_due = False, time.monotonic()
             while not stopping:
                 with self._wake:
                     if self._wanted is None and not self._stopping and not self._calls and not self._urgent:
@@ -218,13 +218,13 @@ class Evaluator:
                 for future, work in calls:
                     _answer(future, work)
                 self.status.looked()
-                if time.monotonic() >= say_due:
-                    say_due = time.monotonic() + _SAY_EVERY
-                    self.losses.say()
+                if time.monotonic() >= log_due:
+                    log_due = time.monotonic() + _LOG_EVERY
+                    self.losses.log_new()
                 self._sweeper.look()
             self._finish()
             self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
-        except BaseException as error:  # noqa: BLE001  the supervisor must hear of whatever ends the evaluation
+        except BaseException as error:  # noqa: BLE001  the supervisor must learn of any end of the evaluation
             self._on_failure(error)
         finally:
             with self._wake:
@@ -234,13 +234,13 @@ class Evaluator:
 
     def _hurry(self) -> None:
         """Look at the intake now; thread-safe."""
-        if not self._urgent:  # else the next look, which has not drained the intake yet, finds what came
+        if not self._urgent:  # else the next look, which has not drained the intake yet, finds the arrivals
             with self._wake:
                 self._urgent = True
                 self._wake.notify()
 
     def _finish(self) -> None:
-        """Nothing more comes: evaluate what is still to be evaluated, as the replay of the recording will."""
+        """The end of input: evaluate the remaining ticks, as the replay of the recording does."""
         end = self._engine.now
         for events in self._engine.finish():
             self._hand_over(events)
@@ -248,13 +248,13 @@ class Evaluator:
         self._record(end, {"kind": "end", "finished": True})
 
     def pause(self) -> float:
-        """Seconds until there is something to do. With clock Data only the samples say when a tick is due."""
+        """Seconds until there is something to do. With clock Data only the samples determine when a tick is due."""
         if not self._engine.on_wall_clock:
             return _DRAIN_EVERY
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
 
     def _look(self, wanted: RuleSet | None) -> None:
-        """Take in what has arrived and run the ticks that are due."""
+        """Consume the arrivals and run the due ticks."""
         now = self._now()
         events: list[Event] = []
         if now + _STALL < self._intake.last:
@@ -263,7 +263,7 @@ class Evaluator:
             events += self._gap(now, "the wall clock stepped back")
         else:
             if now - self._engine.next_tick() > _STALL and self._engine.on_wall_clock:
-                events += self._gap(now, "the evaluation stood still, or the wall clock stepped ahead")
+                events += self._gap(now, "the evaluation stalled, or the wall clock stepped forward")
             events += self._take(self._intake.drain(now), now)
         if wanted is not None:
             events += self._configure(wanted)
@@ -281,14 +281,14 @@ class Evaluator:
         names = self._engine.schedule.paused - {rule} | ({rule} if paused else set())
         self._record(self._engine.now, {"kind": "paused", "rules": sorted(names)})
         self._engine.set_paused(names)
-        _log.info("EventRule %s is %s", rule, "paused: its open episodes hold" if paused else "evaluated again")
+        _log.info("EventRule %s is %s", rule, "paused; its open episodes are kept" if paused else "evaluated again")
 
     def _adapt(self, spent: int) -> None:
-        """Leave out more where the look took too long, and less when it is calm again."""
+        """Thin more evaluations after a slow look, and fewer once looks are fast again."""
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
-            text = "the evaluation takes too long" if spent > LONG else "the evaluation keeps up"
-            _log.warning("%s: evaluations of low priority are left out at level %d of %d", text, level, highest)
+            text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"
+            _log.warning("%s: thinning evaluations of low priority at level %d of %d", text, level, highest)
             self._record(self._engine.now, {"kind": "level", "level": level})
             self._engine.set_level(level)
 
@@ -303,11 +303,11 @@ class Evaluator:
         return events
 
     def _record_outages(self) -> None:
-        for document in self._outages.news():
+        for document in self._outages.take_changes():
             self._record(self._engine.now, document)
 
     def _gap(self, now: int, why: str) -> list[Event]:
-        _log.warning("%s: ticks are not made up for, windows begin anew, open episodes hold", why)
+        _log.warning("%s: skipping missed ticks; windows reset, open episodes kept", why)
         self.status.gaps += 1
         self._record(now, {"kind": "gap", "until": self._engine.now})
         return self._engine.gap(now)
@@ -332,11 +332,11 @@ class Evaluator:
 
     def _apply_rules(self, rule_set: RuleSet) -> list[Event]:
         entries = inlets(rule_set.detector)
-        compiled, refused = self._rule_book.compile(rule_set.rules, rule_set.detector, entries.fields)
+        compiled, refused = self._rule_index.compile(rule_set.rules, rule_set.detector, entries.fields)
         for refusal in refused:
             _log.error("%s", refusal)
         self.status.refused(refused)
-        self._outlet.follow(self._rule_book.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
+        self._outlet.follow(self._rule_index.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
         events = self._engine.set_rules(compiled)
         if self._onlooker is not None:
             self._onlooker.attend(self._engine)
@@ -371,9 +371,9 @@ class Evaluator:
 
 
 def _answer(future: Future[Any], work: Callable[[], Any]) -> None:
-    """Do what somebody asked for; an error is theirs, and not the evaluation's end."""
+    """Carry out a call; its error goes to the caller and does not end the evaluation."""
     if future.set_running_or_notify_cancel():
         try:
             future.set_result(work())
-        except Exception as error:  # noqa: BLE001  whoever asked hears of it
+        except Exception as error:  # noqa: BLE001  passed to the caller
             future.set_exception(error)

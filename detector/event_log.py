@@ -11,7 +11,7 @@ _log = logging.getLogger(__name__)
 
 
 class EventLog:
-    """Appends one CloudEvent a line. At most `capacity` wait; what finds the queue full is dropped and counted."""
+    """Appends one CloudEvent a line. At most `capacity` wait; further ones are dropped and counted."""
 
     def __init__(self, path: Path, *, capacity: int = 65536) -> None:
         """The file's folder is made; what the file holds stays.
@@ -26,7 +26,7 @@ class EventLog:
         self._thread = threading.Thread(target=self._run, name="event-log", daemon=True)
         self._thread.start()
         self.dropped = 0
-        """Events that found the queue full, or that the disk refused."""
+        """Events dropped because the queue was full, or that could not be written."""
 
     def write(self, line: str) -> None:
         """Queue a line; never waits."""

@@ -1,4 +1,4 @@
-"""A detector in a cluster: its Detector, rules and tasks live in the API server, and a Lease says that it lives.
+"""A detector in a cluster: its Detector, rules and tasks live in the API server, and a Lease shows that it is alive.
 
 It begins once it knows its rules, holds its Lease and has the episodes of its live tasks back.
 """
@@ -39,7 +39,7 @@ async def run_in_cluster(
     """Run the Detector of that name, and emit its tasks as the holder, until it is to stop.
 
     Raises:
-        NoClusterError, DetectorError, NetworkError, OSError: it cannot start; the text says why.
+        NoClusterError, DetectorError, NetworkError, OSError: it cannot start; the message gives the reason.
     """
     async with connect(namespace, otherwise=_OTHERWISE) as cluster:
         rules = ClusterRules(cluster.api, cluster.namespace, name)

@@ -1,4 +1,4 @@
-"""The commands that ask a running detector: `detector status`, `evaluate`, `pause` and `resume`.
+"""The commands that query a running detector: `detector status`, `evaluate`, `pause` and `resume`.
 
 A command imports what it runs when it runs, so that `--help` need not.
 """
@@ -15,17 +15,19 @@ from wayside.beginning import importing
 from wayside.commandline import refuse
 
 if TYPE_CHECKING:
-    from detector.streams.asking import Asked
+    from detector.streams.querying import Reply
     from wayside.api.zenoh import Zenoh
 
 DetectorFile = Annotated[
-    Path | None, typer.Option("--detector", help="The running detector's YAML file: says its name and network.")
+    Path | None, typer.Option("--detector", help=("The YAML file of the running detector, with its name and network."))
 ]
-Name = Annotated[str | None, typer.Option(help="The holder to ask; default: the file's Detector, else every one.")]
+Name = Annotated[
+    str | None, typer.Option(help=("The holder to query. Default: that of the file, else every detector."))
+]
 Connect = Annotated[
-    list[str] | None, typer.Option(help="Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: those of the file.")
+    list[str] | None, typer.Option(help="Zenoh endpoints, e.g. tcp/127.0.0.1:7447. Default: those of the file.")
 ]
-Timeout = Annotated[float, typer.Option(help="Seconds to wait for answers.", min=0.1)]
+Timeout = Annotated[float, typer.Option(help="Seconds to wait for responses.", min=0.1)]
 
 RuleName = Annotated[str, typer.Argument(help="The rule's name.", show_default=False)]
 
@@ -37,16 +39,16 @@ def status(
     detector: DetectorFile = None,
     name: Name = None,
     connect: Connect = None,
-    rule: Annotated[str | None, typer.Option(help="Tell only about this rule.")] = None,
+    rule: Annotated[str | None, typer.Option(help="Show only this rule.")] = None,
     subject: Annotated[
-        str | None, typer.Option(help="With --rule: the subject, e.g. car1, car1+car2 or ~fleet; default: the first.")
+        str | None, typer.Option(help=("With --rule: the subject, e.g. car1, car1+car2 or ~fleet. Default: the first."))
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each detector.")] = False,
     timeout: Timeout = 3.0,
 ) -> None:
-    """Say what running detectors take in, evaluate and lose; of a rule also what it sees, and what is unknown."""
+    """Show what running detectors receive, evaluate and lose; for a rule also its values, and what is unknown."""
     if subject is not None and rule is None:
-        refuse("--subject goes with --rule: of which rule?")
+        refuse("--subject requires --rule")
     given = {"rule": rule, "subject": subject, "wait": f"{min(timeout * 0.6, 99):.3f}"} if rule is not None else {}
     answers = inquire(
         "status", {name: value for name, value in given.items() if value is not None}, detector, name, connect, timeout
@@ -80,18 +82,18 @@ def evaluate(
 def pause(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
-    """Do not evaluate a rule until it is resumed; its open episodes hold."""
-    _told("pause", rule, inquire("pause", {"rule": rule}, detector, name, connect, timeout))
+    """Do not evaluate a rule until it is resumed; its open episodes are kept."""
+    _print_replies("pause", rule, inquire("pause", {"rule": rule}, detector, name, connect, timeout))
 
 
 def resume(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
     """Evaluate a paused rule again."""
-    _told("resume", rule, inquire("resume", {"rule": rule}, detector, name, connect, timeout))
+    _print_replies("resume", rule, inquire("resume", {"rule": rule}, detector, name, connect, timeout))
 
 
-def _told(what: str, rule: str, answers: list[Asked]) -> None:
+def _print_replies(what: str, rule: str, answers: list[Reply]) -> None:
     for answer in answers:
         typer.echo(f"{answer.key.split('/')[2]}: rule {rule} {what}d", err=True)
 
@@ -104,11 +106,11 @@ def inquire(
     connect: list[str] | None,
     timeout: float,
     payload: bytes | None = None,
-) -> list[Asked]:
-    """Ask the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
+) -> list[Reply]:
+    """Query the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
     with importing():
         from detector.rules.files import load_rules
-        from detector.streams.asking import ask
+        from detector.streams.querying import query_detectors
         from wayside.api.pod import DetectorMode
         from wayside.api.zenoh import Zenoh, ZenohMode
 
@@ -121,8 +123,8 @@ def inquire(
     if connect:
         config = config.model_copy(update={"connect": connect, "scouting": False, "mode": ZenohMode.CLIENT})
     if not config.connect and not config.scouting:
-        refuse("give --connect ENDPOINT, or --detector FILE whose spec.zenoh says where the detector is")
-    return ask(config, name or holder, what, given, timeout, payload)
+        refuse("give --connect ENDPOINT, or --detector FILE with the endpoints in spec.zenoh")
+    return query_detectors(config, name or holder, what, given, timeout, payload)
 
 
 def _reaching(zenoh: Zenoh) -> Zenoh:

@@ -1,4 +1,4 @@
-"""What is lost, or cannot be used: said when it first happens, then at most once a minute, and in all at the end.
+"""What is lost, or cannot be used: logged when it first happens, then at most once a minute, and in total at the end.
 
 Every kind of loss has a counter where it happens, and the last one's reason. Here they are only read.
 """
@@ -24,7 +24,7 @@ from wayside.rules import PairSubject
 _log = logging.getLogger(__name__)
 
 _APART = 1_000_000_000
-"""Nanoseconds: streams whose delays differ by more are not of one time."""
+"""Nanoseconds: streams whose delays differ by more have diverging stamps."""
 
 _EVERY = 60.0
 """Seconds between two lines about the same kind of loss: bad input may come a thousand times a second."""
@@ -47,7 +47,7 @@ class Loss:
 
 
 class Losses:
-    """Says what is new in the counters of an engine and its intake."""
+    """Logs what is new in the counters of an engine and its intake."""
 
     def __init__(
         self, engine: Engine, intake: Intake | None = None, monotonic: Callable[[], float] = time.monotonic
@@ -58,35 +58,35 @@ class Losses:
         self._monotonic = monotonic
         self._tallies: list[Tally] = []
         self._others: list[Callable[[], Iterable[Loss]]] = []
-        self._said: dict[str, tuple[int, float]] = {}
+        self._logged: dict[str, tuple[int, float]] = {}
 
     def watch(self, tally: Tally) -> None:
-        """Say what it counts as well."""
+        """Also report what this tally counts."""
         self._tallies.append(tally)
 
     def watch_also(self, losses: Callable[[], Iterable[Loss]]) -> None:
-        """Say these as well, whatever counts them."""
+        """Also report these losses, whatever counts them."""
         self._others.append(losses)
 
-    def say(self) -> None:
-        """Log each kind of loss of which there is more, unless it was said within the last minute."""
+    def log_new(self) -> None:
+        """Log each kind of loss that has increased, unless it was logged within the last minute."""
         now = self._monotonic()
         for loss in self.all():
-            said, since = self._said.get(loss.what, (0, -math.inf))
-            if loss.count > said and now - since >= _EVERY:
-                self._said[loss.what] = loss.count, now
-                _log.warning("%s", _line(loss, loss.count - said))
+            logged, since = self._logged.get(loss.what, (0, -math.inf))
+            if loss.count > logged and now - since >= _EVERY:
+                self._logged[loss.what] = loss.count, now
+                _log.warning("%s", _line(loss, loss.count - logged))
         for what, finding in self._apart():
-            if what not in self._said:
-                self._said[what] = 1, now
+            if what not in self._logged:
+                self._logged[what] = 1, now
                 _log.warning("%s", finding)
 
     def sum_up(self) -> None:
         """Log how many samples came, all losses since the start, and how the evaluations went."""
         counters, buffer = self._engine.counters, self._engine.buffer
-        _log.info("%d samples in, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
+        _log.info("%d samples received, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
         for line in (*self.report(), *self.doubts()):
-            _log.warning("in all, %s", line)
+            _log.warning("in total, %s", line)
 
     def report(self) -> Iterator[str]:
         """All losses since the start; and where values were unknown, since a misspelt field looks like that."""
@@ -100,7 +100,9 @@ class Losses:
                 yield f"{of_rule}: {often}" if often else of_rule
 
     def doubts(self) -> Iterator[Finding]:
-        """Streams whose stamps do not fit the clock; where counters watch ages, rules that use or lack old samples."""
+        """Streams whose stamps do not match the clock; where counters watch ages, rules that use or lack old
+        samples.
+        """
         yield from (finding for _, finding in self._apart())
         spec = self._engine.detector.spec
         for name, rule in self._engine.counters.rules.items():
@@ -108,21 +110,21 @@ class Losses:
                 stream, period = spec.stream(stream_name), use.period
                 limit = None if stream is None else spec.stale_after_ns(stream)
                 if limit is None or period is None:
-                    continue  # it never goes stale: what was said last holds
+                    continue  # it never goes stale: the last sample stays valid
                 every = f"every {period / 1e9:.2g} s"
                 if period > limit:
                     yield Finding(
                         STALE_BETWEEN_SAMPLES.name,
-                        f"samples of stream {stream_name} come {every} and go stale after {limit / 1e9:g} s: EventRule "
-                        f"{name} finds them unknown in between; raise streams[{stream_name}].staleAfter",
+                        f"samples of stream {stream_name} arrive {every} and go stale after {limit / 1e9:g} s, so "
+                        f"EventRule {name} finds them unknown in between; raise streams[{stream_name}].staleAfter",
                         name,
                     )
                 elif use.old:
-                    old = f"{use.old} of the {use.count} it used were older than {OLD * period / 1e9:.2g} s"
+                    old = f"{use.old} of the {use.count} samples it used were older than {OLD * period / 1e9:.2g} s"
                     yield Finding(
                         OLD_SAMPLES.name,
-                        f"EventRule {name} used old samples of stream {stream_name}: they come {every}, and {old}. "
-                        "A client's last sample counts on after it falls silent: lower "
+                        f"EventRule {name} used old samples of stream {stream_name}: they arrive {every}, and {old}. "
+                        "The last sample of a silent client stays valid until staleAfter: lower "
                         f"streams[{stream_name}].staleAfter"
                         + (", or maxAge of the position" if self._in_pairs(name) else ""),
                         name,
@@ -134,27 +136,31 @@ class Losses:
         return run is not None and isinstance(run.rule.subject, PairSubject)
 
     def _apart(self) -> Iterator[tuple[str, Finding]]:
-        """With clock Data, streams whose stamps do not fit those of the others: a name for each line, and it."""
+        """With clock Data, streams whose stamps diverge from those of the others: a key and a finding for each."""
         counters = self._engine.counters
         all_unstamped = counters.delays.keys() <= counters.unstamped.keys()
         right = _right(counters.delays)
         for name in sorted({*counters.delays, *counters.zeros}):
             remedy = f"give streams[{name}].stamp, e.g. msg.time or sample.received, or write clock: Wall"
             if zeros := counters.zeros[name]:
-                what = f"{zeros} samples of stream {name} are without a time: their stamps are 0"
-                yield f"zero {name}", Finding(ZERO_STAMPS.name, f"{what}; let the sender fill them in, {remedy}")
+                what = f"{zeros} samples of stream {name} have no time: their stamps are 0"
+                yield f"zero {name}", Finding(ZERO_STAMPS.name, f"{what}; set the stamps in the sender, {remedy}")
             if (unstamped := counters.unstamped[name]) and not all_unstamped:
-                what = f"{unstamped} samples of stream {name} carry no stamp, those of other streams do"
-                counted = f"{what}: with clock Data their receive time counts; {remedy}"
+                what = f"{unstamped} samples of stream {name} have no stamp, unlike those of other streams"
+                counted = f"{what}: with clock Data their receive time is used; {remedy}"
                 yield f"unstamped {name}", Finding(STREAM_WITHOUT_STAMPS.name, counted)
             behind = counters.delays.get(name, right[1]) - right[1]
             if behind < -_APART:
-                what = f"stamps of stream {name} are {-counters.delays[name] / 1e9:.1f} s ahead of the receive times"
-                late = "with clock Data the samples of other streams are late for it; set the sender's clock"
+                what = (
+                    f"the stamps of stream {name} are {-counters.delays[name] / 1e9:.1f} s ahead of the receive times"
+                )
+                late = "with clock Data this makes the samples of other streams late; set the clock of the sender"
                 yield f"ahead {name}", Finding(DIVERGING_STAMPS.name, f"{what}: {late}, {remedy}")
             elif behind > _APART:
-                what = f"stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those"
-                late = "with clock Data its samples are late for the others; set the sender's clock"
+                what = (
+                    f"the stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those"
+                )
+                late = "with clock Data this makes its samples late; set the clock of the sender"
                 yield f"behind {name}", Finding(DIVERGING_STAMPS.name, f"{what} of stream {right[0]}: {late}, {remedy}")
 
     def all(self) -> Iterator[Loss]:
@@ -166,38 +172,42 @@ class Losses:
         for losses in self._others:
             yield from losses()
         if self._intake is not None:
-            full = "samples dropped, the intake being full: more come in than are evaluated"
+            full = "samples dropped because the intake queue is full: more arrive than are evaluated"
             yield Loss(full, self._intake.dropped, cause="intake_full")
-        pushed_out = "samples pushed out of the buffer before their time: it is too small"
+        pushed_out = "samples evicted from the buffer early because it is too small"
         yield Loss(pushed_out, self._engine.buffer.evicted, cause="evicted")
         if isinstance(timeline, DataTimeline):
             ahead, late = timeline.dropped_ahead, timeline.dropped_late
-            yield Loss("samples dropped, their stamps being ahead of the rest", ahead, timeline.last, cause="ahead")
-            yield Loss("samples dropped, their stamps being too old", late, timeline.last, cause="late")
-            yield Loss("samples dropped, too many waiting for their time", timeline.dropped_full, cause="waiting_full")
-        too_late = "samples came when the window of an action that they belong to was complete: raise lateness"
+            yield Loss(
+                "samples dropped because their stamps are ahead of the rest", ahead, timeline.last, cause="ahead"
+            )
+            yield Loss("samples dropped because their stamps are too old", late, timeline.last, cause="late")
+            yield Loss(
+                "samples dropped because too many wait for their time", timeline.dropped_full, cause="waiting_full"
+            )
+        too_late = "samples too late for the window of an action: raise lateness"
         yield Loss(too_late, self._engine.consequences.too_late, cause="window_late")
         for name, count in counters.undecodable.items():
             last = counters.last_undecodable.get(name, "")
             unread = f"times a sample of stream {name} could not be read"
             yield Loss(unread, count, last, cause="undecodable", stream=name)
         for name, count in counters.unnamed.items():
-            unnamed = f"samples of stream {name} dropped, naming no client by key or message"
+            unnamed = f"samples of stream {name} dropped because neither key nor message names a client"
             yield Loss(unnamed, count, counters.last_unnamed.get(name, ""), cause="unnamed", stream=name)
         for name, count in counters.crowded.items():
-            crowded = f"samples of stream {name} dropped, too many clients being known"
+            crowded = f"samples of stream {name} dropped because too many clients are known"
             yield Loss(crowded, count, cause="crowded", stream=name)
         for name, rule in counters.rules.items():
             yield Loss(f"evaluation errors in EventRule {name}", rule.errors, rule.last_error, cause="error", rule=name)
             misplaced = f"times a sample had no position for EventRule {name}"
             yield Loss(misplaced, rule.misplaced, rule.last_misplaced, cause="misplaced", rule=name)
-            crowded = f"looks at pairs left out for EventRule {name}, more than maxPairs being near"
+            crowded = f"evaluations of pairs skipped for EventRule {name} because more than maxPairs are near"
             yield Loss(crowded, rule.crowded_pairs, cause="crowded_pairs", rule=name)
-            kept = f"times a parameter that follows kept its last value in EventRule {name}"
+            kept = f"times a followed parameter kept its last value in EventRule {name}"
             yield Loss(kept, rule.unfollowed, rule.last_unfollowed, cause="unfollowed", rule=name)
-            slow = f"evaluations of EventRule {name} left out, the machine being too slow"
+            slow = f"evaluations of EventRule {name} skipped because the machine is too slow"
             yield Loss(slow, rule.skipped, cause="skipped", rule=name)
-            often = f"episodes of EventRule {name} left out, beyond maxEpisodesPerHour"
+            often = f"episodes of EventRule {name} suppressed beyond maxEpisodesPerHour"
             yield Loss(often, rule.suppressed, cause="suppressed", rule=name)
 
 
@@ -222,7 +232,7 @@ def _often(rule: RuleCounters, *, in_pairs: bool) -> Iterator[str]:
 
 
 def _right(delays: Mapping[str, int]) -> tuple[str, int]:
-    """The stream whose stamps are taken as right, and its delay in nanoseconds.
+    """The stream with the reference stamps, and its delay in nanoseconds.
 
     No stamp lies after its receipt, so the smallest delay is right; where all do, that nearest to the receipt.
     """

@@ -2,7 +2,7 @@
 
 A sample is a tuple, and by default every 700 new ones start a search for cycles, although they never form any. That
 cost as much as receiving and inserting them (`benchmarks/intake_rate.py`). But libraries do leave cycles behind
-(paho-mqtt, some with each message), and with rare searches they add up to ten megabytes before anybody looks.
+(paho-mqtt, some with each message), and with rare searches they add up to ten megabytes unnoticed.
 
 And the C library gives each thread a heap of its own that it shrinks from its end alone: one small piece at the end
 keeps megabytes, so that a detector seems to grow for hours although it uses no more (`benchmarks/soak.py`).
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 
 _YOUNG = 100_000
-"""So many new containers start a search among the young ones."""
+"""Number of new containers that starts a search among the young ones."""
 
 _SWEEP, _TRIM = 5.0, 60.0
 """Seconds after which the young ones are searched in any case, and free memory is given back: both milliseconds."""

@@ -64,7 +64,7 @@ class LiveOutlet:
                 self._traces.over(event)
 
     def move(self, network: Network) -> None:
-        """The Detector changed: leave the network, and join the other. Where that fails, it is said."""
+        """The Detector changed: leave the network, and join the other. A failure is logged."""
         dropped = self.network.dropped_events
         self.network.close()
         self.network = network
@@ -72,10 +72,10 @@ class LiveOutlet:
         try:
             self.network.start()
         except NetworkError as error:
-            _log.error("the changed Detector has no network, correct it: %s", error)
+            _log.error("cannot join the network of the changed Detector; correct it: %s", error)
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
-        """Have what is open written to the state volume, where there is one."""
+        """Write the open episodes to the state volume, if there is one."""
         if self._state is not None:
             self._state.save(episodes())
 
@@ -85,16 +85,18 @@ class LiveOutlet:
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
         """Tell the actions."""
-        self.actions.tell(consequences if self._traces is None else self._traces.consequences(consequences))
+        self.actions.dispatch(consequences if self._traces is None else self._traces.consequences(consequences))
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
-        """See `Messenger`: for the actions, which need not know that the network may be another tomorrow."""
+        """See `Messenger`: for the actions, which are independent of changes of the network."""
         self.network.publish(key, payload, encoding)
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
         """See `Messenger`."""
         try:
-            return self.network.ask(selector, payload, timeout, attachment)
+            return self.network.query(selector, payload, timeout, attachment)
         except NetworkError as error:
             raise ActionError(str(error)) from error
 

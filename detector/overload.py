@@ -1,20 +1,20 @@
-"""When the evaluation falls behind, and when it has caught up: how much is left out, from what a look took. Pure.
+"""Detects when the evaluation falls behind or has caught up: the level of thinning, from the duration of looks. Pure.
 
 A look that took long means that ticks are overdue: the level rises by one at once. It falls by one after each ten
-seconds without such a look. What a level means, `detector/engine/timing/load.py` says.
+seconds without such a look. `detector/engine/timing/load.py` defines the levels.
 """
 
 from __future__ import annotations
 
 LONG = 250_000_000
-"""Nanoseconds that the evaluation of what had come may take; from 1 s on, ticks are lost."""
+"""Maximum nanoseconds for the evaluation of one look; from 1 s on, ticks are lost."""
 
 CALM = 10 * 10**9
 """Nanoseconds without a long look after which one level is taken back."""
 
 
 class Overload:
-    """Follows how long the looks at the intake take."""
+    """Tracks the duration of the looks at the intake."""
 
     def __init__(self) -> None:
         self.level = 0

@@ -15,9 +15,9 @@ from wayside.commandline import refuse
 if TYPE_CHECKING:
     from detector.actions.trigger.requests import RecordingReport, RecordingRequest
 
-app = typer.Typer(help="Have running detectors record, where they allow it (spec.recordings.onRequest).")
+app = typer.Typer(help="Request recordings of running detectors that permit it (spec.recordings.onRequest).")
 
-Id = Annotated[str, typer.Argument(help="The recording's id.", show_default=False)]
+Id = Annotated[str, typer.Argument(help="The id of the recording.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, a line for each recording.")]
 
 _WIDTH = 160
@@ -26,11 +26,13 @@ _WIDTH = 160
 
 @app.command()
 def start(
-    identity: Annotated[str | None, typer.Argument(help="An id of your choice. Default: a new one.")] = None,
-    stream: Annotated[list[str] | None, typer.Option(help="A stream; may be repeated. Default: all allowed.")] = None,
+    identity: Annotated[str | None, typer.Argument(help="An id of your choice. Default: a generated one.")] = None,
+    stream: Annotated[list[str] | None, typer.Option(help="A stream; may be repeated. Default: all permitted.")] = None,
     client: Annotated[list[str] | None, typer.Option(help="A client; may be repeated. Default: all.")] = None,
-    before: Annotated[str, typer.Option(help="How long before now it begins, as far as the buffer reaches.")] = "0s",
-    maximum_duration: Annotated[str, typer.Option(help="The recording ends after this time at the latest.")] = "10m",
+    before: Annotated[
+        str, typer.Option(help=("How long before now the recording starts, as far as the buffer reaches."))
+    ] = "0s",
+    maximum_duration: Annotated[str, typer.Option(help="The maximum duration of the recording.")] = "10m",
     detector: DetectorFile = None,
     name: Name = None,
     connect: Connect = None,
@@ -47,8 +49,8 @@ def start(
         maximumDuration=maximum_duration,
     )
     if detector is None and name is None:
-        refuse("which detector is to record? Give --name NAME or --detector FILE")
-    _print(_asked(request, detector, name, connect, timeout), as_json)
+        refuse("no detector given to record: give --name NAME or --detector FILE")
+    _print(_request_reports(request, detector, name, connect, timeout), as_json)
 
 
 @app.command()
@@ -63,8 +65,8 @@ def stop(
 ) -> None:
     """End a recording."""
     if detector is None and name is None:
-        refuse("which detector is to stop? Give --name NAME or --detector FILE")
-    _print(_asked(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
+        refuse("no detector given to stop: give --name NAME or --detector FILE")
+    _print(_request_reports(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
 
 
 @app.command()
@@ -77,7 +79,7 @@ def status(
     timeout: Timeout = 3.0,
 ) -> None:
     """Say what is recorded on request, and what was."""
-    _print(_asked(_request(id=identity), detector, name, connect, timeout), as_json)
+    _print(_request_reports(_request(id=identity), detector, name, connect, timeout), as_json)
 
 
 def _request(**given: object) -> RecordingRequest:
@@ -94,7 +96,7 @@ def _request(**given: object) -> RecordingRequest:
         refuse(f"{'.'.join(map(str, path))}: {text}")
 
 
-def _asked(
+def _request_reports(
     request: RecordingRequest,
     detector: DetectorFile,
     name: str | None,
@@ -108,14 +110,14 @@ def _asked(
     return [(answer.key.split("/")[2], report) for answer in answers for report in read_reports(answer.payload)]
 
 
-def _print(told: list[tuple[str, RecordingReport]], as_json: bool) -> None:
+def _print(reports: list[tuple[str, RecordingReport]], as_json: bool) -> None:
     """Exits with 1 where a recording was refused or has failed."""
     from detector.actions.trigger.orders import Progress
 
     if as_json:
         import msgspec
 
-        for holder, report in told:
+        for holder, report in reports:
             answer = {"detector": holder, **{key: value for key, value in msgspec.to_builtins(report).items() if value}}
             typer.echo(json.dumps(answer))
     else:
@@ -128,10 +130,10 @@ def _print(told: list[tuple[str, RecordingReport]], as_json: bool) -> None:
         table = Table(box=None, pad_edge=False, header_style="bold")
         for column in ("detector", "recording", "state", "until", "samples", "bytes", "files", "message"):
             table.add_column(column, overflow="fold")
-        for holder, report in told:
+        for holder, report in reports:
             counts = (report.samples, report.bytes)
             files = "\n".join(report.files)
             table.add_row(holder, report.id, report.state.value, report.until, *map(str, counts), files, report.message)
         console.print(table, highlight=False, markup=False)
-    if any(report.state in (Progress.REFUSED, Progress.FAILED) for _, report in told):
+    if any(report.state in (Progress.REFUSED, Progress.FAILED) for _, report in reports):
         raise typer.Exit(1)

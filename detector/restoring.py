@@ -23,14 +23,14 @@ class Restored:
 
 
 async def what_was_open(store: TaskStore, state: StateFile | None) -> Restored:
-    """Look at both. Waits for as long as the store is away; cancel it to give up."""
+    """Read both. Waits while the store is unavailable; cancel it to give up."""
     async with aclosing(store.follow()) as changes:
         async for change in changes:
             if isinstance(change, Snapshot):
                 episodes = [] if state is None else state.load()
                 over = _ended(change)
                 return Restored(live_demands(change), [each for each in episodes if each.episode not in over])
-    raise AssertionError("a store's changes never end")
+    raise AssertionError("the stream of a store's changes ended")
 
 
 def _ended(snapshot: Snapshot) -> set[str]:

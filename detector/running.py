@@ -1,4 +1,4 @@
-"""A detector at work: intake, evaluation, network, event log and recording, wired, started and ended in order."""
+"""A detector at work: intake, evaluation, network, event log and recording, wired, started and stopped in order."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from detector.plugins.processes import ProcessHost
 from detector.requested import Requested
 from detector.restoring import Restored
 from detector.rules.selection import RuleSet
-from detector.sources.registry import plugin_problems
+from detector.sources.registry import source_problems
 from detector.sources.supervision import Sources
 from detector.state import StateFile
 from detector.status.pulse import Pulse
@@ -75,7 +75,7 @@ class Running:
         traces: EpisodeTraces | None = None,
         view: View | None = None,
     ) -> None:
-        """Raises DetectorError where the Detector cannot run, OSError where a file or the port cannot be had."""
+        """Raises DetectorError where the Detector cannot run, OSError if a file or the port is unavailable."""
         self._loop = asyncio.get_running_loop()
         self._failed: asyncio.Future[None] = self._loop.create_future()
         self._rule_set = rule_set
@@ -102,7 +102,7 @@ class Running:
             onlooker=view,
         )
         requested = Requested(self._engine, self._evaluator.call)
-        self._outlet.actions.outcomes.heard = requested.heard
+        self._outlet.actions.outcomes.on_outcome = requested.on_outcome
         pulse = Pulse(self._loop)
         self.answers = Answers(
             self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence
@@ -136,7 +136,7 @@ class Running:
             len(self._restored.demands),
         )
         if self._restored.episodes:
-            _log.info("%d open episodes of the state volume", len(self._restored.episodes))
+            _log.info("restored %d open episodes from the state volume", len(self._restored.episodes))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -158,7 +158,7 @@ class Running:
         self._summarise()
 
     async def until(self, stopping: asyncio.Event) -> None:
-        """Wait for the end. Raises what ended the evaluation, if it was that."""
+        """Wait for the end. Raises the error that ended the evaluation, if any."""
         async with asyncio.TaskGroup() as group:
             ending = group.create_task(stopping.wait())
             self._failed.add_done_callback(lambda _: ending.cancel())
@@ -166,7 +166,7 @@ class Running:
             self._failed.result()
 
     async def follow(self, changes: AsyncIterator[RuleSet]) -> None:
-        """Take over each change of the Detector and its rules."""
+        """Apply each change of the Detector and its rules."""
         async for wanted in changes:
             detector, before = self._good(wanted.detector), self._rule_set.detector.spec
             self._rule_set = replace(wanted, detector=detector)
@@ -190,29 +190,29 @@ class Running:
         )
 
     def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
-        """What takes a stream's messages; what happens to tokens is never dropped lightly."""
+        """The inputs for the messages of a stream; changes of tokens are dropped last."""
         return self._intake.patient_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
 
     def _good(self, wanted: Detector) -> Detector:
-        """The changed Detector; the last one where it cannot run."""
+        """The changed Detector, or the last good one if it cannot run."""
         try:
             _checked(wanted)
         except DetectorError as error:
-            _log.error("Detector %s is not followed, the last good one goes on: %s", wanted.name, error)
+            _log.error("cannot apply the new Detector %s; keeping the last good one: %s", wanted.name, error)
             return self._rule_set.detector
         return wanted
 
     def _fail(self, error: BaseException) -> None:
-        def tell() -> None:
+        def notify() -> None:
             if not self._failed.done():
                 self._failed.set_exception(error)
 
-        self._loop.call_soon_threadsafe(tell)
+        self._loop.call_soon_threadsafe(notify)
 
     def _summarise(self) -> None:
         self._evaluator.losses.sum_up()
         if self._outlet.network.dropped_events:
-            _log.warning("in all, %d events not published", self._outlet.network.dropped_events)
+            _log.warning("in total, %d events not published", self._outlet.network.dropped_events)
 
 
 def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:
@@ -223,7 +223,7 @@ def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:
 
 
 def _server(port: int, answers: Answers) -> StatusServer:
-    # Not at the top: only a detector that is scraped owes the time to import it.
+    # Not at the top: only a detector that is scraped needs the import.
     from detector.status.metrics import Metrics  # noqa: PLC0415
 
     metrics = Metrics(answers.status)
@@ -233,20 +233,22 @@ def _server(port: int, answers: Answers) -> StatusServer:
 
 
 def _of_state(state: StateFile) -> Iterator[Loss]:
-    """What the state volume did not take or give."""
-    unwritten = "times the state volume could not be written, and was tried again"
+    """What could not be written to or read from the state volume."""
+    unwritten = "times the state volume could not be written"
     yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
-    yield Loss("files of the state volume set aside, being unreadable", state.set_aside, cause="state_unreadable")
+    yield Loss("unreadable files of the state volume set aside", state.set_aside, cause="state_unreadable")
 
 
 def _of_traces(traces: EpisodeTraces) -> Iterator[Loss]:
-    """Spans that nobody got."""
-    yield Loss("spans dropped, too many being on their way", traces.tracing.dropped, cause="spans_dropped")
-    yield Loss("spans not taken", traces.tracing.failed, f"by {traces.tracing.endpoint}", cause="spans_failed")
+    """Spans that were not exported."""
+    yield Loss("spans dropped because too many are in flight", traces.tracing.dropped, cause="spans_dropped")
+    yield Loss(
+        "spans that could not be exported", traces.tracing.failed, f"by {traces.tracing.endpoint}", cause="spans_failed"
+    )
 
 
 def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:
-    """What actions say that they lost."""
+    """What actions reported as lost."""
     for lost in outcomes.lost():
         cause = "action_" + re.sub(r"[^a-z]+", "_", lost.what.lower()).strip("_")
         what = f"{lost.what} (action {lost.which.action} of EventRule {lost.which.rule})"
@@ -258,14 +260,14 @@ def _unused(path: Path) -> Path:
     candidates = chain([path], (path.with_name(f"{path.stem}.{number}{path.suffix}") for number in count(2)))
     free = next(candidate for candidate in candidates if not candidate.exists())
     if free != path:
-        _log.warning("%s exists already: recording into %s", path, free)
+        _log.warning("%s already exists: recording into %s", path, free)
     return free
 
 
 def _checked(detector: Detector) -> Inlets:
     """What its streams need. Raises DetectorError, also where a plugin is missing or refuses its parameters."""
     entries = inlets(detector)
-    problems = list(plugin_problems(detector))
+    problems = list(source_problems(detector))
     if problems:
         raise DetectorError(problems)
     return entries

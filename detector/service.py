@@ -1,4 +1,4 @@
-"""`detector run`: wires streams, evaluation, actions and rules together, and ends in good order on SIGTERM.
+"""`detector run`: wires streams, evaluation, actions and rules together, and stops cleanly on SIGTERM.
 
 Zenoh ─▶ intake ─▶ evaluator (thread, owns the engine) ─▶ events: Zenoh, file
                       ▲                                └▶ demands: reconciler ─▶ tasks (API server, or files)
@@ -44,7 +44,7 @@ class Named:
     namespace: str | None
     output: Path | None
     holder: str
-    """By whose name tasks are emitted: the Detector's, or `<name>.<pod>` where several pods run it."""
+    """The holder of the tasks: the name of the Detector, or `<name>.<pod>` if several pods run it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,8 @@ async def run(options: Options) -> None:
     """Run until SIGTERM or SIGINT.
 
     Raises:
-        DocumentError, DetectorError, NetworkError, NoClusterError, OSError: it cannot start; the text says why.
+        DocumentError, DetectorError, NetworkError, NoClusterError, OSError: it cannot start; the message gives the
+        reason.
     """
     tune_garbage_collection()
     stopping = asyncio.Event()
@@ -78,7 +79,7 @@ async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces 
         case Files() as files:
             await _run_from_files(files, options, stopping, traces)
         case Named() as named:
-            # Not at the top: the Kubernetes client takes half a second to import, which nobody without a cluster owes.
+            # Not at the top: the Kubernetes client takes half a second to import, which is only needed with a cluster.
             from detector.in_cluster import run_in_cluster  # noqa: PLC0415
 
             record, port = options.record_intake, options.metrics_port

@@ -1,6 +1,6 @@
 """The state volume: open episodes as one file, so that those without tasks survive a restart, even a kill -9.
 
-The file is replaced in one step by a thread of its own, so the evaluation never waits for the disk and nobody ever
+The file is replaced in one step by a thread of its own, so the evaluation never waits for the disk and no reader ever
 reads half a file. Only the newest set of episodes waits to be written: a slow disk writes less often, and what a kill
 costs is what happened since the last write. An episode that ended then is open again after the restart, and ends again,
 with the same id.
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 _VERSION = 1
 _RETRY = 5.0
-"""Seconds after which a write that failed is tried again, if nothing changes before."""
+"""Seconds after which a failed write is retried, if nothing changes before."""
 
 
 def state_file(detector: Detector, holder: str) -> StateFile | None:
@@ -36,8 +36,8 @@ def state_file(detector: Detector, holder: str) -> StateFile | None:
         return StateFile(Path(state.path), detector.namespace, holder)
     except OSError as error:
         raise OSError(
-            f"spec.state.path: {state.path} cannot be written ({error.strerror}): give a folder that the detector may "
-            "write to"
+            f"spec.state.path: cannot write {state.path} ({error.strerror}): give a folder that the "
+            "detector may write to"
         ) from error
 
 
@@ -56,7 +56,7 @@ class StateFile:
         self._closing = False
         self._thread: threading.Thread | None = None
         self.failures = 0
-        """Writes that the disk refused; each was tried again."""
+        """Number of failed writes; each was retried."""
         self.last_failure = ""
         self.set_aside = 0
         """Files that could not be read."""
@@ -64,14 +64,14 @@ class StateFile:
     def load(self) -> list[OpenEpisode]:
         """The episodes that were open when the file was last written; none where there is no file.
 
-        A file that cannot be read is said and set aside, beside the other under a free name: nothing is restored then.
+        An unreadable file is logged and set aside under a free name: nothing is restored then.
         """
         try:
             text = self.path.read_bytes()
         except FileNotFoundError:
             return []
         except OSError as error:
-            _log.error("%s cannot be read, no episode is restored from it: %s", self.path, error)
+            _log.error("cannot read %s; restoring no episode from it: %s", self.path, error)
             return []
         try:
             return self._read(text)
@@ -84,7 +84,7 @@ class StateFile:
         if not isinstance(document, dict) or document.get("version") != _VERSION:
             raise ValueError(f"it is not of version {_VERSION}")
         if document.get("of") != self._whose:
-            raise ValueError(f"it is of {document.get('of')}, not of {self._whose}")
+            raise ValueError(f"it belongs to {document.get('of')}, not to {self._whose}")
         episodes = document.get("episodes")
         if not isinstance(episodes, list) or not all(isinstance(each, dict) for each in episodes):
             raise ValueError("its episodes are not a list of maps")
@@ -98,9 +98,9 @@ class StateFile:
         try:
             self.path.rename(aside)
         except OSError as refused:
-            _log.error("%s is unreadable and cannot be set aside (%s): %s", self.path, refused, error)
+            _log.error("cannot read %s, nor set it aside (%s): %s", self.path, refused, error)
         else:
-            _log.error("the state is unreadable, set aside as %s, and nothing restored from it: %s", aside, error)
+            _log.error("cannot read the state; set it aside as %s and restored nothing from it: %s", aside, error)
 
     def save(self, episodes: Sequence[OpenEpisode]) -> None:
         """These are open now. Never waits; only the newest counts."""
@@ -112,7 +112,7 @@ class StateFile:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what waits; returns when that is done, or the disk has refused it."""
+        """Write what waits; returns when that has succeeded or failed."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -138,7 +138,7 @@ class StateFile:
                 self.failures += 1
                 self.last_failure = str(error)
                 if not failed:
-                    _log.error("the state cannot be written, and is as soon as possible: %s", error)
+                    _log.error("cannot write the state; retrying: %s", error)
                 failed = True
                 with self._changed:
                     if self._wanted is None:

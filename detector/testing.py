@@ -27,7 +27,7 @@ Paths = str | Path | Sequence[str | Path]
 
 
 class RefusedError(ValueError):
-    """A rule that is not evaluated; the text says why, and where."""
+    """A rule that is not evaluated; the message gives the reason and the place."""
 
 
 def run(rules: Paths, detector: str | Path, recording: Paths, *, as_one: bool = False) -> list[Event]:

@@ -1,7 +1,7 @@
 """The spans of episodes and of their tasks, where traces are on (see `wayside.tracing`).
 
-An episode's span is told when the episode ends. Its ids follow from the episode's id, so its event and its tasks bear
-them from the start, and a detector that takes the episode up again ends the same span.
+The span of an episode is exported when the episode ends. Its ids follow from the episode's id, so its event and its
+tasks carry them from the start, and a detector that takes the episode up again ends the same span.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from wayside.tracing import Tracing, tracing
 
 
 class EpisodeTraces:
-    """Says where episodes and tasks stand, and tells their spans. From any thread; nothing here waits."""
+    """Gives episodes and tasks their trace context, and exports their spans. Thread-safe; never waits."""
 
-    def __init__(self, told: Tracing) -> None:
-        self.tracing = told
+    def __init__(self, tracing: Tracing) -> None:
+        self.tracing = tracing
 
     def event(self, event: Event) -> Event:
-        """The event, with where its episode stands."""
+        """The event, with the trace context of its episode."""
         return msgspec.structs.replace(event, traceparent=str(self._context(event.rule, event.episode)))
 
     def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:
-        """Likewise, of what actions are told."""
+        """Likewise, of the consequences for actions."""
         return [
             replace(each, event=self.event(each.event)) if isinstance(each, Begun | Over) else each
             for each in consequences
         ]
 
     def over(self, event: Event) -> None:
-        """An episode ended: tell its span."""
+        """An episode ended: export its span."""
         if event.end_time is None or event.reason is None:
             return
         self.tracing.emit(
@@ -62,7 +62,7 @@ class EpisodeTraces:
         return task.model_copy(update={"metadata": task.metadata.model_copy(update={"annotations": annotations})})
 
     def created(self, demand: Demand, began: int) -> None:
-        """The demand's task was created, which began at a time in nanoseconds since the epoch: tell its span."""
+        """The demand's task was created, which began at a time in nanoseconds since the epoch: export its span."""
         self.tracing.emit(
             Span(
                 f"create task {demand.action}",
@@ -91,18 +91,18 @@ class EpisodeTraces:
 
 @contextmanager
 def episode_traces(*, export: bool = True) -> Iterator[EpisodeTraces | None]:
-    """Traces where the environment asks for them, else None. On leaving, what waits is sent, for two seconds at most.
+    """Traces if the environment requests them, else None. On exit, waiting spans are sent, for two seconds at most.
 
-    A replay does not `export`: the spans are those of the drive, and were told then.
+    A replay does not `export`: the spans are those of the drive, and were exported then.
     """
-    told = tracing("wayside-detector", export=export)
-    if told is None:
+    exporter = tracing("wayside-detector", export=export)
+    if exporter is None:
         yield None
         return
     try:
-        yield EpisodeTraces(told)
+        yield EpisodeTraces(exporter)
     finally:
-        told.close()
+        exporter.close()
 
 
 def _name(rule: str) -> str:

@@ -25,7 +25,7 @@ class Silent:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         raise AssertionError("nothing is published here")
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float) -> list[bytes]:
+    def query(self, selector: str, payload: bytes | None, timeout: float) -> list[bytes]:
         raise AssertionError("nobody is asked here")
 
 

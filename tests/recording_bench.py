@@ -83,7 +83,7 @@ class _Silent:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         raise AssertionError("recordings publish nothing")
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float) -> list[bytes]:
+    def query(self, selector: str, payload: bytes | None, timeout: float) -> list[bytes]:
         raise AssertionError("recordings ask nobody")
 
 

@@ -1,7 +1,7 @@
-"""What an action is: a class with typed parameters that is told of a rule's episodes, one after the other.
+"""What an action is: a class with typed parameters that receives the episodes of a rule, one after the other.
 
-An action has a thread of its own: it may wait for disks and networks, and nobody else notices. What it raises ends its
-work for that episode and no other.
+An action has a thread of its own: it may wait for disks and networks without delaying anything else. What it raises
+ends its work for that episode and no other.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ActionParameters(Model):
 
 
 class ActionError(Exception):
-    """Raised by an action that cannot do its work for an episode, with a text for people."""
+    """Raised by an action that cannot do its work for an episode, with a message for people."""
 
 
 class Messenger(Protocol):
@@ -39,16 +39,18 @@ class Messenger(Protocol):
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """Queue a message; never waits. With the queue full it is dropped and counted."""
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
-        """Send a query to all who answer it and wait for the answers, at most so many seconds.
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
+        """Send a query to everyone who answers it, and wait at most `timeout` seconds for the answers.
 
-        Raises ActionError where there is no session, nobody answers, or the answer is an error.
+        Raises ActionError if there is no session, no answer, or an error as answer.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What the detector is just now. It may be another after a change of the Detector."""
+    """The present configuration of the detector. It may differ after a change of the Detector."""
 
     detector: Detector
     decoders: Mapping[str, Decoder]
@@ -68,35 +70,35 @@ class Setting:
     surroundings: Callable[[], Surroundings]
     messenger: Messenger
     report: Callable[[Episode, Outcome], None]
-    """Say how far the work for an episode has come: it is published, counted and shown by `detector status`.
+    """Report the progress of an episode: it is published, counted and shown by `detector status`.
 
     Every episode that was started must be reported DONE or FAILED at last, and may be RUNNING before, also repeatedly.
     """
     lose: Callable[[str, int, str], None]
-    """Count what was lost: in a few words what, how many, and the reason. It is shown beside the detector's losses."""
+    """Count losses: a short description, the number, and the reason. They are shown with the losses of the detector."""
     closing: threading.Event
-    """Set when the detector ends: whoever waits for something should give up soon."""
+    """Set when the detector stops: anything that waits should give up soon."""
 
 
 class Action(ABC, Generic[P]):
-    """What a rule does about its episodes.
+    """An action of a rule.
 
     There is one object for each action of each rule. All its methods are called on one thread that belongs to it, never
     two at a time, and for each episode in this order: `started`, `samples` and `ended` as it happens, `completed` last.
     Episodes overlap.
 
-    What `started`, `samples`, `ended` or `completed` raises is reported as the failure of that episode, which is then
-    not told of any more.
+    What `started`, `samples`, `ended` or `completed` raises is reported as the failure of that episode, which then
+    receives nothing more.
     """
 
     Parameters: ClassVar[type[BaseModel]]
-    """The model of its parameters; what it refuses, `detector check` reports with its place."""
+    """The model of its parameters; `detector check` reports errors with their place."""
 
     @classmethod
     def problems(cls, parameters: P, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
-        """What is wrong with parameters that their model cannot see, each with its place among them.
+        """Problems of the parameters that their model cannot detect, each with its place among them.
 
-        `detector check` tells it, and a rule with such an action is refused.
+        `detector check` reports it, and a rule with such an action is refused.
         """
         return ()
 
@@ -114,14 +116,14 @@ class Action(ABC, Generic[P]):
         """Its event ended; samples of the window's `after` may follow."""
 
     def completed(self, episode: Episode, completion: Completion) -> None:
-        """There is nothing more to come of it. It may not have ended, where the detector or the action ends."""
+        """Nothing more of it follows. It may still be open if the detector or the action ends."""
 
     def wake(self) -> float | None:
-        """Called between the others: do what is due now, and say in how many seconds to call again at the latest.
+        """Called between the others: do what is due now, and return the maximum number of seconds until the next call.
 
         None: when there is something new. What it raises is counted, and it is called again after a second.
         """
         return None
 
     def close(self) -> None:
-        """The last call: all episodes are completed. Give up after a few seconds where something hangs."""
+        """The last call: all episodes are completed. Give up after a few seconds if something hangs."""

@@ -1,4 +1,4 @@
-"""What an action learns of an episode: what its events say, what is rendered for it, and its samples."""
+"""What an action receives of an episode: its events, its rendered values, and its samples."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class OutcomeState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What an action says of its work for one episode."""
+    """What an action reports about its work for one episode."""
 
     state: OutcomeState
     message: str = ""

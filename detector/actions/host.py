@@ -1,4 +1,4 @@
-"""Has the actions of all rules at work, follows changes of the rules, and ends in good order.
+"""Runs the actions of all rules, follows changes of the rules, and stops them cleanly.
 
 engine ─▶ consequences ─▶ host ─▶ a worker for each action of each rule, with a thread of its own
                                       └▶ outcomes: status, follow-ups on Zenoh
@@ -16,7 +16,7 @@ from typing import Any
 
 from detector.actions.base import Action, Messenger, Setting, Surroundings
 from detector.actions.outcomes import Outcomes, Which
-from detector.actions.registry import DEPLOY, prepare
+from detector.actions.registry import DEPLOY, prepare_action
 from detector.actions.worker import MAXIMUM_BYTES, Worker
 from detector.engine.consequences.consequences import Begun, Consequence, Run
 from wayside.api import EventRule
@@ -29,8 +29,8 @@ _GRACE = 5.0
 
 
 @dataclass(slots=True)
-class _Employed:
-    """A worker, and what it was employed for."""
+class _Assignment:
+    """A worker, and the action that it runs."""
 
     rule: EventRule
     action: api.Action
@@ -38,7 +38,7 @@ class _Employed:
 
 
 class ActionHost:
-    """The workers. `follow` and `tell` are called by one thread, the evaluation's, and never wait."""
+    """The workers. `follow` and `dispatch` are called by one thread, the evaluation's, and never wait."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class ActionHost:
     ) -> None:
         """`maximum_bytes` of samples wait for each action; `now` gives nanoseconds since the epoch.
 
-        `patient`: `tell` waits for an action that is too slow. Otherwise samples are left out.
+        `patient`: `dispatch` waits for an action that is too slow. Otherwise samples are dropped.
         """
         self._patient = patient
         self._holder = holder
@@ -59,7 +59,7 @@ class ActionHost:
         self._maximum = maximum_bytes
         self._surroundings: Surroundings | None = None
         self._closing = threading.Event()
-        self._employed: dict[Which, _Employed] = {}
+        self._assignments: dict[Which, _Assignment] = {}
         self._at_work: dict[Run, Worker] = {}
         self._leaving: list[Worker] = []
         """Workers whose action was changed or removed; each ends when it has completed its runs."""
@@ -74,53 +74,53 @@ class ActionHost:
             for action in rule.spec.actions
             if action.field != DEPLOY
         }
-        for which, employed in list(self._employed.items()):
-            if which not in wanted or not _same(employed, *wanted[which]):
-                del self._employed[which]
-                self._leaving.append(employed.worker)
+        for which, assignment in list(self._assignments.items()):
+            if which not in wanted or not _same(assignment, *wanted[which]):
+                del self._assignments[which]
+                self._leaving.append(assignment.worker)
         for which, (rule, action) in wanted.items():
-            if which not in self._employed:
+            if which not in self._assignments:
                 self.outcomes.know(which, action.kind)
                 worker = Worker(which, self._maker(rule, action), self.outcomes, self._maximum, patient=self._patient)
-                self._employed[which] = _Employed(rule, action, worker)
+                self._assignments[which] = _Assignment(rule, action, worker)
         self._dismiss()
 
-    def tell(self, consequences: Sequence[Consequence]) -> None:
+    def dispatch(self, consequences: Sequence[Consequence]) -> None:
         """Pass on what happened, in order."""
         for each in consequences:
             if isinstance(each, Begun):
-                employed = self._employed.get(Which(each.run.rule, each.run.action))
-                if employed is None:
+                assignment = self._assignments.get(Which(each.run.rule, each.run.action))
+                if assignment is None:
                     continue
-                self._at_work[each.run] = employed.worker
+                self._at_work[each.run] = assignment.worker
             worker = self._at_work.get(each.run)
             if worker is not None:
-                worker.tell(each)
+                worker.enqueue(each)
                 if each.run not in worker.open:
                     del self._at_work[each.run]
         if consequences:
             self._dismiss()
 
     def close(self, grace: float = _GRACE) -> None:
-        """End all workers; returns when they have, or after so many seconds, and says who did not."""
+        """End all workers; returns when they have ended, or after `grace` seconds, and logs those that have not."""
         self._closing.set()
-        workers = [*(each.worker for each in self._employed.values()), *self._leaving]
+        workers = [*(each.worker for each in self._assignments.values()), *self._leaving]
         for worker in workers:
-            worker.tell_to_close()
+            worker.request_close()
         deadline = time.monotonic() + grace
         for worker in workers:
             if not worker.join(max(0.0, deadline - time.monotonic())):
                 rule, action = worker.which
                 _log.error(
-                    "action %s of EventRule %s does not end within %g s, and is left behind", action, rule, grace
+                    "action %s of EventRule %s did not stop within %g s; abandoning its thread", action, rule, grace
                 )
-                self.outcomes.lose(worker.which, "times the action did not end and was left behind", 1, "")
+                self.outcomes.lose(worker.which, "times the action did not stop in time and was abandoned", 1, "")
 
     def _dismiss(self) -> None:
-        """Let those go who have nothing left to do."""
+        """Close workers that have no work left."""
         for worker in self._leaving:
             if not worker.open:
-                worker.tell_to_close()
+                worker.request_close()
         self._leaving = [worker for worker in self._leaving if not worker.ended]
 
     def _maker(self, rule: EventRule, action: api.Action) -> Callable[[], Action[Any]]:
@@ -137,22 +137,22 @@ class ActionHost:
         )
 
         def make() -> Action[Any]:
-            offered, parameters = prepare(action)
+            offered, parameters = prepare_action(action)
             return offered(parameters, setting)
 
         return make
 
     def _around(self) -> Surroundings:
         if self._surroundings is None:
-            raise RuntimeError("no rule has been followed yet")
+            raise RuntimeError("no EventRule has been applied yet")
         return self._surroundings
 
 
-def _same(employed: _Employed, rule: EventRule, action: api.Action) -> bool:
-    """Whether the action is to be as it is. What its rule says of itself goes into recordings, so it counts."""
-    before = employed.rule
+def _same(assignment: _Assignment, rule: EventRule, action: api.Action) -> bool:
+    """Whether the action is to be as it is. The labels and texts of its rule go into recordings, so they count."""
+    before = assignment.rule
     return (
-        employed.action == action
+        assignment.action == action
         and before.metadata.generation == rule.metadata.generation
         and before.metadata.labels == rule.metadata.labels
         and before.spec.classification == rule.spec.classification

@@ -1,4 +1,4 @@
-"""What became of the actions' work: kept by action for the status, and told as follow-ups on Zenoh.
+"""The outcomes of actions: kept by action for the status, and published as follow-ups on Zenoh.
 
     wayside/actions/<holder>/<rule>/<episode>/<action>
 
@@ -31,7 +31,7 @@ class Which(NamedTuple):
 
 
 @dataclass(slots=True)
-class Tally:
+class ActionTally:
     """What an action has done since the detector's start, or since it was last changed to be of another kind."""
 
     kind: str
@@ -46,7 +46,7 @@ class Tally:
     last_failure: str = ""
     last_file: str = ""
     current: dict[str, str] = field(default_factory=dict)
-    """By episode, what was said last of those that run, if anything was."""
+    """By running episode, the last message, if any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Lost:
 
 
 class Outcomes:
-    """Keeps and tells outcomes; thread-safe."""
+    """Keeps and publishes outcomes; thread-safe."""
 
     def __init__(self, holder: str, publish: Callable[[str, bytes, str], None], now: Callable[[], int]) -> None:
         """`publish` takes key, payload and encoding and never waits; `now` gives nanoseconds since the epoch."""
@@ -68,42 +68,42 @@ class Outcomes:
         self._publish = publish
         self._now = now
         self._lock = threading.Lock()
-        self._tallies: dict[Which, Tally] = {}
-        self._said: dict[tuple[Which, str], Outcome | None] = {}
-        """The runs that are neither done nor failed, with what was said last."""
+        self._tallies: dict[Which, ActionTally] = {}
+        self._reported: dict[tuple[Which, str], Outcome | None] = {}
+        """The runs that are neither done nor failed, with their last outcome."""
         self._lost: Counter[tuple[Which, str]] = Counter()
         self._reasons: dict[tuple[Which, str], str] = {}
-        self.heard: Callable[[Which, str, Outcome], None] = lambda which, episode, outcome: None
-        """Told each outcome that counts, with the episode's id, on the thread that reports it."""
+        self.on_outcome: Callable[[Which, str, Outcome], None] = lambda which, episode, outcome: None
+        """Called with each new outcome and the id of the episode, on the thread that reports it."""
 
     def know(self, which: Which, kind: str) -> None:
         """There is this action, whether or not it is ever needed."""
         with self._lock:
             if which not in self._tallies or self._tallies[which].kind != kind:
-                self._tallies[which] = Tally(kind)
+                self._tallies[which] = ActionTally(kind)
 
     def begin(self, which: Which, episode: Episode) -> None:
         """The action has the episode."""
         with self._lock:
-            if (which, episode.id) not in self._said:
-                self._said[which, episode.id] = None
+            if (which, episode.id) not in self._reported:
+                self._reported[which, episode.id] = None
                 self._tallies[which].running += 1
 
     def report(self, which: Which, episode: Episode, outcome: Outcome) -> None:
-        """See `Setting.report`. After DONE or FAILED nothing more counts, nor what is said twice."""
+        """See `Setting.report`. Reports after DONE or FAILED and repeated reports are ignored."""
         with self._lock:
             known = (which, episode.id)
-            if known not in self._said or self._said[known] == outcome:
+            if known not in self._reported or self._reported[known] == outcome:
                 return
             tally = self._tallies[which]
             if outcome.state is OutcomeState.RUNNING:
-                self._said[known] = outcome
+                self._reported[known] = outcome
                 tally.current[episode.id] = outcome.message
             else:
-                del self._said[known]
+                del self._reported[known]
                 tally.current.pop(episode.id, None)
                 _count(tally, outcome)
-        self.heard(which, episode.id, outcome)
+        self.on_outcome(which, episode.id, outcome)
         document = follow_up(self._holder, which, episode, outcome, self._now())
         key = f"wayside/actions/{self._holder}/{which.rule}/{episode.id}/{which.action}"
         self._publish(key, json.dumps(document, separators=(",", ":"), allow_nan=False).encode(), ENCODING)
@@ -111,12 +111,12 @@ class Outcomes:
     def is_open(self, which: Which, episode: str) -> bool:
         """Whether the run is neither done nor failed."""
         with self._lock:
-            return (which, episode) in self._said
+            return (which, episode) in self._reported
 
     def is_silent(self, which: Which, episode: str) -> bool:
-        """Whether nothing was said of the run yet."""
+        """Whether nothing was reported about the run yet."""
         with self._lock:
-            return (which, episode) in self._said and self._said[which, episode] is None
+            return (which, episode) in self._reported and self._reported[which, episode] is None
 
     def lose(self, which: Which, what: str, count: int, last: str) -> None:
         """See `Setting.lose`."""
@@ -124,7 +124,7 @@ class Outcomes:
             self._lost[which, what] += count
             self._reasons[which, what] = last
 
-    def tallies(self) -> dict[Which, Tally]:
+    def tallies(self) -> dict[Which, ActionTally]:
         """A copy of what is kept of each action."""
         with self._lock:
             return {which: _copied(tally) for which, tally in sorted(self._tallies.items())}
@@ -139,7 +139,7 @@ class Outcomes:
 
 
 def follow_up(holder: str, which: Which, episode: Episode, outcome: Outcome, now: int) -> dict[str, Any]:
-    """The CloudEvent that tells an outcome; `now` is nanoseconds since the epoch."""
+    """The CloudEvent of an outcome; `now` is nanoseconds since the epoch."""
     data: dict[str, Any] = {
         "rule": which.rule,
         "action": which.action,
@@ -169,7 +169,7 @@ def _given(name: str, value: Any) -> Mapping[str, Any]:
     return {name: value} if value else {}
 
 
-def _count(tally: Tally, outcome: Outcome) -> None:
+def _count(tally: ActionTally, outcome: Outcome) -> None:
     tally.running -= 1
     tally.samples += outcome.samples
     tally.bytes += outcome.bytes
@@ -184,8 +184,8 @@ def _count(tally: Tally, outcome: Outcome) -> None:
         tally.last_failure = outcome.message
 
 
-def _copied(tally: Tally) -> Tally:
-    return Tally(
+def _copied(tally: ActionTally) -> ActionTally:
+    return ActionTally(
         tally.kind, tally.running, tally.done, tally.failed, tally.samples, tally.bytes, tally.missing, tally.files,
         tally.last_failure, tally.last_file, dict(tally.current),
     )  # fmt: skip

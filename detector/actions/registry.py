@@ -1,4 +1,4 @@
-"""Which actions there are, and whether a rule gives them what they ask for.
+"""Which actions there are, and whether a rule gives them the parameters that they require.
 
 Built-in actions are found as those of other packages are. Their parameters are fields of the rule, so they are known to
 be right once the rule is read.
@@ -26,7 +26,7 @@ DEPLOY = "deploy"
 """The action that is none of these: its tasks are reconciled (detector/actions/deploy)."""
 
 
-def prepare(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
+def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
     """The class of an action other than deploy, and its parameters; `streams` are those that parameters may name.
 
     Raises PluginError; the paths begin at the action.
@@ -36,25 +36,30 @@ def prepare(action: api.Action, streams: Sequence[str] | None = None) -> tuple[t
         given = action.parameters
         if not isinstance(given, offered.Parameters):
             wanted = f"{offered.Parameters.__module__}.{offered.Parameters.__name__}"
-            raise PluginError(((action.field,), f"what is installed as action {action.kind} asks for {wanted}"))
+            raise PluginError(((action.field,), f"the installed action {action.kind} takes the parameters {wanted}"))
         return offered, given
     name = action.plugin.name
     if name in api.Action.model_fields:
-        raise PluginError((("plugin", "name"), f"{name} is no plugin: write {name}: {{…}} in place of plugin: {{…}}"))
+        raise PluginError(
+            (
+                ("plugin", "name"),
+                f"{name} is a built-in action, not a plugin: write {name}: {{…}} instead of plugin: {{…}}",
+            )
+        )
     offered = OFFERS.load(name, ("plugin", "name"))
     context = {"streams": None if streams is None else list(streams)}
     return offered, OFFERS.parameters(offered, action.plugin.parameters, ("plugin", "parameters"), context)
 
 
 def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with a rule's actions, as far as their classes can tell here."""
+    """What is wrong with a rule's actions, as far as their classes can check here."""
     yield from secret_problems(rule, detector)
     streams = [stream.name for stream in detector.spec.streams]
     for index, action in enumerate(rule.spec.actions):
         if action.field != DEPLOY:
             at = ("spec", "actions", index)
             try:
-                offered, parameters = prepare(action, streams)
+                offered, parameters = prepare_action(action, streams)
             except PluginError as error:
                 for path, text in error.problems:
                     yield RuleProblem((*at, *path), text)

@@ -33,8 +33,10 @@ def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem
             if name in own:
                 yield RuleProblem(
                     place,
-                    f"the Secret {name} is the Detector's own, for its networks: name another one, or have its "
-                    "spec.pod.secrets give this one to rules",
+                    (
+                        f"the Secret {name} holds the network access of the Detector itself: name another one, "
+                        "or share it with rules in spec.pod.secrets"
+                    ),
                 )
 
 

@@ -1,7 +1,7 @@
-"""One action of one rule at work: its thread, and the bounded queue of what it is told.
+"""One action of one rule at work: its thread, and the bounded queue of its input.
 
-Samples wait up to so many bytes; what finds the queue full is left out of that run, counted, and told at its end. What
-tells of episodes always gets through. What the action raises ends its work for that episode and no other.
+Samples wait up to a number of bytes; beyond it they are dropped from that run, counted, and reported at its end.
+Messages about episodes are never dropped. What the action raises ends its work for that episode and no other.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 MAXIMUM_BYTES = 256 * 2**20
 """So many bytes of samples wait for an action at most, overhead included."""
 
-SILENT = "the action ended without saying what became of it"
+SILENT = "the action ended without reporting an outcome"
 
 _AGAIN = 1.0
 """Seconds after which `wake` is called again when it failed."""
@@ -36,7 +36,7 @@ Make = Callable[[], Action[Any]]
 
 
 class Worker:
-    """Tells an action of its episodes. `tell` from one thread at a time, and never waits, unless it is patient."""
+    """Passes episodes to an action. One thread at a time calls `enqueue`, which never waits unless `patient`."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class Worker:
         *,
         patient: bool = False,
     ) -> None:
-        """`patient`: where the queue is full, `tell` waits, and nothing is left out."""
+        """`patient`: `enqueue` waits while the queue is full, and no sample is dropped."""
         self.which = which
         self._patient = patient
         self._make = make
@@ -60,11 +60,11 @@ class Worker:
         self._changed = threading.Condition()
         self._closing = False
         self._episodes: dict[Run, Episode] = {}
-        """Of the runs that the action is told of."""
+        """The episodes of the runs that the action receives."""
         self._completed: list[Episode] = []
-        """Episodes of which nothing more comes, and of which the action has not said anything yet."""
+        """Completed episodes about which the action has not reported anything yet."""
         self.open: set[Run] = set()
-        """The runs that are not completed, as the one who tells sees it."""
+        """The runs that are not completed, as the producer sees them."""
         self._thread = threading.Thread(target=self._work, name=f"action {which.rule}/{which.action}", daemon=True)
         self._thread.start()
 
@@ -73,7 +73,7 @@ class Worker:
         """Of samples that wait for the action."""
         return self._waiting
 
-    def tell(self, consequence: Consequence) -> None:
+    def enqueue(self, consequence: Consequence) -> None:
         """Pass on what happened."""
         match consequence:
             case Begun(run=run):
@@ -89,20 +89,20 @@ class Worker:
             elif size and self._waiting + size > self._maximum:
                 count = len(consequence.samples) if isinstance(consequence, Sampled) else 0
                 self._missing[consequence.run] = self._missing.get(consequence.run, 0) + count
-                self._outcomes.lose(self.which, "samples left out, the action being too slow", count, "")
+                self._outcomes.lose(self.which, "samples left out because the action is too slow", count, "")
                 return
             self._waiting += size
             self._inbox.append((consequence, size))
             self._changed.notify()
 
-    def tell_to_close(self) -> None:
-        """Nothing more is told; returns at once."""
+    def request_close(self) -> None:
+        """Enqueue nothing more; returns at once."""
         with self._changed:
             self._closing = True
             self._changed.notify()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the action's end, at most so many seconds; whether it has ended."""
+        """Wait at most `timeout` seconds for the end of the action; returns whether it has ended."""
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
@@ -118,22 +118,22 @@ class Worker:
             with self._changed:
                 if not self._inbox and not self._closing:
                     self._changed.wait(None if due is None else max(0.0, due - time.monotonic()))
-                news = list(self._inbox)
+                received = list(self._inbox)
                 self._inbox.clear()
                 closing = self._closing
-            for consequence, size in news:
+            for consequence, size in received:
                 self._pass_on(action, problem, consequence)
                 with self._changed:
                     self._waiting -= size
                     self._changed.notify()
-            if action is not None and (news or closing or due is None or time.monotonic() >= due):
+            if action is not None and (received or closing or due is None or time.monotonic() >= due):
                 due = self._woken(action)
-            if closing and not news:
+            if closing and not received:
                 break
         if action is not None:
             try:
                 action.close()
-            except Exception as error:  # noqa: BLE001  somebody else's code, at its very end
+            except Exception as error:  # noqa: BLE001  third-party code, at its very end
                 self._failed_in(action, "close", error)
             for episode in self._silent():
                 self._outcomes.report(self.which, episode, Outcome(OutcomeState.FAILED, SILENT))
@@ -141,8 +141,8 @@ class Worker:
     def _made(self) -> tuple[Action[Any] | None, str]:
         try:
             return self._make(), ""
-        except Exception as error:  # noqa: BLE001  somebody else's code: its episodes fail, and nothing else does
-            problem = f"the action cannot be had: {_text(error)}"
+        except Exception as error:  # noqa: BLE001  third-party code: its episodes fail, and nothing else does
+            problem = f"cannot create the action: {_text(error)}"
             _log.error("action %s of EventRule %s: %s", self.which.action, self.which.rule, problem)
             return None, problem
 
@@ -163,8 +163,8 @@ class Worker:
                 _log.debug("action %s of EventRule %s", self.which.action, self.which.rule, exc_info=error)
             self._fail(run, _text(error))
         if isinstance(consequence, Completed):
-            told_of = self._episodes.pop(run, None)
-            self._completed = [*self._silent(), *(() if told_of is None else (told_of,))]
+            completed = self._episodes.pop(run, None)
+            self._completed = [*self._silent(), *(() if completed is None else (completed,))]
 
     def _silent(self) -> list[Episode]:
         return [each for each in self._completed if self._outcomes.is_silent(self.which, each.id)]
@@ -188,7 +188,7 @@ class Worker:
                 action.completed(episode, Completion(cut, missing))
 
     def _fail(self, run: Run, why: str) -> None:
-        """The action has failed with the run, and is not told of it any more."""
+        """The action has failed with the run, and receives nothing more of it."""
         episode = self._episodes.pop(run)
         if self._outcomes.is_open(self.which, episode.id):
             _log.error("action %s of EventRule %s failed for %s: %s", self.which.action, run.rule, episode.subject, why)
@@ -200,7 +200,7 @@ class Worker:
         """When to call it again; seconds of the monotonic clock."""
         try:
             pause = action.wake()
-        except Exception as error:  # noqa: BLE001  somebody else's code, which must not end the thread
+        except Exception as error:  # noqa: BLE001  third-party code, which must not end the thread
             self._failed_in(action, "wake", error)
             pause = _AGAIN
         return None if pause is None else time.monotonic() + max(0.0, pause)

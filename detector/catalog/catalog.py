@@ -20,7 +20,7 @@ class ChoiceError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
+class CatalogEntry:
     """A rule as the catalog has it; each is one of its own, whatever they have in common."""
 
     name: str
@@ -28,11 +28,11 @@ class Entry:
     """Where it was found: file and line, or the namespace."""
     description: str
     classification: Classification
-    """Without values where the rule says none."""
+    """Without values if the rule gives none."""
 
     @property
     def classified(self) -> bool:
-        """Whether the rule says where it stands in any dimension."""
+        """Whether the rule has a value in any dimension."""
         return bool(self.classification.to_json())
 
     def values(self, dimension: Dimension) -> tuple[Value, ...]:
@@ -41,32 +41,32 @@ class Entry:
         return tuple(value for value in dimension.values if value in given)
 
 
-def entry(rule: EventRule, place: str) -> Entry:
+def entry(rule: EventRule, place: str) -> CatalogEntry:
     """The rule as the catalog has it."""
-    return Entry(rule.name, place, rule.spec.description, rule.spec.classification or Classification())
+    return CatalogEntry(rule.name, place, rule.spec.description, rule.spec.classification or Classification())
 
 
 @dataclass(frozen=True)
 class Catalog:
     """Rules, by name and place."""
 
-    entries: tuple[Entry, ...]
+    entries: tuple[CatalogEntry, ...]
 
-    def having(self, value: Value) -> tuple[Entry, ...]:
+    def having(self, value: Value) -> tuple[CatalogEntry, ...]:
         """The rules that have the value; values of two dimensions differ even where they are written alike."""
         dimension = next(each for each in SCHEME if isinstance(value, each.values))
         return tuple(each for each in self.entries if value in each.values(dimension))
 
-    def silent(self, dimension: Dimension) -> tuple[Entry, ...]:
-        """The classified rules that say nothing in the dimension."""
+    def silent(self, dimension: Dimension) -> tuple[CatalogEntry, ...]:
+        """The classified rules without a value in the dimension."""
         return tuple(each for each in self.entries if each.classified and not each.values(dimension))
 
     @property
-    def unclassified(self) -> tuple[Entry, ...]:
+    def unclassified(self) -> tuple[CatalogEntry, ...]:
         """The rules without any classification."""
         return tuple(each for each in self.entries if not each.classified)
 
-    def labels(self) -> Mapping[Entry, str]:
+    def labels(self) -> Mapping[CatalogEntry, str]:
         """What the rules are called: by name, and with the folder or file where several have the same name."""
         return dict(_labelled(self.entries))
 
@@ -75,11 +75,11 @@ class Catalog:
 class Read:
     """Rules, and what could not be read."""
 
-    entries: tuple[Entry, ...]
+    entries: tuple[CatalogEntry, ...]
     unreadable: tuple[str, ...] = ()
 
 
-def catalog(entries: Iterable[Entry], chosen: Chosen | None = None) -> Catalog:
+def catalog(entries: Iterable[CatalogEntry], chosen: Chosen | None = None) -> Catalog:
     """The rules that have, in each chosen dimension, one of the chosen values."""
     wanted = (chosen or {}).items()
     kept = (each for each in entries if all(values & set(each.values(dimension)) for dimension, values in wanted))
@@ -87,10 +87,10 @@ def catalog(entries: Iterable[Entry], chosen: Chosen | None = None) -> Catalog:
 
 
 def choose(texts: Iterable[str]) -> Chosen:
-    """What is asked for as `dimension=value`; several values of a dimension are alternatives.
+    """The choice given as `dimension=value`; several values of a dimension are alternatives.
 
     Raises:
-        ChoiceError: there is no such dimension or value; the text says which there are.
+        ChoiceError: there is no such dimension or value; the message lists the valid ones.
     """
     chosen: dict[Dimension, frozenset[Value]] = {}
     for text in texts:
@@ -98,12 +98,12 @@ def choose(texts: Iterable[str]) -> Chosen:
         dimension = next((each for each in SCHEME if each.name == name), None)
         if dimension is None:
             raise ChoiceError(
-                f"{text}: there is no dimension {name!r}; there are {_listed(each.name for each in SCHEME)}"
+                f"{text}: unknown dimension {name!r}; the dimensions are {_listed(each.name for each in SCHEME)}"
             )
         value = next((each for each in dimension.values if each.value == written), None)
         if value is None:
             there = _listed(each.value for each in dimension.values)
-            raise ChoiceError(f"{text}: {name} has no value {written!r}; it has {there}")
+            raise ChoiceError(f"{text}: {name} has no value {written!r}; its values are {there}")
         chosen[dimension] = chosen.get(dimension, frozenset()) | {value}
     return chosen
 
@@ -112,7 +112,7 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(names)
 
 
-def _labelled(entries: Iterable[Entry]) -> Iterator[tuple[Entry, str]]:
+def _labelled(entries: Iterable[CatalogEntry]) -> Iterator[tuple[CatalogEntry, str]]:
     """By name; where several share one, with their place, without what all these places begin with."""
     for name, group in groupby(entries, key=lambda each: each.name):
         same = list(group)

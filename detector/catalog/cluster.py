@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from detector.catalog.catalog import Entry, Read, entry
+from detector.catalog.catalog import CatalogEntry, Read, entry
 from detector.cluster.connection import connect
 from detector.cluster.errors import ApiError, NoClusterError
 from detector.rules.kubernetes import EVENT_RULES
@@ -11,7 +11,8 @@ from wayside.api.documents import parse_object
 
 
 async def read_cluster(namespace: str | None) -> Read:
-    """The EventRules of the namespace. Those that cannot be read, such as of a newer version, are told and left out.
+    """The EventRules of the namespace. Those that cannot be read, such as of a newer version, are reported and left
+    out.
 
     Args:
         namespace: default: the kubeconfig context's, or the pod's own.
@@ -19,15 +20,16 @@ async def read_cluster(namespace: str | None) -> Read:
     Raises:
         NoClusterError: there is neither a kubeconfig nor a pod's account, or the API server does not let us list.
     """
-    entries: list[Entry] = []
+    entries: list[CatalogEntry] = []
     unreadable: list[str] = []
-    async with connect(namespace, otherwise="give files or folders with EventRules instead of --cluster") as cluster:
+    async with connect(namespace, otherwise="give either files or folders with EventRules, or --cluster") as cluster:
         try:
             listed = await cluster.api.list(EVENT_RULES, cluster.namespace, {})
         except ApiError as error:
             raise NoClusterError(
-                f"the EventRules of namespace {cluster.namespace} cannot be listed: {error}. Check that KUBECONFIG "
-                "leads to the right cluster, and that its account may list eventrules.wayside.dev there"
+                f"cannot list the EventRules of namespace {cluster.namespace}: {error}. Check that "
+                "KUBECONFIG points to the right cluster, and that its account may list "
+                "eventrules.wayside.dev there"
             ) from error
         for each in listed["items"]:
             # The status is the manager's business, and a newer manager's may have fields that we do not know.
@@ -37,6 +39,6 @@ async def read_cluster(namespace: str | None) -> Read:
             except ValueError as error:
                 unreadable.append(f"EventRule {each['metadata']['name']}: {error}")
                 continue
-            assert isinstance(rule, EventRule)  # noqa: S101  the resource says so
+            assert isinstance(rule, EventRule)  # noqa: S101  the resource defines it
             entries.append(entry(rule, f"namespace {rule.namespace}"))
     return Read(tuple(entries), tuple(unreadable))

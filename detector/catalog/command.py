@@ -39,8 +39,10 @@ def command(
         list[str] | None,
         typer.Option(
             metavar="DIMENSION=VALUE",
-            help="Only rules with this value, e.g. typeOfAction=Deployment; repeatable: of one dimension either value, "
-            "of several all.",
+            help=(
+                "Only rules with this value, e.g. typeOfAction=Deployment. Repeatable: values of the same "
+                "dimension are alternatives, all dimensions must match."
+            ),
         ),
     ] = None,
     form: Annotated[Format, typer.Option("--format", help="Markdown, JSON and HTML are text.")] = Format.TABLE,
@@ -50,7 +52,7 @@ def command(
     if bool(files) == cluster:
         refuse("give files or folders with EventRules, or --cluster")
     if namespace is not None and not cluster:
-        refuse("--namespace goes with --cluster; rules in files say their namespaces themselves")
+        refuse("--namespace requires --cluster; rules in files name their namespace themselves")
     with importing():
         from detector.catalog.catalog import ChoiceError, catalog, choose
         from detector.catalog.files import read_files
@@ -61,7 +63,7 @@ def command(
         refuse(f"--only {error}")
     read = _read_cluster(namespace) if cluster else read_files(files or ())
     for text in read.unreadable:
-        typer.echo(f"left out, since it cannot be read: {text}", err=True)
+        typer.echo(f"left out, because it cannot be read: {text}", err=True)
     found = catalog(read.entries, chosen)
     text = _text(found, form, into_file=output is not None)
     if output is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from detector.catalog.catalog import Catalog, Entry
+from detector.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME
 
 
@@ -35,7 +35,7 @@ def json_view(catalog: Catalog) -> str:
     return json.dumps(document, ensure_ascii=False, indent=2) + "\n"
 
 
-def _rule(each: Entry) -> dict[str, Any]:
-    told = {"name": each.name, "place": each.place, "description": each.description or None}
+def _rule(each: CatalogEntry) -> dict[str, Any]:
+    fields = {"name": each.name, "place": each.place, "description": each.description or None}
     classification = each.classification.to_json() if each.classified else None
-    return {name: value for name, value in (*told.items(), ("classification", classification)) if value is not None}
+    return {name: value for name, value in (*fields.items(), ("classification", classification)) if value is not None}

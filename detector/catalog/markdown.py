@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
-from detector.catalog.catalog import Catalog, Entry
+from detector.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME
 
 _MEANINGFUL = re.compile(r"([\\`*_{}\[\]<>()#+!|~])")
@@ -19,7 +19,7 @@ def markdown_view(catalog: Catalog) -> str:
 def _overview(catalog: Catalog) -> Iterator[str]:
     labels = catalog.labels()
 
-    def names(entries: Iterable[Entry]) -> str:
+    def names(entries: Iterable[CatalogEntry]) -> str:
         return ", ".join(_text(labels[each]) for each in entries)
 
     yield from ("# Rules by dimension and value", "", "| dimension | value | rules |", "|---|---|---|")
@@ -29,7 +29,7 @@ def _overview(catalog: Catalog) -> Iterator[str]:
             yield f"| {first} | {value.words} | {names(catalog.having(value))} |"
             first = ""
         if silent := catalog.silent(dimension):
-            yield f"| | *not said* | {names(silent)} |"
+            yield f"| | *not given* | {names(silent)} |"
     if catalog.unclassified:
         yield from ("", f"Without classification: {names(catalog.unclassified)}.")
 

@@ -11,7 +11,7 @@ import colorsys
 from collections.abc import Iterator, Mapping
 from html import escape
 
-from detector.catalog.catalog import Catalog, Entry
+from detector.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME, Dimension, Value
 
 
@@ -22,7 +22,7 @@ def page(catalog: Catalog) -> str:
     return _PAGE.format(style=_STYLE, script=_SCRIPT, count=len(catalog.entries), body="\n".join(body))
 
 
-def _chart(catalog: Catalog, numbers: Mapping[Entry, str]) -> Iterator[str]:
+def _chart(catalog: Catalog, numbers: Mapping[CatalogEntry, str]) -> Iterator[str]:
     labels = catalog.labels()
     yield '<section class="chart">'
     for index, dimension in enumerate(SCHEME):
@@ -41,7 +41,7 @@ def _chart(catalog: Catalog, numbers: Mapping[Entry, str]) -> Iterator[str]:
     yield "</section>"
 
 
-def _tables(catalog: Catalog, numbers: Mapping[Entry, str]) -> Iterator[str]:
+def _tables(catalog: Catalog, numbers: Mapping[CatalogEntry, str]) -> Iterator[str]:
     labels = catalog.labels()
     yield '<section class="rules">'
     for each in catalog.entries:
@@ -57,7 +57,7 @@ def _tables(catalog: Catalog, numbers: Mapping[Entry, str]) -> Iterator[str]:
     yield "</section>"
 
 
-def _rows(each: Entry) -> Iterator[str]:
+def _rows(each: CatalogEntry) -> Iterator[str]:
     for dimension in SCHEME:
         values = ", ".join(
             f'<span title="{escape(value.definition)}">{escape(value.words)}</span>' for value in each.values(dimension)

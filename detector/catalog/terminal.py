@@ -8,7 +8,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from detector.catalog.catalog import Catalog, Entry
+from detector.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME
 
 
@@ -16,7 +16,7 @@ def terminal_view(catalog: Catalog) -> RenderableType:
     """Each value of each dimension with the rules that have it."""
     labels = catalog.labels()
 
-    def names(entries: Iterable[Entry]) -> Text:
+    def names(entries: Iterable[CatalogEntry]) -> Text:
         return Text(", ".join(labels[each] for each in entries))
 
     table = Table(box=None, pad_edge=False, show_edge=False)
@@ -28,7 +28,7 @@ def terminal_view(catalog: Catalog) -> RenderableType:
             table.add_row(first, value.words, names(catalog.having(value)))
             first = ""
         if silent := catalog.silent(dimension):
-            table.add_row(first, "(not said)", names(silent))
+            table.add_row(first, "(not given)", names(silent))
     if not catalog.unclassified:
         return table
     return Group(table, Text.assemble("\nwithout classification: ", names(catalog.unclassified)))

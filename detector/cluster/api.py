@@ -42,7 +42,7 @@ class Resource(NamedTuple):
 class Api:
     """The verbs, for a namespace and resource each time.
 
-    Every verb raises `UnavailableError` where the server does not answer or asks to come back, and another `ApiError`
+    Every verb raises `UnavailableError` where the server does not answer or requests a retry, and another `ApiError`
     where it refuses.
     """
 
@@ -154,4 +154,5 @@ class Api:
         except (aiohttp.ClientError, TimeoutError, OSError) as error:
             raise UnavailableError(0, "NoAnswer", f"{method} {url}: {error or type(error).__name__}") from error
         except json.JSONDecodeError as error:
-            raise UnavailableError(0, "NoAnswer", f"{method} {url}: the answer is cut or no JSON: {error}") from error
+            text = f"{method} {url}: the response is truncated or not JSON: {error}"
+            raise UnavailableError(0, "NoAnswer", text) from error

@@ -1,4 +1,4 @@
-"""Waiting longer after each failure, and never in step with others that failed at the same moment."""
+"""Exponential backoff with jitter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Backoff:
         """Count a failure; the seconds to wait now.
 
         Args:
-            at_least: seconds that the other side asks for; heeded up to the cap.
+            at_least: seconds that the other side requests; limited by the cap.
         """
         delay = min(self._cap, self._first * 2.0 ** min(self.failures, 30))
         self.failures += 1

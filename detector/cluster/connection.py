@@ -1,4 +1,4 @@
-"""Finding the API server and who we are in its cluster: a kubeconfig, or the pod's own account."""
+"""Finds the API server and the own account: a kubeconfig, or the account of the pod."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _IN_CLUSTER = "KUBERNETES_SERVICE_HOST"
 _CONNECTIONS = 32
 
 _BROKEN = (ConfigException, OSError, YAMLError, ValueError, TypeError, KeyError, AttributeError)
-"""What the loader stumbles over in files that are missing, no YAML or of another shape: it checks little itself."""
+"""What the loader raises for files that are missing, not YAML or of another shape: it checks little itself."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Cluster:
 async def connect(
     namespace: str | None = None, kubeconfig: Path | None = None, *, otherwise: str = ""
 ) -> AsyncIterator[Cluster]:
-    """Set up the one connection that all parts share. Nothing is sent yet: the server may be away.
+    """Set up the one connection that all parts share. Nothing is sent yet: the server may be unavailable.
 
     Args:
         namespace: where to work. Default: the kubeconfig context's, or the pod's own.

@@ -8,7 +8,7 @@ from wayside.inputerror import InputError
 
 
 class ApiError(Exception):
-    """A request to the API server failed. The text is what the server said, or why it said nothing."""
+    """A request to the API server failed. The message is that of the server, or the reason why there is none."""
 
     def __init__(self, code: int, reason: str, message: str) -> None:
         super().__init__(f"{code} {reason}: {message}" if code else f"{reason}: {message}")
@@ -20,16 +20,16 @@ class ApiError(Exception):
 
 
 class UnavailableError(ApiError):
-    """No answer, or one that says to come back later: the same request may succeed soon."""
+    """No answer, or one that requests a retry: the same request may succeed soon."""
 
     def __init__(self, code: int, reason: str, message: str, retry_after: float = 0.0) -> None:
         super().__init__(code, reason, message)
         self.retry_after = retry_after
-        """Seconds that the server asks to wait; 0 where it does not say."""
+        """Seconds to wait as the server requests; 0 if it gives none."""
 
 
 class RefusedError(ApiError):
-    """The server understood and refuses: the same request will fail again until somebody changes something."""
+    """The server understood and refuses: retrying the same request is useless."""
 
 
 class NotFoundError(RefusedError):
@@ -45,7 +45,7 @@ class ConflictError(RefusedError):
 
 
 class GoneError(RefusedError):
-    """The server no longer has the history from which to continue a watch: list again."""
+    """The resource version is too old to continue a watch: list again."""
 
 
 _UNAVAILABLE_CODES = frozenset({401, 408, 429})
@@ -76,4 +76,4 @@ def error_of(code: int, body: bytes, retry_after: str | None = None) -> ApiError
 
 
 class NoClusterError(InputError):
-    """There is no way to an API server; the text says what to give."""
+    """There is no access to an API server; the message gives the remedy."""

@@ -2,7 +2,7 @@
 
 A watch may lose its connection, or the server the history that it needs (410); and no watch proves that nothing was
 missed. So each watch lasts one resync period only, and whatever ends it, a fresh list follows. What the world looked
-like meanwhile does not matter: the list says what is.
+like in the meantime does not matter: the list is the current state.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PAUSE = 0.1
 
 @dataclass(frozen=True)
 class Listed:
-    """All objects there are; what was known before and is not among them is gone."""
+    """All existing objects; any other object known before is deleted."""
 
     objects: list[JsonObject]
     version: int
@@ -86,7 +86,7 @@ class Reflector:
         """How often the server stopped answering or refused."""
 
     async def follow(self) -> AsyncGenerator[Change, None]:
-        """What is, and then what changes. Never ends and raises nothing; errors are logged, counted and retried."""
+        """The list, then its changes. Never ends and raises nothing; errors are logged, counted and retried."""
         while True:
             try:
                 listed = await self._api.list(self._resource, self._namespace, self._selectors)
@@ -95,7 +95,7 @@ class Reflector:
                 async with aclosing(self._watch(listed["metadata"]["resourceVersion"])) as changes:
                     async for change in changes:
                         yield change
-                await asyncio.sleep(_PAUSE)  # a server that ends each watch at once is not to be flooded with lists
+                await asyncio.sleep(_PAUSE)  # do not flood a server that ends each watch at once with lists
             except GoneError:
                 await asyncio.sleep(_PAUSE)  # its history is gone, but the server is there
             except ApiError as error:

@@ -1,4 +1,6 @@
-"""Binds the models of a compiled rule to their files, and says what does not fit: file, inputs, shapes, outputs."""
+"""Binds the models of a compiled rule to their files, and reports what does not match: file, inputs, shapes,
+outputs.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,7 @@ class Runner:
         names = [self._output] if self._output is not None else list(outputs)
         columns = {name: outputs[name].astype(np.float64) for name in names}
         if any(len(column) != len(rows) for column in columns.values()):
-            raise ModelError(f"the model gave no output of {len(rows)} rows for as many clients")
+            raise ModelError(f"the model did not return {len(rows)} rows for {len(rows)} clients")
         if len(names) == 1:
             return [_plain(columns[names[0]][row]) for row in range(len(rows))]
         return [{name: _plain(columns[name][row]) for name in names} for row in range(len(rows))]
@@ -87,25 +89,28 @@ class Runner:
 def _problems(model: CompiledModel, file: ModelFile) -> Iterator[tuple[FieldPath, str]]:
     source = model.source
     if source.sha256 is not None and source.sha256 != file.sha256:
-        yield ("sha256",), f"the file's is {file.sha256}: give that, or the right file"
+        yield ("sha256",), f"the sha256 of the file is {file.sha256}: give that value, or the right file"
     declared = {each.name: each for each in file.inputs}
     for index, given in enumerate(source.inputs):
         if given.name not in declared:
-            yield ("inputs", index, "name"), f"the model has no input {given.name}; it has {_listed(file.inputs)}"
+            yield (
+                ("inputs", index, "name"),
+                f"the model has no input {given.name}; its inputs are {_listed(file.inputs)}",
+            )
             continue
         if text := _misfit(given, declared[given.name]):
             yield ("inputs", index), text
     missing = sorted(declared.keys() - {given.name for given in source.inputs})
     if missing:
-        yield ("inputs",), f"the model needs {', '.join(missing)} as well"
+        yield ("inputs",), f"the model also needs the inputs {', '.join(missing)}"
     outputs = {each.name: each for each in file.outputs}
     if source.output is not None and source.output not in outputs:
-        yield ("output",), f"the model has no output {source.output}; it has {_listed(file.outputs)}"
+        yield ("output",), f"the model has no output {source.output}; its outputs are {_listed(file.outputs)}"
         return
     wanted = [outputs[source.output]] if source.output is not None else list(file.outputs)
     for tensor in wanted:
         if tensor.dtype is None:
-            yield ("output",), f"output {tensor.name} is {tensor.kind}, no tensor of numbers: name another as output"
+            yield ("output",), f"output {tensor.name} is {tensor.kind}, not a tensor of numbers: name another output"
             return
     fitting = [each for each in source.inputs if each.name in declared and not _misfit(each, declared[each.name])]
     if len(fitting) == len(source.inputs) and not missing:
@@ -119,35 +124,35 @@ def _trial(inputs: Sequence[ModelInput], file: ModelFile, wanted: Sequence[Tenso
     try:
         outputs = file.run_rows([row, row])
     except ModelError as error:
-        yield ("inputs",), f"{error} (tried with zeros for two clients)"
+        yield ("inputs",), f"{error} (in a trial with zeros for two clients)"
         return
     for tensor in wanted:
         shape = outputs[tensor.name].shape
         if not shape or shape[0] != 2:
-            text = f"output {tensor.name} has shape {list(shape)} for two clients: its first axis must be theirs"
+            text = f"output {tensor.name} has shape {list(shape)} for two clients: its first axis must be the clients"
             yield ("output",), text
         elif (size := int(np.prod(shape[1:]))) > MAXIMUM_OUTPUT:
-            yield ("output",), f"output {tensor.name} has {size} numbers a client, more than {MAXIMUM_OUTPUT}"
+            yield ("output",), f"output {tensor.name} has {size} numbers per client; the maximum is {MAXIMUM_OUTPUT}"
 
 
 def _misfit(given: ModelInput, declared: Tensor) -> str:
     """Why what is given does not fit the model's input; empty where it does."""
     if declared.dtype is None:
-        return f"input {declared.name} is {declared.kind}: only tensors of numbers can be given"
+        return f"input {declared.name} is {declared.kind}: only tensors of numbers are supported"
     if len(declared.shape) < 2:
-        return f"input {declared.name} has shape {_shape(declared.shape)}: its first axis must be the clients'"
+        return f"input {declared.name} has shape {_shape(declared.shape)}: its first axis must be the clients"
     first, rest = declared.shape[0], declared.shape[1:]
     if first not in (None, 1):
         return (
-            f"input {declared.name} has shape {_shape(declared.shape)}, for exactly {first} clients: export the model "
-            "with a first axis of any length"
+            f"input {declared.name} has shape {_shape(declared.shape)}, for exactly {first} clients: export "
+            "the model with a first axis of variable length"
         )
     fits = len(rest) == len(given.shape) and all(
         want in (None, have) for want, have in zip(rest, given.shape, strict=False)
     )
     if fits:
         return ""
-    return f"a client's input has shape {_shape(given.shape)}, but {declared.name} takes {_shape(rest)}"
+    return f"the input of a client has shape {_shape(given.shape)}, but {declared.name} requires {_shape(rest)}"
 
 
 def _image(wanted: ModelImage, payload: bytes) -> NDArray[np.float32]:
@@ -178,7 +183,7 @@ def _points(wanted: ModelPoints, payload: bytes) -> NDArray[np.float64]:
 
 
 def _known(wanted: ModelPoints | None) -> ModelPoints:
-    assert wanted is not None  # noqa: S101  the engine asks only for images and points
+    assert wanted is not None  # noqa: S101  the engine requests only images and points
     return wanted
 
 

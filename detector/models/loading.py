@@ -32,7 +32,7 @@ _MAXIMUM_BYTES = 2**31
 
 
 class ModelError(ValueError):
-    """A model file that cannot be used; the text says why."""
+    """A model file that cannot be used; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class ModelFile:
         try:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors have no base of their own
-            raise ModelError(f"is no ONNX model that can be run: {_line(error)}") from error
+            raise ModelError(f"is not a valid ONNX model: {_line(error)}") from error
         self.sha256 = sha256
         self.inputs = tuple(map(_tensor, self._session.get_inputs()))
         self.outputs = tuple(map(_tensor, self._session.get_outputs()))
@@ -104,10 +104,10 @@ def load_model(path: str) -> ModelFile:
     try:
         size = Path(path).stat().st_size
         if size > _MAXIMUM_BYTES:
-            raise ModelError(f"{path} has {size} bytes: an ONNX model has at most {_MAXIMUM_BYTES}")
+            raise ModelError(f"{path} has {size} bytes; an ONNX model may have at most {_MAXIMUM_BYTES}")
         content = Path(path).read_bytes()
     except OSError as error:
-        raise ModelError(f"{path} cannot be read: {error.strerror}: is the volume mounted?") from error
+        raise ModelError(f"cannot read {path}: {error.strerror}: is the volume mounted?") from error
     sha256 = hashlib.sha256(content).hexdigest()
     model = _loaded.get(sha256)
     if model is None:

@@ -25,7 +25,7 @@ def _known_stream(name: str, info: ValidationInfo) -> str:
     if streams is None or name in streams:
         return name
     close = difflib.get_close_matches(name, streams, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(streams)}"
+    hint = f"did you mean {close[0]}?" if close else f"its streams are {', '.join(streams)}"
     raise ValueError(f"the Detector has no stream {name}; {hint}")
 
 
@@ -62,7 +62,7 @@ class Plugin(ABC, Generic[P]):
 
     @classmethod
     def warm_up(cls) -> None:
-        """Called once where the plugin runs, before it is asked for anything: what takes long to load belongs here.
+        """Called once where the plugin runs, before any other call: slow loading belongs here.
 
         A value must be there within half a second, and that includes what is imported for it.
         """

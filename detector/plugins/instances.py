@@ -8,7 +8,7 @@ from typing import Any
 from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.base import Plugin, Subject
-from detector.plugins.registry import prepare
+from detector.plugins.registry import prepare_plugin
 from detector.plugins.values import plain
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledPlugin, CompiledRule
@@ -19,7 +19,7 @@ class Instances:
 
     def __init__(self, plugin: str, parameters: Mapping[str, Any]) -> None:
         """Raises PluginError, and whatever the plugin's `warm_up` raises."""
-        self._plugin, self._parameters = prepare(plugin, parameters)
+        self._plugin, self._parameters = prepare_plugin(plugin, parameters)
         self._plugin.warm_up()
         self._objects: dict[str, Plugin[Any]] = {}
 

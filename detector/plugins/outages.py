@@ -1,4 +1,4 @@
-"""Which calls of plugins found none running: told live, recorded with the intake, and given again by its replay.
+"""Which calls of plugins found none running: noted live, recorded with the intake, and replayed from it.
 
 Calls of a signal are counted from the engine's start; that count is the same live and in a replay, whatever the clock.
 """
@@ -15,7 +15,7 @@ KIND = "plugin"
 
 
 class Outages:
-    """Notes when a plugin goes and comes back; in a replay, knows it beforehand."""
+    """Notes when a plugin stops and runs again; in a replay, reads it from the recording."""
 
     def __init__(self, recorded: Callable[[], Iterable[Mapping[str, Any]]] | None = None) -> None:
         """`recorded` gives the controls of an intake file; it is called when the first plugin is."""
@@ -23,10 +23,10 @@ class Outages:
         self._expected: dict[tuple[str, str], list[tuple[int, bool]]] | None = None
         self._calls: dict[tuple[str, str], int] = {}
         self._away: set[tuple[str, str]] = set()
-        self._news: list[dict[str, Any]] = []
+        self._changes: list[dict[str, Any]] = []
 
     def expects(self, call: PluginCall) -> bool:
-        """Whether the plugin ran at this call, as far as a recording says; to be asked once for each call."""
+        """Whether the plugin ran at this call, as far as a recording shows; call it once for each call."""
         place = call.rule, call.signal
         number = self._calls[place] = self._calls.get(place, 0) + 1
         if self._expected is None:
@@ -42,7 +42,7 @@ class Outages:
         place = call.rule, call.signal
         if running is (place in self._away):
             (self._away.discard if running else self._away.add)(place)
-            self._news.append(
+            self._changes.append(
                 {
                     "kind": KIND,
                     "rule": call.rule,
@@ -52,7 +52,7 @@ class Outages:
                 }
             )
 
-    def news(self) -> list[dict[str, Any]]:
+    def take_changes(self) -> list[dict[str, Any]]:
         """What changed since the last call, as controls for the intake file."""
-        news, self._news = self._news, []
-        return news
+        taken, self._changes = self._changes, []
+        return taken

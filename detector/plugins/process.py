@@ -1,7 +1,7 @@
-"""The process of one plugin signal, as the detector sees it: started, asked, stopped, and started again.
+"""The process of one plugin signal, as the detector sees it: started, called, stopped, and restarted.
 
 One that does not give its value within the patience is killed, and its state with it; it is started again after growing
-pauses, three times, and then stays stopped until its rule changes.
+pauses, three times, and then stays stopped until the rule changes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from wayside.rules import CompiledPlugin
 _log = logging.getLogger(__name__)
 
 PATIENCE = 0.5
-"""Seconds in which a live plugin must give its value: less than the stall from which on ticks are not made up for."""
+"""Seconds in which a live plugin must give its value: less than the stall after which ticks are skipped."""
 
 START_PATIENCE = 60.0
 """Seconds in which a plugin must have started, where one waits for it."""
@@ -38,7 +38,7 @@ _QUERIES = frozenset({"clients", "streams", "newest", "last", "between", "neares
 
 
 class StoppedError(Exception):
-    """The process was stopped, or ended by itself; the text says why."""
+    """The process was stopped, or exited; the message gives the reason."""
 
 
 class SignalProcess:
@@ -77,7 +77,7 @@ class SignalProcess:
         self._wire.send("start", self._plugin.plugin, self._plugin.parameters)
 
     def is_ready(self, within: float, *, again: bool) -> bool:
-        """Whether it can be asked, after waiting so many seconds for its start; `again`: a stopped one may start."""
+        """Whether it is ready, after waiting `within` seconds for its start; `again`: a stopped one may start."""
         if self._process is None and again and self._starts <= len(_PAUSES) and self._monotonic() >= self._again_at:
             self._launch()
         if self._ready or self._wire is None:
@@ -89,24 +89,26 @@ class SignalProcess:
                 self._end(f"did not start within {within:g} s")
             return False
         except ClosedError:
-            self._end("ended while it was starting")
+            self._end("exited while it was starting")
             return False
         if answer == "refused":
             self._end(f"cannot run: {content[0]}")
         self._ready = answer == "ready"
         return self._ready
 
-    def ask(self, call: PluginCall, queries: Queries, patience: float) -> Value:
-        """The signal's value. Raises PluginFailedError where the plugin failed, StoppedError where it is no more."""
+    def request_value(self, call: PluginCall, queries: Queries, patience: float) -> Value:
+        """The signal's value. Raises PluginFailedError where the plugin failed, StoppedError if its process has
+        stopped.
+        """
         wire = self._wire
         assert wire is not None  # noqa: S101  it is ready
         self._subjects.add(call.subject)
         try:
             wire.send("value", call.subject, call.element, call.clients, queries.now, within=patience)
             while True:
-                asked = self._monotonic()
+                requested = self._monotonic()
                 answer, *content = wire.receive(max(patience, 0.0))
-                patience -= self._monotonic() - asked  # the time that we take for the queries is not the plugin's
+                patience -= self._monotonic() - requested  # the time that we take for the queries is not the plugin's
                 match answer:
                     case "query":
                         _reply(wire, queries, *content)
@@ -116,21 +118,21 @@ class SignalProcess:
                         value: Value = content[0]
                         return value
         except TimeoutError:
-            raise StoppedError(self._end("gave no value in time")) from None
+            raise StoppedError(self._end("did not return a value in time")) from None
         except ClosedError:
-            raise StoppedError(self._end("ended by itself")) from None
+            raise StoppedError(self._end("exited")) from None
 
     def keep(self, subjects: Collection[str]) -> None:
         """Drop the state of all other subjects."""
         if not self._subjects <= set(subjects):
             self._subjects &= set(subjects)
-            self._tell("keep", sorted(self._subjects))
+            self._send("keep", sorted(self._subjects))
 
     def reset(self) -> None:
         """Drop all state."""
         if self._subjects:
             self._subjects.clear()
-            self._tell("reset")
+            self._send("reset")
 
     def stop(self) -> None:
         """End the process."""
@@ -142,12 +144,12 @@ class SignalProcess:
         self._process = self._wire = None
         self._ready = False
 
-    def _tell(self, *message: Any) -> None:
+    def _send(self, *message: Any) -> None:
         if self._ready and self._wire is not None:
             try:
                 self._wire.send(*message, within=PATIENCE)
             except (TimeoutError, ClosedError):
-                self._end("ended by itself, or does not read what it is told")
+                self._end("exited, or does not read its input")
 
     def _end(self, why: str) -> str:
         self.stop()
@@ -155,9 +157,9 @@ class SignalProcess:
         if self._starts <= len(_PAUSES):
             pause = _PAUSES[self._starts - 1]
             self._again_at = self._monotonic() + pause
-            then = f"it is stopped, and started again after {pause:g} s"
+            then = f"stopped, restarting in {pause:g} s"
         else:
-            then = "it stays stopped until its rule changes"
+            then = "stopped until the rule changes"
         self.why = f"its process {why}; {then}"
         _log.error(
             "EventRule %s, signal %s, plugin %s: %s", self._rule, self._plugin.name, self._plugin.plugin, self.why
@@ -173,5 +175,5 @@ def _reply(wire: Wire, queries: Queries, method: str, arguments: list[Any], opti
         wire.send(*answer, within=PATIENCE)
     except (ClosedError, TimeoutError):
         raise
-    except Exception as error:  # noqa: BLE001  what a plugin asks for must not stop the engine
+    except Exception as error:  # noqa: BLE001  the queries of a plugin must not stop the engine
         wire.send("raised", type(error).__name__, str(error))

@@ -1,7 +1,7 @@
 """Runs each plugin signal in a process of its own, so that one that hangs or crashes is stopped while the rules go on.
 
 The value is computed at the tick: the engine's thread waits for it, and answers the plugin's queries meanwhile. Which
-calls found no running plugin is the only thing here that depends on how fast the machine is; `outages` tells it and
+calls found no running plugin is the only thing here that depends on how fast the machine is; `outages` notes it and
 takes it, so that the replay of an intake file gives the same events.
 """
 
@@ -18,7 +18,7 @@ from wayside.expressions import Reason, Value
 from wayside.rules import CompiledRule
 
 REPLAY_PATIENCE = 10.0
-"""Seconds in a replay, where nobody waits."""
+"""Seconds in a replay, where nothing waits."""
 
 
 class ProcessHost:
@@ -62,12 +62,12 @@ class ProcessHost:
         signal = self._signals[call.rule, call.signal]
         if not self.outages.expects(call):
             signal.reset()
-            raise PluginFailedError(Reason.ABSENT, "it did not run when this was recorded")
+            raise PluginFailedError(Reason.ABSENT, "the plugin was not running when this was recorded")
         if not signal.is_ready(START_PATIENCE if self._wait else 0.0, again=not self._wait):
             self.outages.note(call, running=False)
             raise PluginFailedError(Reason.ABSENT, signal.why)
         try:
-            value = signal.ask(call, queries, self._patience)
+            value = signal.request_value(call, queries, self._patience)
         except StoppedError as error:
             self.outages.note(call, running=False)
             raise PluginFailedError(Reason.ERROR, str(error)) from None

@@ -1,4 +1,4 @@
-"""Which plugins there are, and whether a rule gives them what they ask for."""
+"""Which plugins there are, and whether a rule gives them the parameters that they require."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OFFERS = Offers[Plugin[Any]](
 )
 
 
-def prepare(
+def prepare_plugin(
     name: str, parameters: Mapping[str, Any], streams: list[str] | None = None
 ) -> tuple[type[Plugin[Any]], PluginParameters]:
     """The plugin and its parameters; `streams` are those that parameters may name.
@@ -40,7 +40,7 @@ def plugin_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem
     for index, signal in enumerate(rule.spec.signals):
         if signal.plugin is not None:
             try:
-                prepare(signal.plugin.name, signal.plugin.parameters, streams)
+                prepare_plugin(signal.plugin.name, signal.plugin.parameters, streams)
             except PluginError as error:
                 for path, text in error.problems:
                     yield RuleProblem(("spec", "signals", index, "plugin", *path), text)

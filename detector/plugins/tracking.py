@@ -1,4 +1,4 @@
-"""Follows points from one moment to the next, to tell how long each has been there."""
+"""Follows points from one moment to the next, to measure how long each has been there."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Tracks:
     def __init__(self, within: float, speed: float, gap: int) -> None:
         """A point is the same as one before at most `within` metres, and `speed` m/s times the time between, away.
 
-        One that is missing for `gap` nanoseconds begins anew; with 0, one that is missing once.
+        One that is missing for `gap` nanoseconds starts over; with 0, one that is missing once.
         """
         self._within = within
         self._speed = speed
@@ -42,7 +42,7 @@ class Tracks:
         self._tracks += [Track(points[index], time, time) for index in sorted(new)]
 
     def lasting(self, time: int, least: int) -> list[Track]:
-        """Those that are there at that time and have been for at least so many nanoseconds, oldest first."""
+        """Those that are there at that time and have been for at least this many nanoseconds, oldest first."""
         return sorted(
             (track for track in self._tracks if track.last == time and time - track.since >= least),
             key=lambda track: (track.since, track.place),

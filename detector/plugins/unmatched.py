@@ -3,7 +3,7 @@
 The two lists are those of one client, or one of each client of a pair. Samples of about the same stamp are compared:
 the objects are brought into one frame, matched by position (as many pairs within the gate as there can be, and of these
 the nearest), and what is left over is followed over time. The signal is the list of those that have been left over for
-long enough; a rule says e.g. `when: size(unmatched) > 0`.
+long enough; a rule uses e.g. `when: size(unmatched) > 0`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class ObjectList(PluginParameters):
     @model_validator(mode="after")
     def _one_way(self) -> ObjectList:
         if self.frame is not None and self.pose is not None:
-            raise ValueError("give frame (by tf) or pose (by a stream), not both; neither: the frame is common already")
+            raise ValueError(
+                "give either frame (by tf) or pose (by a stream), not both; give neither if the frame is already common"
+            )
         return self
 
 
@@ -103,7 +105,7 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
     def value(self, queries: Queries, clients: tuple[str, ...]) -> Value:
         """None until two samples could be compared, and where one of the streams is stale."""
         if len(clients) > 2:
-            raise ValueError(f"it compares one client or two, not {len(clients)}: use it in a client or pairs scope")
+            raise ValueError(f"it compares one or two clients, not {len(clients)}: use it in a client or pairs scope")
         parameters = self.parameters
         seer, other = (clients[0], clients[-1]) if parameters.of == "a" else (clients[-1], clients[0])
         theirs = parameters.counterparts or parameters.objects
@@ -161,12 +163,12 @@ def _frame(queries: Queries, of: ObjectList, sample: DecodedSample) -> Pose:
 
 
 def _points(of: ObjectList, sample: DecodedSample, frame: Pose) -> list[Point]:
-    """Where the objects are in the common frame; those that say no place are left out."""
+    """Where the objects are in the common frame; those without a position are left out."""
     objects = _at(sample.message, of.list)
     if not isinstance(objects, list):
         raise ValueError(f"a message of stream {of.stream} has no list at {of.list!r}")
     if len(objects) > _OBJECTS:
-        raise ValueError(f"a message of stream {of.stream} has {len(objects)} objects: at most {_OBJECTS} are compared")
+        raise ValueError(f"a message of stream {of.stream} has {len(objects)} objects; at most {_OBJECTS} are compared")
     places = ((_at(each, of.x), _at(each, of.y)) for each in objects)
     return [frame.apply((x, y, 0.0))[:2] for x, y in places if _is_place(x) and _is_place(y)]
 

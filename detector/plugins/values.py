@@ -28,11 +28,11 @@ def plain(value: Any, depth: int = _DEEPEST) -> Value:
         case dict() if depth and all(isinstance(key, str) for key in value):
             return {key: plain(item, depth - 1) for key, item in value.items()}
     if not depth:
-        raise TypeError(f"the value is nested more than {_DEEPEST} deep")
+        raise TypeError(f"the value is nested more than {_DEEPEST} levels deep")
     scalar = getattr(value, "item", None)  # numpy's numbers
     if scalar is not None and getattr(value, "shape", None) == ():
         return plain(scalar(), depth - 1)
     raise TypeError(
-        f"the value is a {type(value).__name__}: give None, a boolean, a number, a text, or lists and maps (with texts "
-        "as keys) of these"
+        f"the value is a {type(value).__name__}: return None, a boolean, a number, a text, or lists and "
+        "maps (with text keys) of these"
     )

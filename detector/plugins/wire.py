@@ -5,7 +5,7 @@
                         keep(subjects), reset()                         (no answer)
     plugin → detector   query(method, arguments, options)               → answer(result) | raised(kind, text)
 
-Queries are asked only while a value is computed, one at a time.
+Queries are sent only while a value is computed, one at a time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ class Wire:
         self._size: int | None = None
 
     def send(self, *message: Any, within: float | None = None) -> None:
-        """Raises ClosedError, TimeoutError (after so many seconds), and TypeError or OverflowError for strange data."""
+        """Raises ClosedError, TimeoutError (after `within` seconds), and TypeError or OverflowError for strange
+        data.
+        """
         data = _encode(message)
         self._socket.settimeout(within)
         try:
@@ -49,7 +51,7 @@ class Wire:
             raise ClosedError from error
 
     def receive(self, within: float | None = None) -> list[Any]:
-        """The next message. Raises ClosedError, TimeoutError (after so many seconds)."""
+        """The next message. Raises ClosedError, TimeoutError (after `within` seconds)."""
         until = None if within is None else time.monotonic() + within
         if self._size is None:
             (self._size,) = _LENGTH.unpack(self._exactly(_LENGTH.size, until))

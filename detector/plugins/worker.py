@@ -32,7 +32,7 @@ _Samples = list[DecodedSample]
 
 
 class RemoteQueries:
-    """The queries of Queries, asked of the detector."""
+    """The queries of Queries, sent to the detector."""
 
     def __init__(self, wire: Wire, now: int) -> None:
         self._wire = wire
@@ -45,54 +45,54 @@ class RemoteQueries:
 
     def clients(self) -> list[str]:
         """See Queries."""
-        found: list[str] = self._ask(list[str], "clients")
+        found: list[str] = self._query(list[str], "clients")
         return found
 
     def streams(self, client: str) -> list[str]:
         """See Queries."""
-        found: list[str] = self._ask(list[str], "streams", client)
+        found: list[str] = self._query(list[str], "streams", client)
         return found
 
     def newest(self, client: str | None, stream: str, *, frame: str | None = None) -> DecodedSample | None:
         """See Queries."""
-        found: DecodedSample | None = self._ask(DecodedSample | None, "newest", client, stream, frame=frame)
+        found: DecodedSample | None = self._query(DecodedSample | None, "newest", client, stream, frame=frame)
         return found
 
     def last(self, client: str | None, stream: str, count: int, *, frame: str | None = None) -> list[DecodedSample]:
         """See Queries."""
-        found: _Samples = self._ask(_Samples, "last", client, stream, count, frame=frame)
+        found: _Samples = self._query(_Samples, "last", client, stream, count, frame=frame)
         return found
 
     def between(
         self, client: str | None, stream: str, after: int, until: int, *, frame: str | None = None
     ) -> list[DecodedSample]:
         """See Queries."""
-        found: _Samples = self._ask(_Samples, "between", client, stream, after, until, frame=frame)
+        found: _Samples = self._query(_Samples, "between", client, stream, after, until, frame=frame)
         return found
 
     def nearest(self, client: str | None, stream: str, stamp: int, *, frame: str | None = None) -> DecodedSample | None:
         """See Queries."""
-        found: DecodedSample | None = self._ask(DecodedSample | None, "nearest", client, stream, stamp, frame=frame)
+        found: DecodedSample | None = self._query(DecodedSample | None, "nearest", client, stream, stamp, frame=frame)
         return found
 
     def pose(self, client: str, stream: str, stamp: int, *, at: str = "") -> Pose | None:
         """See Queries."""
-        found: Pose | None = self._ask(Pose | None, "pose", client, stream, stamp, at=at)
+        found: Pose | None = self._query(Pose | None, "pose", client, stream, stamp, at=at)
         return found
 
     def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
         """See Queries."""
-        found: list[tuple[DecodedSample, ...]] = self._ask(
+        found: list[tuple[DecodedSample, ...]] = self._query(
             list[tuple[DecodedSample, ...]], "tuples", client, list(streams), slop
         )
         return found
 
     def transform(self, client: str, target: str, source: str, stamp: int | None = None) -> Pose:
         """See Queries."""
-        found: Pose = self._ask(Pose, "transform", client, target, source, stamp)
+        found: Pose = self._query(Pose, "transform", client, target, source, stamp)
         return found
 
-    def _ask(self, kind: Any, method: str, *arguments: Any, **options: Any) -> Any:
+    def _query(self, kind: Any, method: str, *arguments: Any, **options: Any) -> Any:
         self._wire.send("query", method, arguments, options)
         answer, *content = self._wire.receive()
         if answer == "raised":
@@ -136,7 +136,7 @@ def _value(
 
 
 def _leave_with_the_detector() -> None:
-    """However the detector ended, and whatever the plugin is doing: nobody is left behind."""
+    """However the detector ended, and whatever the plugin is doing: no process is left behind."""
     parent = os.getppid()
     while os.getppid() == parent:
         time.sleep(1)

@@ -59,7 +59,7 @@ class Recorders:
 
     def tell(self, consequences: Sequence[Consequence]) -> None:
         """Pass on what happened, in order."""
-        self._host.tell(consequences)
+        self._host.dispatch(consequences)
 
     def close(self) -> Iterator[str]:
         """Complete all clips. Gives a line for each action that failed or lost something."""
@@ -79,7 +79,9 @@ class _Nobody:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """See `Messenger`."""
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
         """See `Messenger`."""
         raise ActionError("a replay has no Zenoh session")
 

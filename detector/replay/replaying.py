@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from detector.actions.base import Surroundings
-from detector.assembly import Inlets, Refusal, RuleBook, inlets, make_engine
+from detector.assembly import Inlets, Refusal, RuleIndex, inlets, make_engine
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, from_task, to_task
 from detector.engine.episodes.events import Event
@@ -98,7 +98,7 @@ class Replay:
         self._recorders: Recorders | None = None if clips is None else clips.recorders(holder)
         self._detector = detector = detector if clips is None else clips.placed(detector)
         self._entries: Inlets = inlets(detector)
-        self._rule_book = RuleBook()
+        self._rule_index = RuleIndex()
         self._engine: Engine = make_engine(
             detector, self._entries, holder=holder, start=start, plugins=plugins, order=order
         )
@@ -153,12 +153,12 @@ class Replay:
 
     def set_rules(self, rules: Sequence[EventRule]) -> None:
         """Go on with these rules."""
-        compiled, refused = self._rule_book.compile(rules, self._detector, self._entries.fields)
+        compiled, refused = self._rule_index.compile(rules, self._detector, self._entries.fields)
         self.outcome.refusals += refused
         self.outcome.rules |= {rule.name: rule for rule in rules}
         if self._recorders is not None:
             surroundings = Surroundings(self._detector, self._entries.decoders, self._entries.types)
-            self._recorders.follow(self._rule_book.good, surroundings)
+            self._recorders.follow(self._rule_index.good, surroundings)
         self._note(self._engine.set_rules([rule_as_of(rule, self._version) for rule in compiled]))
         if self._onlooker is not None:
             self._onlooker.attend(self._engine)

@@ -1,6 +1,6 @@
-"""Recordings that others ask for over Zenoh."""
+"""Recordings requested over Zenoh."""
 
-from detector.requested.asking import Requested
 from detector.requested.running import with_requested
+from detector.requested.serving import Requested
 
 __all__ = ["Requested", "with_requested"]

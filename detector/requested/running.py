@@ -1,4 +1,4 @@
-"""How a recording on request runs: by the record action of a rule that nobody wrote, with an episode of its own."""
+"""How a recording on request runs: by the record action of a generated rule, with an episode of its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from detector.actions.outcomes import Which
 from detector.engine.consequences.consequences import Consequences, Run
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import identifier
-from detector.requested.book import Entry
+from detector.requested.index import RequestedRecording
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.names import FLEET, parse_subject
 from wayside.rules.actions import window_of
@@ -29,7 +29,7 @@ def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[Event
             "kind": "EventRule",
             "metadata": {"name": REQUESTED.rule, "namespace": detector.namespace},
             "spec": {
-                "description": "Recordings that others asked for.",
+                "description": "Recordings requested by others.",
                 "when": "false",
                 "actions": [{"name": REQUESTED.action, "record": {}}],
             },
@@ -45,14 +45,16 @@ def run_of(identity: str) -> Run:
 
 def begin(
     consequences: Consequences,
-    entry: Entry,
+    entry: RequestedRecording,
     detector: Detector,
     holder: str,
     clients: Sequence[str] | None,
     cause: dict[str, Any],
     now: int,
 ) -> None:
-    """Have the recording's samples told from now on. `cause` is the requester's event; nothing in it is believed."""
+    """Pass the samples of the recording on from now on. `cause` is the event of the requester; nothing in it is
+    trusted.
+    """
     subject, subjects = _about(cause)
     data = cause.get("data")
     classification = data.get("classification") if isinstance(data, dict) else None
@@ -77,7 +79,7 @@ def begin(
 
 
 def _about(cause: dict[str, Any]) -> tuple[str, tuple[str, ...]]:
-    """Whom the requester's event is about; the subject stands in names of files."""
+    """The subject of the requester's event; it is part of file names."""
     subject = cause.get("subject")
     if isinstance(subject, str) and len(subject) <= 256:
         try:

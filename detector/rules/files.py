@@ -14,12 +14,12 @@ from wayside.rules import RuleProblem
 
 @dataclass(frozen=True)
 class FileRules:
-    """What the files say."""
+    """The content of the files."""
 
     rule_set: RuleSet
     detector: Document
     rules: dict[str, Document]
-    """The selected rules by name, for errors to tell where."""
+    """The selected rules by name, for the places of errors."""
     warnings: tuple[str, ...]
     """Rules that are given but not evaluated, and why."""
 
@@ -31,7 +31,7 @@ def load_rules(detector: str | Path, rules: Iterable[str | Path], check: Check =
     """Read exactly one Detector, and the rules that it selects.
 
     Args:
-        detector: a file or folder. It may hold other kinds too; they are not looked at.
+        detector: a file or folder. It may hold other kinds too; they are ignored.
         rules: files or folders, likewise. EventRules beside the detector count only if they are given here.
         check: finds what keeps the Detector from running.
 
@@ -81,8 +81,8 @@ def _left_out(documents: dict[str, Document], chosen: dict[str, Document], detec
         rule = document.object
         if rule.namespace != detector.namespace:
             why = (
-                f"it is in namespace {rule.namespace!r}, the Detector {detector.name!r} in {detector.namespace!r}: "
-                "a detector evaluates rules of its own namespace only"
+                f"it is in namespace {rule.namespace!r}, the Detector {detector.name!r} in "
+                f"{detector.namespace!r}: a detector evaluates only rules of its own namespace"
             )
             yield str(document.problem(("metadata", "namespace"), f"the EventRule {name!r} is not evaluated: {why}"))
         else:
@@ -101,6 +101,6 @@ def _load(paths: Iterable[str | Path], problems: list[Problem]) -> list[Document
 
 def _not_one(given: str, detectors: list[Document]) -> Iterable[Problem]:
     if not detectors:
-        yield Problem(given, 0, 0, "", "holds no Detector: give one object of kind: Detector")
+        yield Problem(given, 0, 0, "", "contains no Detector: give one object of kind: Detector")
     for document in detectors[1:]:
-        yield document.problem(("metadata", "name"), "is a second Detector: give one, in a file of its own")
+        yield document.problem(("metadata", "name"), "is a second Detector: give only one")

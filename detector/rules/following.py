@@ -33,11 +33,11 @@ async def follow_files(
             try:
                 loaded = load_rules(detector, rules, check)
             except (DocumentError, OSError) as error:
-                _log.error("the files are not followed, what was good goes on: %s", error)
+                _log.error("cannot watch the files; keeping the last good version: %s", error)
                 continue
             for warning in loaded.warnings:
                 _log.warning("%s", warning)
-            _log.info("the files are read again: %d rules", len(loaded.rule_set.rules))
+            _log.info("reloaded the files: %d rules", len(loaded.rule_set.rules))
             yield loaded.rule_set
     finally:
         asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)

@@ -19,7 +19,7 @@ DETECTORS = Resource(API_VERSION, Detector.plural)
 EVENT_RULES = Resource(API_VERSION, EventRule.plural)
 
 _COALESCING = 0.05
-"""Seconds: what `kubectl apply` sends in one go is taken over in one go."""
+"""Seconds: changes of one `kubectl apply` take effect together."""
 
 Object = TypeVar("Object", bound=Kind)
 
@@ -132,11 +132,11 @@ class _Known(Generic[Object]):
             parsed = parse_object(shape | read)
         except ValueError as error:
             if self.unreadable.get(name) != str(error):
-                what = "goes on as it last was" if name in self.objects else "is left out"
-                _log.warning("the %s %s cannot be read and %s: %s", self._kind.__name__, name, what, error)
+                what = "keeping its last good version" if name in self.objects else "leaving it out"
+                _log.warning("cannot read the %s %s; %s: %s", self._kind.__name__, name, what, error)
             self.unreadable[name] = str(error)
             return
-        assert isinstance(parsed, self._kind)  # noqa: S101  the shape says so
+        assert isinstance(parsed, self._kind)  # noqa: S101  the shape guarantees it
         self.unreadable.pop(name, None)
         self.objects[name] = parsed
 

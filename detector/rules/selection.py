@@ -17,7 +17,7 @@ class RuleSet:
     """Those that the detector selects, by name."""
 
     def same_as(self, other: RuleSet | None) -> bool:
-        """Whether nothing differs that matters to the engine; status and the like do not."""
+        """Whether both are equal to the engine; status and similar fields do not count."""
         return other is not None and _essence(self) == _essence(other)
 
 

@@ -32,7 +32,7 @@ _MAXIMUM_KEYS = 100_000
 
 
 class SourceError(Exception):
-    """Raised by a source that cannot continue, with a text for people. The source starts again after a pause."""
+    """Raised by a source that cannot continue, with a message for people. The source starts again after a pause."""
 
 
 @dataclass(frozen=True, slots=True)

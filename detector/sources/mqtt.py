@@ -19,14 +19,14 @@ from detector.sources.base import Feed, Source, SourceError
 from wayside.api.access import Access
 
 _LOOK_EVERY = 0.2
-"""Seconds: how long a look for messages takes at most, and so how soon the source stops."""
+"""Maximum seconds of one wait for messages, and so of the stop of the source."""
 
 
 class MqttParameters(Access):
     """Which broker, and how to take messages from it."""
 
-    host: str = Field(min_length=1, max_length=255, description="The broker's name or address.")
-    port: int | None = Field(default=None, ge=1, le=65535, description="Default: 1883, with TLS 8883.")
+    host: str = Field(min_length=1, max_length=255, description="The name or address of the broker.")
+    port: int | None = Field(default=None, ge=1, le=65535, description="Default: 1883; with TLS 8883.")
     qos: Annotated[int, Field(ge=0, le=2)] = Field(
         default=0, description="0: at most once, 1: at least once, 2: exactly once."
     )
@@ -34,21 +34,26 @@ class MqttParameters(Access):
         default=None,
         min_length=1,
         max_length=255,
-        description="Who the detector is to the broker. With it the broker keeps messages of qos 1 and 2 while the "
-        "detector is away.",
+        description=(
+            "The client id at the broker. With it, the broker keeps messages of qos 1 and 2 while the detector "
+            "is disconnected."
+        ),
     )
-    prefix: str = Field(
-        default="", max_length=255, description="What stands before the key in topics, e.g. / or plant1/."
-    )
+    prefix: str = Field(default="", max_length=255, description="The prefix of the key in topics, e.g. / or plant1/.")
     keep_alive: int = Field(
-        default=15, ge=1, le=3600, description="Seconds after which a silent connection is tried, and given up."
+        default=15,
+        ge=1,
+        le=3600,
+        description=(
+            "Keep-alive in seconds: a silent connection is probed after this time, and closed if it stays silent."
+        ),
     )
 
     @field_validator("prefix")
     @classmethod
     def _plain(cls, prefix: str) -> str:
         if any(character in prefix for character in "+#"):
-            raise ValueError("is no filter: wildcards stand in the streams' keys")
+            raise ValueError("is not a filter: use wildcards in the keys of the streams")
         return prefix
 
 
@@ -66,14 +71,14 @@ class MqttSource(Source[MqttParameters]):
 
         def on_connect(client: Client, _: object, __: object, reason: ReasonCode, ___: object) -> None:
             if reason.is_failure:
-                refused.append(f"the broker refuses the connection: {reason}")
+                refused.append(f"the broker refused the connection: {reason}")
             else:
                 client.subscribe(filters)
 
         def on_subscribe(_: object, __: object, ___: object, reasons: list[ReasonCode], ____: object) -> None:
             for (topic, _qos), reason in zip(filters, reasons, strict=False):
                 if reason.is_failure:
-                    refused.append(f"the broker refuses the subscription to {topic}: {reason}")
+                    refused.append(f"the broker refused the subscription to {topic}: {reason}")
 
         def on_message(_: object, __: object, message: MQTTMessage) -> None:
             feed.put(message.topic.removeprefix(parameters.prefix), bytes(message.payload))
@@ -86,9 +91,9 @@ class MqttSource(Source[MqttParameters]):
                 if refused:
                     raise SourceError(refused[0])
                 if result != 0:
-                    raise SourceError(f"the connection to {parameters.host}:{self._port} is lost: {result.name}")
+                    raise SourceError(f"lost the connection to {parameters.host}:{self._port}: {result.name}")
         except OSError as error:
-            raise SourceError(f"no connection to {parameters.host}:{self._port}: {error}") from error
+            raise SourceError(f"cannot connect to {parameters.host}:{self._port}: {error}") from error
         finally:
             client.disconnect()
 
@@ -117,7 +122,7 @@ class MqttSource(Source[MqttParameters]):
                 if files.certificate is not None:
                     context.load_cert_chain(files.certificate, files.key)
             except (ssl.SSLError, OSError) as error:
-                raise SourceError(f"parameters.tls: a certificate or key cannot be used: {error}") from error
+                raise SourceError(f"parameters.tls: cannot use a certificate or key: {error}") from error
             client.tls_set_context(context)
         return client
 

@@ -1,4 +1,4 @@
-"""Which sources are installed, and whether a Detector gives them what they ask for."""
+"""Which sources are installed, and whether a Detector gives them the parameters that they require."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Make = Callable[[], Source[Any]]
 """Makes a source for one run."""
 
 
-def prepare(source: DataSource) -> Make:
+def prepare_source(source: DataSource) -> Make:
     """Loads the plugin and checks its parameters.
 
     Raises PluginError; the paths begin at the entry in `spec.sources`.
@@ -31,11 +31,11 @@ def prepare(source: DataSource) -> Make:
     return lambda: plugin(parameters)
 
 
-def plugin_problems(detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with the Detector's sources, as far as their plugins can tell here."""
+def source_problems(detector: Detector) -> Iterator[RuleProblem]:
+    """What is wrong with the Detector's sources, as far as their plugins can check here."""
     for index, source in enumerate(detector.spec.sources):
         try:
-            prepare(source)
+            prepare_source(source)
         except PluginError as error:
             for path, text in error.problems:
                 yield RuleProblem(("spec", "sources", index, *path), text)

@@ -1,4 +1,4 @@
-"""Runs sources: each on a thread of its own, started again when it fails, and left behind where it does not stop."""
+"""Runs sources: each on a thread of its own, restarted when it fails, and abandoned if it does not stop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Any
 
 from detector.sources.base import Feed, Putter
-from detector.sources.registry import Make, prepare
+from detector.sources.registry import Make, prepare_source
 from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
 from wayside.api.source import DataSource
@@ -23,7 +23,7 @@ _LONGEST_PAUSE = 30.0
 """Seconds before a source that failed is run again: doubling from the first to the longest."""
 
 _STEADY = 60.0
-"""Seconds: a run that lasted this long was a good one, and after it the pauses begin anew."""
+"""Seconds: a run that lasted this long was a good one, and resets the backoff."""
 
 
 class State(StrEnum):
@@ -55,7 +55,7 @@ class SourceThread:
         self.streams = streams
         self.state = State.RUNNING
         self.last_error = ""
-        self._make: Make = prepare(source)
+        self._make: Make = prepare_source(source)
         self._tally = tally
         self._first_pause, self._longest_pause = first_pause, longest_pause
         self._feed = Feed(streams, putter, lambda key: tally.add(Cause.UNROUTED, source.name, last=key))
@@ -70,17 +70,17 @@ class SourceThread:
         """Begin; returns at once."""
         self._thread.start()
 
-    def tell_to_stop(self) -> None:
-        """From now on nothing of it is taken; returns at once."""
+    def request_stop(self) -> None:
+        """Ignore its further messages; returns at once."""
         self._feed.stop()
 
     def join(self, timeout: float) -> None:
-        """Wait for its end, for at most `timeout` seconds; then it is left behind, which is said and counted."""
+        """Wait for its end, for at most `timeout` seconds; then it is abandoned, logged and counted."""
         self._thread.join(timeout)
         if self._thread.is_alive():
             self._tally.add(Cause.LEFT_BEHIND, self.source.name)
             log.error(
-                "source %s (%s) does not stop and is left behind: its run() must look at feed.stopping",
+                "source %s (%s) does not stop; abandoning its thread: its run() must check feed.stopping",
                 self.source.name,
                 self.source.plugin,
             )
@@ -92,7 +92,7 @@ class SourceThread:
             began = time.monotonic()
             try:
                 self._make().run(self._feed)
-            except BaseException as error:  # noqa: BLE001  somebody else's code, which must not end the detector
+            except BaseException as error:  # noqa: BLE001  third-party code, which must not end the detector
                 if self._feed.stopping:
                     break
                 if time.monotonic() - began >= _STEADY:
@@ -106,13 +106,13 @@ class SourceThread:
             self.state = State.STOPPED
         else:
             self.state = State.FINISHED
-            log.info("source %s has nothing more to deliver, after %d messages", self.source.name, self.messages)
+            log.info("source %s has ended after %d messages", self.source.name, self.messages)
 
     def _failed(self, error: BaseException, pause: float) -> None:
         self.state = State.PAUSING
         self.last_error = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         self._tally.add(Cause.FAILED, self.source.name, last=self.last_error)
-        log.warning("source %s failed, again in %g s: %s", self.source.name, pause, self.last_error)
+        log.warning("source %s failed; restarting it in %g s: %s", self.source.name, pause, self.last_error)
         log.debug("source %s", self.source.name, exc_info=error)
 
 
@@ -130,7 +130,7 @@ class Sources:
         """Run the Detector's sources; those that are the same, with the same streams, go on. May wait for ends.
 
         Raises:
-            PluginError: a source cannot be had; nothing has changed then.
+            PluginError: a source cannot be loaded; nothing has changed then.
         """
         wanted = {
             source.name: (source, tuple(stream for stream in detector.spec.streams if stream.source == source.name))
@@ -159,7 +159,7 @@ class Sources:
 
     def _stop(self, threads: Mapping[str, SourceThread]) -> None:
         for thread in threads.values():
-            thread.tell_to_stop()
+            thread.request_stop()
         deadline = time.monotonic() + self._timeout
         for name, thread in threads.items():
             thread.join(max(0.0, deadline - time.monotonic()))
@@ -167,5 +167,5 @@ class Sources:
 
 
 def _delivered(streams: Iterable[Stream]) -> list[dict[str, Any]]:
-    """What matters of streams to who delivers them; how long samples are kept or believed does not."""
+    """The settings of streams that matter to a source; those of buffering do not."""
     return [stream.model_dump(exclude={"buffer", "stale_after", "stamp", "latched"}) for stream in streams]

@@ -1,1 +1,1 @@
-"""What a running detector says of itself: its status, the same as metrics, and the requests that it answers."""
+"""What a running detector reports about itself: its status, the same as metrics, and the requests that it answers."""

@@ -1,6 +1,6 @@
 """Why a rule does or does not fire: what its next evaluation sees of each subject.
 
-The evaluation is watched, not repeated: it tells what it saw on the way, so looking changes nothing and nothing is
+The evaluation is watched, not repeated: it reports what it saw on the way, so looking changes nothing and nothing is
 computed for it beyond what is computed anyway.
 """
 
@@ -21,7 +21,7 @@ from wayside.names import parse_subject
 from wayside.rules import ClientSubject, FleetSubject, PairSubject
 
 MAXIMUM_SUBJECTS = 20
-"""So many subjects are told of, those with an open episode and those whose condition holds first."""
+"""Maximum number of subjects shown, those with an open episode or a true condition first."""
 
 _MAXIMUM_NOTES = 20
 
@@ -33,9 +33,9 @@ class Watching:
         """Raises ValueError where there is no such rule, or it is watched already."""
         run = engine.rules.get(rule)
         if run is None:
-            raise ValueError(f"rule {rule} is not evaluated: its state and message say why")
+            raise ValueError(f"rule {rule} is not evaluated: see its state and message")
         if run.witness is not None:
-            raise ValueError(f"somebody else asks about rule {rule} just now: ask again")
+            raise ValueError(f"another request about rule {rule} is in progress: try again")
         self.future: Future[Explanation] = Future()
         self._engine = engine
         self._run = run
@@ -46,21 +46,21 @@ class Watching:
         run.counters.notes = []
 
     def is_over(self) -> bool:
-        """Whether the rule was evaluated meanwhile, is gone, or nobody waits any more; then the future says so."""
+        """Whether the rule was evaluated meanwhile, is gone, or nothing waits any more; then the future is set."""
         gone = self._engine.rules.get(self._run.rule.name) is not self._run
         if self._run.counters.ticks == self._ticks and not gone and not self.future.cancelled():
             return False
         notes, self._run.witness, self._run.counters.notes = self._run.counters.notes or [], None, None
         if self.future.set_running_or_notify_cancel():
             tick = self._run.counters.last_tick / 1e9
-            self.future.set_result(Explanation(tick, self._told(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))
+            self.future.set_result(Explanation(tick, self._statuses(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))
         return True
 
-    def _told(self) -> list[SubjectStatus]:
-        told = [status for _, status in sorted(self._seen, key=lambda each: (each[0], each[1].subject))]
-        if self._subject is not None and not told:
+    def _statuses(self) -> list[SubjectStatus]:
+        statuses = [status for _, status in sorted(self._seen, key=lambda each: (each[0], each[1].subject))]
+        if self._subject is not None and not statuses:
             return [SubjectStatus(self._subject, looked_at=False, why=self._why_not(self._subject))]
-        return told[:MAXIMUM_SUBJECTS]
+        return statuses[:MAXIMUM_SUBJECTS]
 
     def _see(self, evaluated: Evaluated) -> None:
         text, variables = evaluated.candidate.subject.text, evaluated.candidate.variables
@@ -85,7 +85,10 @@ class Watching:
         """By signal, as expressions name it, why it has no value."""
         for plugin in self._run.rule.plugins:
             if plugin.name not in variables:
-                yield plugin.name, f"plugin {plugin.plugin} gave no value, or failed: see the rule's last error"
+                yield (
+                    plugin.name,
+                    f"plugin {plugin.plugin} returned no value or failed: see the last error of the rule",
+                )
         match self._run.rule.subject:
             case PairSubject():
                 for role in ("a", "b"):
@@ -110,32 +113,34 @@ class Watching:
         lane = self._engine.buffer.lane(client, stream)
         spec = self._engine.detector.spec.stream(stream)
         if spec is None:
-            return f"nothing of {stream} has such a value"
+            return f"no {stream} has such a value"
         if lane is None or lane.latest == NEVER:
-            return f"no sample of stream {stream} has come from {client}"
+            return f"no sample of stream {stream} has arrived from {client}"
         age = (self._engine.now - lane.latest) / 1e9
         limit = self._engine.detector.spec.stale_after_ns(spec)
         if limit is not None and age > limit / 1e9:
             return f"stream {stream} of {client} is stale: its newest sample is {age:.1f} s old, more than staleAfter"
-        return f"what came of stream {stream} from {client} has no such value in its window"
+        return f"the samples of stream {stream} from {client} have no such value in the window"
 
     def _why_not(self, text: str) -> str:
         try:
             clients, _ = parse_subject(text)
         except ValueError:
-            return f"{text!r} is no subject: write car1, car1+car2, ~fleet, or with an element car1~north"
+            return f"{text!r} is not a subject: write car1, car1+car2 or ~fleet, or with an element car1~north"
         missing = [client for client in clients if client not in self._engine.clients]
         if missing:
-            return f"client {missing[0]} is not known: nothing came from it within clientTimeout"
+            return f"unknown client {missing[0]}: no sample arrived from it within clientTimeout"
         match self._run.rule.subject:
             case PairSubject() as pairs if len(clients) == 2:
-                return f"the pair is not within {pairs.within:g} m, or a place is unknown, or a role does not fit"
+                return f"the pair is not within {pairs.within:g} m, or a position is unknown, or a role does not match"
             case PairSubject():
                 return "the rule is about pairs: write car1+car2"
             case FleetSubject():
                 return "the rule is about the fleet: write ~fleet"
             case ClientSubject():
-                return "the rule is about single clients, and elements where it has `each`: write car1, or car1~north"
+                return (
+                    "the rule is about single clients, or their elements where it has `each`: write car1 or car1~north"
+                )
 
 
 def _plain(truth: Any) -> bool | None:

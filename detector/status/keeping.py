@@ -1,7 +1,7 @@
 """Keeps the status of a running detector: taken by the evaluation thread, at most once a second, read by any other.
 
-So whoever asks neither waits for the evaluation nor holds it up, and the engine's counters are only ever read by the
-thread that writes them. What costs something per sample is looked at in samples: latencies are those of the newest
+So a request neither waits for the evaluation nor delays it, and the engine's counters are only ever read by the
+thread that writes them. Work per sample is limited: latencies are those of the newest
 message of at most a few clients, once a second.
 """
 
@@ -41,10 +41,10 @@ _EVERY = 1_000_000_000
 """Nanoseconds between two statuses, and between two looks at a latency."""
 
 _LOOKED_AT = 16
-"""Of so many clients the newest sample's latency is looked at, for each stream or rule."""
+"""Number of clients whose newest sample counts for the latency of each stream or rule."""
 
 _RATES_OVER = 10
-"""Rates are over so many statuses."""
+"""Number of statuses over which rates are averaged."""
 
 _CLIENTS = 200
 
@@ -94,7 +94,7 @@ class StatusKeeper:
 
     @property
     def silence(self) -> float:
-        """Seconds since the evaluation last did what was due; for any thread."""
+        """Seconds since the last look of the evaluation; for any thread."""
         return time.monotonic() - self._beat
 
     def arrived(self, arrivals: Sequence[Arrival]) -> None:
@@ -103,7 +103,7 @@ class StatusKeeper:
             self._last.update((arrival.stream, arrival) for arrival in arrivals)
 
     def refused(self, refusals: Iterable[Refusal]) -> None:
-        """These rules, of those that are wanted now, are not evaluated as they are written."""
+        """Set the rules that are refused now."""
         self._refusals = {refusal.rule.name: refusal for refusal in refusals}
         self._taken = 0
 
@@ -181,7 +181,7 @@ class StatusKeeper:
         )
 
     def _axis(self) -> int:
-        """The time that ages are told by: with clock Wall now, also where ticks are rare."""
+        """The reference time of ages: with clock Wall now, also where ticks are rare."""
         return self._now() if self._engine.on_wall_clock else self._engine.now
 
     def _clients(self) -> Iterator[ClientStatus]:
@@ -263,7 +263,7 @@ class StatusKeeper:
         return islice((sample.received for sample in newest if sample is not None), _LOOKED_AT)
 
     def _forget(self, streams: Iterable[str]) -> None:
-        """What is kept of streams and rules that are gone."""
+        """Forget streams and rules that are gone."""
         for of_streams in (self._stream_latencies, self._last):
             for name in of_streams.keys() - {*streams}:
                 of_streams.pop(name)
@@ -275,7 +275,7 @@ def _state(run: RuleRun, schedule: Schedule) -> tuple[RuleState, str]:
     if not run.rule.enabled:
         return RuleState.DISABLED, "enabled is false"
     if run.rule.name in schedule.paused:
-        return RuleState.PAUSED, "open episodes hold until it is resumed"
+        return RuleState.PAUSED, "open episodes are kept until it is resumed"
     if not run.rule.on_demand and (thinned := schedule.thinning(run.rule)) > 1:
-        return RuleState.DEGRADED, f"the machine is too slow: one of {thinned} evaluations takes place"
-    return RuleState.ACCEPTED, "dryRun: events are published, no action runs" if run.rule.dry_run else ""
+        return RuleState.DEGRADED, f"the machine is too slow: the rule is evaluated once in {thinned} times"
+    return RuleState.ACCEPTED, "dryRun: publishing events, running no action" if run.rule.dry_run else ""

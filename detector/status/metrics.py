@@ -14,69 +14,114 @@ from detector.status.model import ActionStatus, Histogram, RuleState, RuleStatus
 _PREFIX = "wayside_detector_"
 
 DETECTOR: tuple[tuple[str, type, str, Callable[[Status], float | None]], ...] = (
-    ("connected", GaugeMetricFamily, "1 while a Zenoh router, peer or client is connected", lambda s: s.connected),
-    ("start_time_seconds", GaugeMetricFamily, "When the detector started, since the epoch", lambda s: s.started),
-    ("status_time_seconds", GaugeMetricFamily, "When these numbers were taken, since the epoch", lambda s: s.taken),
-    ("evaluated_time_seconds", GaugeMetricFamily, "Up to here all ticks have run, on the time axis", lambda s: s.now),
-    ("generation", GaugeMetricFamily, "Of the Detector that is followed; 0 from a file", lambda s: s.generation),
-    ("clients", GaugeMetricFamily, "Clients that are known", lambda s: s.client_count),
-    ("gaps", CounterMetricFamily, "Times at which ticks were not made up for", lambda s: s.gaps),
-    ("buffer_bytes", GaugeMetricFamily, "Held in the buffer, overhead included", lambda s: s.buffered_bytes),
-    ("buffer_limit_bytes", GaugeMetricFamily, "The cap over all streams", lambda s: s.maximum_bytes),
-    ("demands", GaugeMetricFamily, "Tasks that are demanded now", lambda s: s.demand_count),
-    ("clients_missing", GaugeMetricFamily, "Expected clients that send nothing", lambda s: s.missing_count),
+    ("connected", GaugeMetricFamily, "1 if a Zenoh router, peer or client is connected", lambda s: s.connected),
+    (
+        "start_time_seconds",
+        GaugeMetricFamily,
+        "Start time of the detector, in seconds since the epoch",
+        lambda s: s.started,
+    ),
+    ("status_time_seconds", GaugeMetricFamily, "Time of this status, in seconds since the epoch", lambda s: s.taken),
+    (
+        "evaluated_time_seconds",
+        GaugeMetricFamily,
+        "Time axis position up to which all ticks were evaluated, in seconds since the epoch",
+        lambda s: s.now,
+    ),
+    (
+        "generation",
+        GaugeMetricFamily,
+        "Generation of the Detector in use; 0 if it is from a file",
+        lambda s: s.generation,
+    ),
+    ("clients", GaugeMetricFamily, "Number of known clients", lambda s: s.client_count),
+    ("gaps", CounterMetricFamily, "Number of gaps at which missed ticks were skipped", lambda s: s.gaps),
+    ("buffer_bytes", GaugeMetricFamily, "Size of the buffer in bytes, overhead included", lambda s: s.buffered_bytes),
+    (
+        "buffer_limit_bytes",
+        GaugeMetricFamily,
+        "Maximum size of the buffer in bytes, over all streams",
+        lambda s: s.maximum_bytes,
+    ),
+    ("demands", GaugeMetricFamily, "Number of tasks that are currently demanded", lambda s: s.demand_count),
+    ("clients_missing", GaugeMetricFamily, "Number of expected clients that send nothing", lambda s: s.missing_count),
     (
         "certificate_expiry_time_seconds",
         GaugeMetricFamily,
-        "When the certificate in use expires, since the epoch; without one, not there",
+        "Expiry of the certificate in use, in seconds since the epoch; absent without a certificate",
         lambda s: s.certificate.expires,
     ),
     (
         "certificate_refused",
         GaugeMetricFamily,
-        "1 while the files' new certificates are not used, being of no use",
+        "1 if the new certificates in the files cannot be used",
         lambda s: bool(s.certificate.problem),
     ),
-    ("certificate_renewals", CounterMetricFamily, "Times new ones were taken", lambda s: s.certificate.renewals),
+    ("certificate_renewals", CounterMetricFamily, "Number of certificate renewals", lambda s: s.certificate.renewals),
 )
-"""Without labels: name, kind, what it tells, and its value; None: not there."""
+"""Without labels: name, kind, help text, and value; None: absent."""
 
 STREAM: tuple[tuple[str, type, str, Callable[[StreamStatus], float | None]], ...] = (
-    ("stream_samples", CounterMetricFamily, "Samples taken into the buffer", lambda s: s.samples),
-    ("stream_samples_per_second", GaugeMetricFamily, "Over the last ten seconds or so", lambda s: s.rate),
-    ("stream_clients", GaugeMetricFamily, "Clients of which something is buffered", lambda s: s.clients),
-    ("stream_age_seconds", GaugeMetricFamily, "Since the newest sample, on the time axis", lambda s: s.age),
-    ("stream_buffered_samples", GaugeMetricFamily, "Samples in the buffer", lambda s: s.buffered_samples),
-    ("stream_buffered_bytes", GaugeMetricFamily, "Their bytes, overhead included", lambda s: s.buffered_bytes),
+    ("stream_samples", CounterMetricFamily, "Number of samples added to the buffer", lambda s: s.samples),
+    (
+        "stream_samples_per_second",
+        GaugeMetricFamily,
+        "Samples per second, averaged over about ten seconds",
+        lambda s: s.rate,
+    ),
+    ("stream_clients", GaugeMetricFamily, "Number of clients with buffered samples", lambda s: s.clients),
+    ("stream_age_seconds", GaugeMetricFamily, "Age of the newest sample in seconds, on the time axis", lambda s: s.age),
+    ("stream_buffered_samples", GaugeMetricFamily, "Number of samples in the buffer", lambda s: s.buffered_samples),
+    (
+        "stream_buffered_bytes",
+        GaugeMetricFamily,
+        "Bytes of these samples in the buffer, overhead included",
+        lambda s: s.buffered_bytes,
+    ),
 )
 """By stream."""
 
 RULE: tuple[tuple[str, type, str, Callable[[RuleStatus], float | None]], ...] = (
-    ("rule_evaluations", CounterMetricFamily, "Subjects looked at", lambda r: r.evaluations),
-    ("rule_ticks", CounterMetricFamily, "Times at which the rule was evaluated, for all subjects", lambda r: r.ticks),
-    ("rule_evaluation_seconds", CounterMetricFamily, "Spent on evaluating", lambda r: r.time),
-    ("rule_unknowns", CounterMetricFamily, "Values that were not there when needed", lambda r: r.unknowns),
-    ("rule_errors", CounterMetricFamily, "Expressions that failed on values that were there", lambda r: r.errors),
-    ("rule_episodes_started", CounterMetricFamily, "Episodes that started", lambda r: r.started),
-    ("rule_episodes_ended", CounterMetricFamily, "Episodes that ended", lambda r: r.ended),
-    ("rule_episodes_open", GaugeMetricFamily, "Episodes that are open now", lambda r: r.open),
+    ("rule_evaluations", CounterMetricFamily, "Number of subjects evaluated", lambda r: r.evaluations),
+    (
+        "rule_ticks",
+        CounterMetricFamily,
+        "Number of ticks at which the rule was evaluated, for all subjects",
+        lambda r: r.ticks,
+    ),
+    ("rule_evaluation_seconds", CounterMetricFamily, "Time spent on evaluations, in seconds", lambda r: r.time),
+    ("rule_unknowns", CounterMetricFamily, "Number of values that were unknown when needed", lambda r: r.unknowns),
+    (
+        "rule_errors",
+        CounterMetricFamily,
+        "Number of expressions that failed although their values were known",
+        lambda r: r.errors,
+    ),
+    ("rule_episodes_started", CounterMetricFamily, "Number of episodes that started", lambda r: r.started),
+    ("rule_episodes_ended", CounterMetricFamily, "Number of episodes that ended", lambda r: r.ended),
+    ("rule_episodes_open", GaugeMetricFamily, "Number of open episodes", lambda r: r.open),
     (
         "rule_subjects_pending",
         GaugeMetricFamily,
-        "Subjects whose `for` has begun",
+        "Number of subjects whose `for` is running",
         lambda r: r.pending,
     ),
 )
 """By rule."""
 
 ACTION: tuple[tuple[str, type, str, Callable[[ActionStatus], float | None]], ...] = (
-    ("action_running", GaugeMetricFamily, "Episodes that an action works on", lambda a: a.running),
-    ("action_done", CounterMetricFamily, "Episodes that an action has done its work for", lambda a: a.done),
-    ("action_failed", CounterMetricFamily, "Episodes that an action failed with", lambda a: a.failed),
-    ("action_samples", CounterMetricFamily, "Samples that are recorded or stored", lambda a: a.samples),
-    ("action_bytes", CounterMetricFamily, "Bytes that are recorded, stored or sent", lambda a: a.bytes),
-    ("action_files", CounterMetricFamily, "Files that were written", lambda a: a.files),
-    ("action_missing", CounterMetricFamily, "Samples, messages or the like lost on the way", lambda a: a.missing),
+    ("action_running", GaugeMetricFamily, "Number of episodes that the action is working on", lambda a: a.running),
+    ("action_done", CounterMetricFamily, "Number of episodes that the action completed", lambda a: a.done),
+    ("action_failed", CounterMetricFamily, "Number of episodes for which the action failed", lambda a: a.failed),
+    ("action_samples", CounterMetricFamily, "Number of samples recorded or stored", lambda a: a.samples),
+    ("action_bytes", CounterMetricFamily, "Number of bytes recorded, stored or sent", lambda a: a.bytes),
+    ("action_files", CounterMetricFamily, "Number of files written", lambda a: a.files),
+    (
+        "action_missing",
+        CounterMetricFamily,
+        "Number of samples, messages or similar that the action lost",
+        lambda a: a.missing,
+    ),
 )
 """By rule, action and kind."""
 
@@ -100,7 +145,7 @@ class Metrics(Collector):
         """The metrics of one status."""
         status = self._status()
         info = GaugeMetricFamily(
-            f"{_PREFIX}info", "Which detector this is; always 1", labels=("detector", "holder", "version", "clock")
+            f"{_PREFIX}info", "Identity of the detector; always 1", labels=("detector", "holder", "version", "clock")
         )
         info.add_metric((status.detector, status.holder, status.version, status.clock), 1)
         yield info
@@ -108,7 +153,7 @@ class Metrics(Collector):
         yield from _families(STREAM, ("stream",), [((stream.name,), stream) for stream in status.streams])
         yield _histograms(
             "stream_latency_seconds",
-            "From stamp to receipt, of some samples each second",
+            "Seconds from stamp to receipt, for a few samples per second",
             "stream",
             [(stream.name, stream.latency) for stream in status.streams],
         )
@@ -116,14 +161,14 @@ class Metrics(Collector):
         yield _states(status.rules)
         yield _histograms(
             "rule_latency_seconds",
-            "From the receipt of what an evaluation saw to its end, clock Wall only",
+            "Seconds from the receipt of the newest evaluated samples to the end of the evaluation; clock Wall only",
             "rule",
             [(rule.name, rule.latency) for rule in status.rules if rule.latency is not None],
         )
         acting = [((each.rule, each.action, each.kind), each) for each in status.actions]
         yield from _families(ACTION, ("rule", "action", "kind"), acting)
         losses = CounterMetricFamily(
-            f"{_PREFIX}losses", "What was lost or could not be used, by cause", labels=("cause", "stream", "rule")
+            f"{_PREFIX}losses", "Number of items lost or unusable, by cause", labels=("cause", "stream", "rule")
         )
         for drops in status.drops:
             losses.add_metric((drops.cause, drops.stream, drops.rule), drops.count)
@@ -145,7 +190,9 @@ def _families(
 
 
 def _states(rules: Iterable[RuleStatus]) -> Metric:
-    family = GaugeMetricFamily(f"{_PREFIX}rule_state", "1 for the state that the rule is in", labels=("rule", "state"))
+    family = GaugeMetricFamily(
+        f"{_PREFIX}rule_state", "1 for the current state of the rule, else 0", labels=("rule", "state")
+    )
     for rule in rules:
         for state in RuleState:
             family.add_metric((rule.name, state.value), float(rule.state is state))

@@ -54,7 +54,7 @@ class StreamStatus(msgspec.Struct, frozen=True, rename="camel"):
     rate: float
     """Samples a second, over the last ten seconds or so."""
     clients: int
-    """Of so many clients there is something in the buffer."""
+    """Number of clients with samples in the buffer."""
     age: float | None
     """Since the newest sample, on the detector's time axis; None where none is there."""
     buffered_samples: int
@@ -89,7 +89,7 @@ class RuleStatus(msgspec.Struct, frozen=True, rename="camel"):
     unknowns: int = 0
     """Values that were not there when an expression needed them."""
     absences: dict[str, int] = {}
-    """What was not there, as far as expressions said so."""
+    """What was missing, as far as expressions reported it."""
     errors: int = 0
     last_error: str = ""
     started: int = 0
@@ -172,22 +172,22 @@ class ActionStatus(msgspec.Struct, frozen=True, rename="camel"):
     last_file: str = ""
     last_failure: str = ""
     current: dict[str, str] = {}
-    """By episode, what was last said of those that run, of at most 20."""
+    """By running episode, the last message, of at most 20."""
 
 
 class CertificateStatus(msgspec.Struct, frozen=True, rename="camel"):
-    """What the detector proves itself with on Zenoh."""
+    """The certificate of the detector on Zenoh."""
 
     expires: float | None = None
     """When the first certificate of its own chain expires, seconds since the epoch; None: it has none."""
     renewals: int = 0
-    """How often new certificates or passwords were taken into use."""
+    """Number of renewals of certificates or passwords."""
     problem: str = ""
     """Why what the files hold now is not used."""
 
 
 class Status(msgspec.Struct, frozen=True, rename="camel"):
-    """All that a detector says of itself."""
+    """The status of a detector."""
 
     detector: str
     holder: str
@@ -212,7 +212,7 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     rules: list[RuleStatus]
     drops: list[Drops]
     explanation: Explanation | None = None
-    """Of the one rule that was asked for, if it was evaluated in the meantime."""
+    """Of the requested rule, if it was evaluated in the meantime."""
     connected: bool = False
     """Whether a router, a peer or a client is connected."""
     sources: list[SourceStatus] = []

@@ -1,4 +1,4 @@
-"""Whether an event loop still runs, found out by whoever asks: nothing has to beat meanwhile."""
+"""Whether an event loop still runs, measured on request: no heartbeat is needed."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import time
 
 
 class Pulse:
-    """Leaves word with the loop, and counts how long that is not answered."""
+    """Schedules a callback in the loop, and measures how long it does not run."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._lock = threading.Lock()
-        self._asked: float | None = None
+        self._sent: float | None = None
 
     def silence(self) -> float:
-        """Seconds for which the loop has owed an answer; 0.0 where it owes none. From any thread."""
+        """Seconds for which the callback has been overdue; 0.0 if it is not. From any thread."""
         with self._lock:
-            if self._asked is None:
-                self._asked = time.monotonic()
+            if self._sent is None:
+                self._sent = time.monotonic()
                 try:
                     self._loop.call_soon_threadsafe(self._answered)
                 except RuntimeError:  # closed: the process is ending
-                    self._asked = None
-            return 0.0 if self._asked is None else time.monotonic() - self._asked
+                    self._sent = None
+            return 0.0 if self._sent is None else time.monotonic() - self._sent
 
     def _answered(self) -> None:
         with self._lock:
-            self._asked = None
+            self._sent = None

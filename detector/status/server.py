@@ -12,7 +12,7 @@ Page = Callable[[], tuple[bool, bytes]]
 _TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 _POLL = 0.1
-"""Seconds in which the server notices that it is to end."""
+"""Maximum seconds until the server notices its stop."""
 
 _PATIENCE = 10.0
 """Seconds that a client may take to send its request, so that none keeps a thread for ever."""
@@ -22,7 +22,7 @@ class StatusServer:
     """Serves pages from `start` to `close`."""
 
     def __init__(self, port: int, pages: Mapping[str, Page]) -> None:
-        """Listens on all addresses of the machine; port 0 takes a free one. Raises OSError where the port is taken."""
+        """Listens on all addresses of the machine; port 0 selects a free one. Raises OSError if the port is in use."""
 
         class Handler(BaseHTTPRequestHandler):
             timeout = _PATIENCE
@@ -30,7 +30,7 @@ class StatusServer:
             def do_GET(self) -> None:
                 page = pages.get(self.path.partition("?")[0])
                 if page is None:
-                    self._send(404, f"ask for one of {', '.join(pages)}\n".encode())
+                    self._send(404, f"unknown page; the pages are {', '.join(pages)}\n".encode())
                     return
                 well, text = page()
                 self._send(200 if well else 503, text)
@@ -43,7 +43,7 @@ class StatusServer:
                 self.wfile.write(text)
 
             def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the base class names it
-                """Say nothing: a probe comes every few seconds."""
+                """Log nothing: a probe comes every few seconds."""
 
         try:
             self._server = _Server(("", port), Handler)

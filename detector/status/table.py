@@ -16,7 +16,7 @@ _DEMANDS = 10
 
 
 def status_view(status: Status) -> RenderableType:
-    """Everything that a status says, in a few tables."""
+    """A status as a few tables."""
     return Group(*_parts(status))
 
 
@@ -46,7 +46,7 @@ def _parts(status: Status) -> Iterator[RenderableType]:
     if status.explanation is None:
         yield streams
         for source in status.sources:
-            error = f"; the last error: {source.last_error}" if source.last_error else ""
+            error = f"; last error: {source.last_error}" if source.last_error else ""
             yield f"source {source.name} ({source.plugin}): {source.state}, {source.messages} messages{error}"
     rules = _table("rule", "state", "evaluations", "time", "latency", "unknowns", "errors", "open", "started", "ended")
     for rule in status.rules:
@@ -88,20 +88,20 @@ def _parts(status: Status) -> Iterator[RenderableType]:
 
 
 def _proving(status: Status) -> Iterator[RenderableType]:
-    """What the detector proves itself with, where that is certificates or does not do."""
+    """The certificate of the detector, if it has one or there is a problem."""
     certificate = status.certificate
     if certificate.expires is not None:
         left = certificate.expires - status.taken
         lasts = f"expires in {_lasting(left)}" if left > 0 else f"expired {_lasting(-left)} ago"
         yield f"certificate {lasts}, renewed {certificate.renewals} times"
     if certificate.problem:
-        yield f"new certificates are not used: {certificate.problem}"
+        yield f"new certificates not in use: {certificate.problem}"
 
 
 def _acting(status: Status) -> Iterator[RenderableType]:
-    """What became of the actions' work, of the rules that are told about."""
-    told = {rule.name for rule in status.rules}
-    actions = [each for each in status.actions if each.rule in told or status.explanation is None]
+    """The outcomes of the actions of the rules shown."""
+    shown = {rule.name for rule in status.rules}
+    actions = [each for each in status.actions if each.rule in shown or status.explanation is None]
     if not actions:
         return
     table = _table("action", "kind", "running", "done", "failed", "samples", "missing", "size", "files")
@@ -117,9 +117,9 @@ def _acting(status: Status) -> Iterator[RenderableType]:
     yield table
     for each in actions:
         if each.last_file:
-            yield f"{each.rule}/{each.action}: the last file: {each.last_file}"
+            yield f"{each.rule}/{each.action}: last file: {each.last_file}"
         if each.last_failure:
-            yield f"{each.rule}/{each.action}: the last failure: {each.last_failure}"
+            yield f"{each.rule}/{each.action}: last failure: {each.last_failure}"
         for episode, message in each.current.items():
             if message:
                 yield f"{each.rule}/{each.action}: episode {episode}: {message}"
@@ -128,11 +128,11 @@ def _acting(status: Status) -> Iterator[RenderableType]:
 def _explained(explanation: Explanation) -> Iterator[RenderableType]:
     for subject in explanation.subjects:
         if not subject.looked_at:
-            yield f"{subject.subject}: not looked at: {subject.why}"
+            yield f"{subject.subject}: not evaluated: {subject.why}"
             continue
         state = "an episode is open" if subject.open else "no episode"
         if subject.pending is not None:
-            state = f"when has held for {subject.pending:.1f} s"
+            state = f"when has been true for {subject.pending:.1f} s"
         truths = (
             ("in scope", subject.in_scope),
             ("near", subject.near),
@@ -156,7 +156,7 @@ def _remarks(rule: RuleStatus) -> Iterator[str]:
     if rule.message:
         yield f"{rule.name}: {rule.message}"
     if rule.last_error:
-        yield f"{rule.name}: the last error: {rule.last_error}"
+        yield f"{rule.name}: last error: {rule.last_error}"
     for what, count in sorted(rule.absences.items(), key=lambda item: -item[1])[:3]:
         yield f"{rule.name}: {'once' if count == 1 else f'{count} times'} {what}"
 

@@ -2,7 +2,7 @@
 
     wayside/detectors/<holder>/<what>?name=value;…
 
-An answer is JSON. What cannot be answered is an error reply whose text says why.
+An answer is JSON. A request that cannot be answered gets an error reply with the reason.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import zenoh
 _log = logging.getLogger(__name__)
 
 Answer = Callable[[str, Mapping[str, str], bytes], bytes]
-"""Takes what is asked for, its parameters and the query's payload (often none), gives JSON.
+"""Takes the name of the request, its parameters and the payload of the query (often none); returns JSON.
 
 Raises ValueError where it cannot.
 """
@@ -24,7 +24,7 @@ Raises ValueError where it cannot.
 JSON = "application/json"
 
 _CHANNEL = 64
-"""So many queries wait; Zenoh holds further ones back, and those who ask give up in their own time."""
+"""Maximum number of waiting queries; Zenoh holds further ones back until their timeout."""
 
 
 def status_key(holder: str, what: str) -> str:
@@ -46,7 +46,7 @@ class Answering:
         self._thread.start()
 
     def join(self, timeout: float) -> None:
-        """The session is closed: wait for the thread, at most so many seconds."""
+        """The session is closed: wait at most `timeout` seconds for the thread."""
         self._thread.join(timeout)
 
     def _run(self) -> None:
@@ -57,16 +57,16 @@ class Answering:
                 return
             try:
                 self._reply(query)
-            except Exception as error:  # noqa: BLE001  one bad question must not silence the detector
-                _log.warning("a query of %s was not answered: %s", query.key_expr, error)
+            except Exception as error:  # noqa: BLE001  one bad query must not silence the detector
+                _log.warning("cannot answer a query of %s: %s", query.key_expr, error)
             finally:
                 query.drop()  # type: ignore[no-untyped-call]  # ends the query, whatever was replied
 
     def _reply(self, query: zenoh.Query) -> None:
         parts = (part.partition("=") for part in str(query.parameters).split(";") if part)
         parameters = {name: value for name, _, value in parts}
-        asked = str(query.key_expr).rsplit("/", 1)[-1]
-        what = "status" if asked.startswith("*") else asked
+        page = str(query.key_expr).rsplit("/", 1)[-1]
+        what = "status" if page.startswith("*") else page
         try:
             given = query.payload
             payload = self._answer(what, parameters, b"" if given is None else given.to_bytes())

@@ -1,12 +1,12 @@
-"""What comes on a stream, over one session after another, each sample once and in order.
+"""The samples of a stream, over one session after another, each once and in order.
 
 When one session takes the place of another, both are subscribed for a while. What comes over the old one goes on at
 once, and is noted; what comes over the new one waits. Then the old one is withdrawn, what it had received is taken, and
 after that what waited, without what was noted. So nothing is lost, nothing is taken twice, and on no key does a sample
 overtake another.
 
-A sample is known again by the timestamp that routers (and peers) give to each. Where nobody does, those that are equal
-in key and content are taken for the same, within the second or so in which both sessions are subscribed.
+A sample is known again by the timestamp that routers (and peers) give to each. Without timestamps, those that are equal
+in key and content count as the same, within the second or so in which both sessions are subscribed.
 """
 
 from __future__ import annotations
@@ -23,12 +23,14 @@ from detector.streams.bursts import LONGEST
 from detector.streams.subscribing import Subscription
 
 MAXIMUM_NOTED = 1_000_000
-"""So many samples are noted, and so many wait, for one stream; beyond, the sessions are exchanged without more ado."""
+"""Maximum samples noted, and maximum samples waiting, for one stream; beyond, the sessions are exchanged at once."""
 
 _MAXIMUM_KEYS = 200_000
 
 _LOOKED_AT = 100
-"""So many samples of the new session are looked for among those of the old one: the first ones come there first too."""
+"""Number of samples of the new session that are searched among those of the old one: the first ones come there first
+too.
+"""
 
 _ECHO = 5.0
 """Seconds after the exchange in which the new session may still deliver what the old one had: then all has come."""
@@ -85,11 +87,11 @@ class Inlet:
                 yield first
 
     def note(self) -> None:
-        """From now on remember what comes: another session is about to subscribe."""
+        """Start noting samples: another session is about to subscribe."""
         self._noted = Counter()
 
     def try_second(self, second: Subscription) -> None:
-        """Take what waits in the new session's subscription; it is to be called often, so that nothing jams there."""
+        """Take the samples of the new session's subscription; call it often, so that its queue does not fill."""
         if not self.full:
             self._held.extend(each for each in iter(second.handler.try_recv, None) if not self._is_old(each))
 
@@ -112,7 +114,7 @@ class Inlet:
         return bool(self._noted) and not self._held
 
     def forget(self) -> None:
-        """No other session takes the place of this one, for now."""
+        """Cancel the exchange: this session stays."""
         self._noted = None
         self._held = []
 

@@ -1,6 +1,6 @@
 """How a stream is subscribed to and its samples are handed over, by the layout of its keys.
 
-A layout has a pump of its own, so that what one asks of every sample costs the others nothing.
+A layout has a pump of its own, so that the work per sample of one costs the others nothing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Follows the clients' liveliness tokens, and tells what happens to them as arrivals for the intake.
+"""Follows the clients' liveliness tokens, and passes their changes as arrivals to the intake.
 
 When our connection to a router ends, Zenoh reports all tokens behind it as gone, a moment before the connection
 itself. So a token that is gone is looked at again shortly after: only if no router left since the token was declared,
@@ -20,10 +20,10 @@ from wayside.keys import KeyPattern
 log = logging.getLogger(__name__)
 
 _SETTLE = 0.2
-"""Seconds between a report that a token is gone and the belief in it."""
+"""Seconds until a reported loss of a token takes effect."""
 
 _DOUBT = 10.0
-"""Seconds after a router left in which tokens that were declared before are not believed to be dropped."""
+"""Seconds after a router left in which losses of tokens declared before are ignored."""
 
 _CHANNEL = 16_384
 
@@ -34,13 +34,13 @@ Tokens = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
 
 
 def subscribe_tokens(session: zenoh.Session, key: str) -> Tokens:
-    """`key` is a pattern in key-format notation; tokens that are there are told of. Raises KeyPatternError, ZError."""
+    """`key` is a pattern in key-format notation; existing tokens are reported. Raises KeyPatternError, ZError."""
     expression = zenoh.KeyExpr.autocanonize(KeyPattern.parse(key).expression)
     return session.liveliness().declare_subscriber(expression, zenoh.handlers.FifoChannel(_CHANNEL), history=True)
 
 
 class TokenWatch:
-    """Tells of tokens while a session is open; at the last one's end, that nothing is known of them any more."""
+    """Reports tokens while a session is open; at the end of the last one, that their state is unknown."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class TokenWatch:
         self._connections = connections
         self._stop = threading.Event()
         self._held: dict[str, int] = {}
-        """The tokens that are there, and how many routers had left when they were declared."""
+        """The existing tokens, and the number of routers that had left when they were declared."""
         self._subscriber = subscriber
         self._following: tuple[Tokens, Connections] | None = None
         self._changed = threading.Condition()
@@ -89,7 +89,7 @@ class TokenWatch:
             tokens = self._subscriber.handler
             try:
                 while True:
-                    self._tell([_report(tokens.recv())], tokens)
+                    self._apply([_report(tokens.recv())], tokens)
             except zenoh.ZError:  # undeclared, or the session is closed
                 with self._changed:
                     self._changed.wait_for(
@@ -103,7 +103,7 @@ class TokenWatch:
             self._compare()
 
     def _compare(self) -> None:
-        """Another session tells of all tokens that are there: those that it does not tell of are gone meanwhile."""
+        """Another session reports all existing tokens: those that it does not report are gone."""
         self._held = dict.fromkeys(self._held, self._connections.departures)
         tokens = self._subscriber.handler
         reports = [_report(each) for each in iter(tokens.try_recv, None)]
@@ -111,10 +111,10 @@ class TokenWatch:
         gone = [(key, zenoh.SampleKind.DELETE) for key in self._held if key not in there]
         new = [(key, kind) for key, kind in reports if kind == zenoh.SampleKind.DELETE or key not in self._held]
         if gone or new:
-            self._tell([*gone, *new], tokens)
+            self._apply([*gone, *new], tokens)
 
-    def _tell(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
-        """What a report and those that follow it at once come to, a token at a time."""
+    def _apply(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+        """Apply a report and those that follow it at once, a token at a time."""
         if reports[0][1] == zenoh.SampleKind.DELETE and not self._stop.wait(_SETTLE):
             reports.extend(_report(each) for each in iter(tokens.try_recv, None))
         newest = dict(reports)

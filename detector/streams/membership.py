@@ -18,8 +18,9 @@ from detector.streams.tally import Tally
 from wayside.api.stream import Stream
 
 _CHANNEL = 16_384
-"""So many samples of a stream wait for its thread while the evaluation holds the interpreter's lock. Once they are full
-Zenoh's own queues fill, and then it is the sender's congestion control that says whether it waits or drops."""
+"""Maximum number of samples of a stream that wait for its thread while the evaluation holds the interpreter's lock.
+Once they are full Zenoh's own queues fill, and then it is the sender's congestion control that decides whether it
+waits or drops."""
 
 _PATIENCE = 10.0
 """Seconds for which a session is kept that is not wanted any more, but on which an answer is still waited for."""
@@ -58,20 +59,20 @@ class Membership:
                 self._unused.notify_all()
 
     def retire(self) -> None:
-        """Close once nobody uses it any more, and after ten seconds in any case."""
+        """Close once it is no longer used, and after ten seconds in any case."""
         with self._unused:
             self._unused.wait_for(lambda: not self._users, _PATIENCE)
         self.close()
 
     def close(self, timeout: float = 2.0) -> None:
-        """Leave at once; it frees the threads that wait for something to come, or to go out."""
+        """Leave at once; this frees the threads that wait to receive or to send."""
         self.connections.close()
         self.session.close()  # type: ignore[no-untyped-call]
         if self._answering is not None:
             self._answering.join(timeout)
 
-    def await_somebody(self, stop: threading.Event, seconds: float) -> bool:
-        """Whether somebody is connected within so many seconds."""
+    def await_connection(self, stop: threading.Event, seconds: float) -> bool:
+        """Whether a connection exists within `seconds`."""
         until = time.monotonic() + seconds
         while not self.connections.any and time.monotonic() < until and not stop.wait(0.01):
             pass

@@ -18,6 +18,6 @@ def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put) -> None:
     put_kind = zenoh.SampleKind.PUT
     for burst in bursts:
         messages = [(str(sample.key_expr), sample.payload.to_bytes()) for sample in burst]
-        if not all(map(_PAYLOAD, messages)):  # a deletion is no message; asking each for its kind would cost more
+        if not all(map(_PAYLOAD, messages)):  # a deletion is no message; checking the kind of each would cost more
             messages = list(compress(messages, [sample.kind == put_kind for sample in burst]))
         put(messages)

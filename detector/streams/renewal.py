@@ -1,10 +1,10 @@
-"""Certificates and passwords are taken anew when their files change: a second session takes the first one's place.
+"""Renews certificates and passwords when their files change: a second session replaces the first.
 
-What a running session proves itself with cannot be changed, and a router closes the connection when the certificate
-expires. So the new material is tried with a session of its own, beside the first; `inlets` tells how no sample is lost
-between them. Where the new session cannot be had, or nothing is given to it, the first one stays as it is, and that is
-said. A detector that others connect to cannot listen twice: its session is closed and opened anew, with the old
-material again if the new one does not do, and what is sent in between is lost.
+The credentials of a running session cannot be changed, and a router closes the connection when the certificate
+expires. So the new material is tried with a session of its own, beside the first; `inlets` describes how no sample is
+lost between them. If the new session cannot be opened, or receives nothing, the first one is kept, and
+that is logged. A detector that others connect to cannot listen twice: its session is closed and reopened, with the
+old material if the new one fails, and samples sent in between are lost.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from wayside.api.zenoh import Zenoh, ZenohMode
 log = logging.getLogger(__name__)
 
 LOOK_EVERY = 10.0
-"""Seconds between two looks at the files; a kubelet takes about a minute to change them."""
+"""Seconds between two checks of the files; a kubelet takes about a minute to change them."""
 
 _AT_LEAST, _AT_MOST = 1.0, 10.0
 """Seconds for which both sessions are subscribed: time for the subscription to be known, and for both to be level."""
@@ -35,22 +35,22 @@ _AT_LEAST, _AT_MOST = 1.0, 10.0
 _LOOK_AT_BOTH = 0.01
 
 _AGAIN = 60.0
-"""Seconds after which material that did not do is tried once more: the other side may have been at fault."""
+"""Seconds after which material that failed is tried once more: the other side may have been at fault."""
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
-    """What is known of the material in use."""
+class CertificateState:
+    """The state of the material in use."""
 
     expires: float | None = None
     """When the first certificate of the own chain expires, seconds since the epoch; None: there is none."""
     renewals: int = 0
     problem: str = ""
-    """Why what the files hold now is not used."""
+    """Why the present content of the files is not used."""
 
 
 class Renewal:
-    """Looks at the files of one network until it is stopped, on a thread of its own."""
+    """Watches the files of one network until it is stopped, on a thread of its own."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Renewal:
         look_every: float = LOOK_EVERY,
         on_failure: Callable[[BaseException], None],
     ) -> None:
-        """`join` subscribes a session; `use` has everything that goes out take a membership from now on."""
+        """`join` subscribes a session; `use` switches all outgoing data to a membership."""
         self._config = config
         self._member = first
         self._inlets = inlets
@@ -75,24 +75,24 @@ class Renewal:
         self._on_failure = on_failure
         self._stop = threading.Event()
         self.reopening = threading.Event()
-        """Set while there is no session, since another one is just being opened."""
+        """Set while there is no session because another one is being opened."""
         self._failed: Material | None = None
         self._again = 0.0
-        self.standing = Standing(first.material.expires)
+        self.certificate_state = CertificateState(first.material.expires)
         self._thread = threading.Thread(target=self._run, name="certificates", daemon=True)
 
     def start(self) -> None:
-        """Look from now on; where there is nothing that can change, nothing is done."""
+        """Start watching the files, if there are any that can change."""
         config = self._config
         if any((config.tls, config.tls_secret, config.credentials, config.credentials_secret)):
             self._thread.start()
 
     def stop(self) -> None:
-        """Begin nothing more; an exchange that is under way is ended soon."""
+        """Start no further exchange; one in progress ends soon."""
         self._stop.set()
 
     def join(self, timeout: float) -> None:
-        """Wait for the thread, at most so many seconds."""
+        """Wait at most `timeout` seconds for the thread."""
         if self._thread.is_alive():
             self._thread.join(timeout)
 
@@ -102,32 +102,34 @@ class Renewal:
                 self._look()
         except Exception as error:  # noqa: BLE001  this thread's edge: certificates would expire unnoticed
             if not self._stop.is_set():
-                log.critical("certificates are not followed any more: %s", error)
+                log.critical("watching certificates failed; they are no longer renewed: %s", error)
                 self._on_failure(error)
 
     def _look(self) -> None:
         try:
             material = material_of(self._config)
         except NetworkError as error:
-            self._tell(str(error))
+            self._set_problem(str(error))
             return
         if material == self._member.material:
             self._failed = None
-            self._tell("")
+            self._set_problem("")
         elif material != self._failed or time.monotonic() >= self._again:
             try:
                 self._exchange(material)
             except NetworkError as error:
                 self._failed, self._again = material, time.monotonic() + _AGAIN
-                self._tell(str(error))
+                self._set_problem(str(error))
 
-    def _tell(self, problem: str) -> None:
-        if problem and problem != self.standing.problem and not self._stop.is_set():
-            log.warning("the new certificates or password are not used, the session of before goes on: %s", problem)
-        self.standing = Standing(self._member.material.expires, self.standing.renewals, problem)
+    def _set_problem(self, problem: str) -> None:
+        if problem and problem != self.certificate_state.problem and not self._stop.is_set():
+            log.warning("cannot use the new certificates or password; keeping the current session: %s", problem)
+        self.certificate_state = CertificateState(
+            self._member.material.expires, self.certificate_state.renewals, problem
+        )
 
     def _exchange(self, material: Material) -> None:
-        """Raises NetworkError where the new material does not do; then all is as before."""
+        """Raises NetworkError if the new material fails; then nothing has changed."""
         listens = bool(self._config.listen) or self._config.mode is ZenohMode.ROUTER
         before = self._member
         if listens:
@@ -136,9 +138,9 @@ class Renewal:
             self._take_over(material)
         if self._member is before or self._stop.is_set():
             return
-        self.standing = Standing(material.expires, self.standing.renewals + 1)
+        self.certificate_state = CertificateState(material.expires, self.certificate_state.renewals + 1)
         until = "" if material.expires is None else f", until {time.strftime('%FT%TZ', time.gmtime(material.expires))}"
-        log.info("zenoh: the new certificates or password are in use%s", until)
+        log.info("zenoh: using the new certificates or password%s", until)
 
     def _take_over(self, material: Material) -> None:
         first = self._member
@@ -169,9 +171,9 @@ class Renewal:
         first.retire()
 
     def _run_both(self, first: Membership, second: Membership) -> None:
-        """Until both sessions are level. Raises NetworkError where nothing is given to the second one."""
-        if first.connections.any and not second.await_somebody(self._stop, _AT_MOST):
-            raise NetworkError(f"zenoh: with them nobody is connected at {[*self._config.connect]}")
+        """Run both until they are level. Raises NetworkError if the second one receives nothing."""
+        if first.connections.any and not second.await_connection(self._stop, _AT_MOST):
+            raise NetworkError(f"zenoh: with the new ones no connection to {[*self._config.connect]} is established")
         begin = time.monotonic()
         pairs = [*zip(self._inlets, second.subscriptions, strict=True)]
         while not self._stop.wait(_LOOK_AT_BOTH):
@@ -183,7 +185,9 @@ class Renewal:
             if elapsed >= _AT_LEAST and not any(inlet.waits for inlet in self._inlets):
                 break
         if not self._stop.is_set() and any(inlet.only_first for inlet in self._inlets):
-            raise NetworkError("zenoh: with them nothing is received: does the router allow the new name to subscribe?")
+            raise NetworkError(
+                "zenoh: with the new ones nothing is received: does the router permit the new name to subscribe?"
+            )
 
     def _reopen(self, material: Material) -> None:
         try:
@@ -220,7 +224,7 @@ class Renewal:
             inlet.follow(subscription)
         if self._tokens is not None and second.tokens is not None:
             self._tokens.follow(second.tokens, second.connections)
-        lost = "zenoh: the session was opened anew within %.1f s: what was sent meanwhile is lost"
+        lost = "zenoh: reopened the session within %.1f s: samples sent in the meantime are lost"
         log.warning(lost, time.monotonic() - began)
         if tried is not material and refused is not None:
             raise refused

@@ -1,4 +1,5 @@
-"""ROS 2 over Zenoh as rmw_zenoh lays it out (its docs/design.md): the key tells the type, an attachment the number.
+"""ROS 2 over Zenoh as rmw_zenoh lays it out (its docs/design.md): the key gives the type, an attachment the sequence
+number.
 
 A key reads `<domain>/<topic>/<type>/<type hash>`, the type as DDS writes it:
 `0/car1/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_…`. What goes on from here is the topic alone: so the same Detector
@@ -20,7 +21,7 @@ from detector.streams.sequences import Sequences
 from detector.streams.tally import Cause, Tally
 
 _TOPICS = 200_000
-"""So many keys of a stream are remembered; beyond, they are read anew."""
+"""Maximum number of cached keys of a stream; beyond, they are parsed again."""
 
 _GID = 16
 _NAMED = b"\x0fsequence_number"
@@ -28,7 +29,7 @@ _NAMED_GID = b"\x0asource_gid\x10"
 
 
 class MisfitError(ValueError):
-    """A key that is none of the stream's; the text says why."""
+    """A key that does not belong to the stream; the message gives the reason."""
 
 
 def expression(topics: str, domain: int | None) -> str:
@@ -41,13 +42,13 @@ def split(key: str) -> tuple[str, str]:
     domain, _, rest = key.partition("/")
     parts = rest.rsplit("/", 2)
     if len(parts) < 3 or not domain.isdecimal():
-        raise MisfitError(f"{key} does not read <domain>/<topic>/<type>/<type hash>")
+        raise MisfitError(f"{key} is not of the form <domain>/<topic>/<type>/<type hash>")
     topic, mangled, _ = parts
     names = mangled.replace("%", "/").replace("::", "/").split("/")
     if len(names) == 4 and names[2] == "dds_" and names[3].endswith("_"):
         names = [*names[:2], names[3][:-1]]
     if len(names) != 3 or not all(names):
-        raise MisfitError(f"{key} names no type: {mangled} does not read <package>::msg::dds_::<Type>_")
+        raise MisfitError(f"{key} names no type: {mangled} is not of the form <package>::msg::dds_::<Type>_")
     return topic, "/".join(names)
 
 
@@ -65,7 +66,7 @@ class Reader:
     """Reads keys and attachments of one stream; for the one thread that receives it."""
 
     def __init__(self, stream: str, type_name: str | None, tally: Tally) -> None:
-        """`type_name`: what the keys must tell, None for any."""
+        """`type_name`: the type that the keys must give, None for any."""
         self._stream = stream
         self._type = type_name
         self._tally = tally
@@ -77,12 +78,12 @@ class Reader:
         topic = self._topics.get(key)
         if topic is None:
             try:
-                topic, told = split(key)
+                topic, given = split(key)
             except MisfitError as error:
                 self._tally.add(Cause.MISFIT, self._stream, last=str(error))
                 return None
-            if self._type not in (None, told):
-                misfit = f"{topic} is {told}, but the stream's type is {self._type}"
+            if self._type not in (None, given):
+                misfit = f"{topic} is of type {given}, but the type of the stream is {self._type}"
                 self._tally.add(Cause.MISFIT, self._stream, last=misfit)
                 return None
             if len(self._topics) >= _TOPICS:
@@ -92,11 +93,11 @@ class Reader:
 
     def follow(self, topic: str, attachment: bytes | None) -> None:
         """A sample came on the topic with this attachment."""
-        told = None if attachment is None else numbered(attachment)
-        if told is None:
+        given = None if attachment is None else numbered(attachment)
+        if given is None:
             self._tally.add(Cause.UNNUMBERED, self._stream, last=topic)
         else:
-            self._sequences.follow(*told, topic)
+            self._sequences.follow(*given, topic)
 
 
 def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: Reader) -> None:

@@ -1,7 +1,7 @@
 """Losses before the detector, seen by the numbers that publishers give their samples.
 
-A publisher counts its samples one by one. The first that comes says where it stands; a step of more than one afterwards
-says how many did not come. A number that is passed already came late; one far off means that counting began anew.
+A publisher counts its samples one by one. The first sample gives the current number; a later step of more than one
+gives the number of losses. A lower number is a late sample; one far off means that counting restarted.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 from detector.streams.tally import Cause, Tally
 
 MAXIMUM_PUBLISHERS = 10_000
-"""So many publishers of a stream are remembered; beyond, the one that was first seen longest ago begins anew."""
+"""Maximum number of tracked publishers of a stream; beyond, the oldest one is forgotten."""
 
-_ANEW = 2**32
-"""A step this far is no loss: no publisher sends so much while nobody looks."""
+_RESTARTED = 2**32
+"""A step this far is no loss, but a restart: no publisher sends that many unnoticed."""
 
 _BACK = 1000
 """A number this far back is no late sample."""
@@ -38,7 +38,7 @@ class Sequences:
             if len(self._last) >= MAXIMUM_PUBLISHERS:
                 del self._last[next(iter(self._last))]
             self._last[publisher] = number
-        elif last < number < last + _ANEW:
+        elif last < number < last + _RESTARTED:
             self._last[publisher] = number
             which = str(last + 1) if number == last + 2 else f"{last + 1} to {number - 1}"
             missed = f"{topic}: {which} of publisher {publisher.hex()}"

@@ -24,11 +24,11 @@ _FIELD = "spec.zenoh"
 
 
 class NetworkError(InputError, ValueError):
-    """The Zenoh session cannot be had as configured; the text names the field and the reason."""
+    """The Zenoh session cannot be opened as configured; the message names the field and the reason."""
 
 
 def material_of(config: Zenoh) -> Material:
-    """What to prove oneself with now. Raises NetworkError."""
+    """The present certificates and credentials. Raises NetworkError."""
     try:
         return read_material(config, _FIELD)
     except AccessError as error:
@@ -38,34 +38,35 @@ def material_of(config: Zenoh) -> Material:
 def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Session:
     """Opens a session. A peer or router connects in the background; a client must reach a router now.
 
-    `material`: default: what the configuration means now. Raises NetworkError.
+    `material`: default: that of the configuration. Raises NetworkError.
     """
     try:
         return zenoh.open(_settings(config, material_of(config) if material is None else material))
     except zenoh.ZError as error:
         raise NetworkError(
-            f"zenoh: no session as {config.mode} with connect {[*config.connect]}, listen {[*config.listen]}: {error}"
+            f"zenoh: cannot open a session as {config.mode} with connect {[*config.connect]}, listen "
+            f"{[*config.listen]}: {error}"
         ) from error
 
 
 def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, Material] | None:
     """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
-    attempt, said = 0, ""
+    attempt, logged = 0, ""
     while not stop.is_set():
         try:
             material = material_of(config)
             return open_session(config, material), material
         except NetworkError as error:
-            if str(error) != said:
-                said = str(error)
-                log.warning("%s; trying on", error)
+            if str(error) != logged:
+                logged = str(error)
+                log.warning("%s; retrying", error)
         stop.wait(_RETRY_SECONDS[min(attempt, len(_RETRY_SECONDS) - 1)])
         attempt += 1
     return None
 
 
 class Connections:
-    """Who is connected to a session right now: says in the log when the last one goes, and when one is back."""
+    """The connections of a session: logs when the last one is lost, and when one is back."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._lock = threading.Lock()
@@ -88,7 +89,7 @@ class Connections:
         return left is not None and time.monotonic() - left <= seconds
 
     def close(self) -> None:
-        """From now on, connections end because we end them: nothing is said about it."""
+        """From now on, connections end because we end them: nothing is logged."""
         self._closing = True
 
     def _take(self, event: zenoh.TransportEvent) -> None:
@@ -100,7 +101,7 @@ class Connections:
                 self._others.add(other)
                 if self._alone:
                     self._alone = False
-                    log.info("zenoh: connected again, to %s %s", role, other)
+                    log.info("zenoh: reconnected to %s %s", role, other)
                 return
             self._others.discard(other)
             if event.transport.whatami == zenoh.WhatAmI.ROUTER:
@@ -108,7 +109,7 @@ class Connections:
                 self.departures += 1
             if not self._others and not self._closing:
                 self._alone = True
-                log.warning("zenoh: the connection to %s %s is lost, nobody is connected; trying on", role, other)
+                log.warning("zenoh: lost the connection to %s %s, and no other is left; reconnecting", role, other)
 
 
 def _settings(config: Zenoh, material: Material) -> zenoh.Config:

@@ -1,6 +1,6 @@
-"""How a stream is subscribed to: plainly, or as an Advanced Subscriber that asks publishers for what it missed.
+"""How a stream is subscribed to: plainly, or as an Advanced Subscriber that requests missed samples from publishers.
 
-A plain subscriber is the faster one, so streams that ask for neither history nor recovery get it.
+A plain subscriber is the faster one, so streams without history and recovery get it.
 """
 
 from __future__ import annotations

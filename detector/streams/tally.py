@@ -10,17 +10,17 @@ from enum import StrEnum
 class Cause(StrEnum):
     """Why something did not reach the intake. The texts are those of the log."""
 
-    MISSED = "samples of stream {} lost before the detector, as their publishers number them"
-    OVERTAKEN = "samples of stream {} came after later ones, and were counted as lost"
-    MISFIT = "samples of stream {} dropped, their keys not being the stream's"
-    UNNUMBERED = "samples of stream {} taken in without a number, so that losses do not show"
-    UNROUTED = "messages of source {} dropped, their keys belonging to none of its streams"
-    FAILED = "times source {} failed and was to be started again"
-    LEFT_BEHIND = "times source {} did not stop and was left behind"
+    MISSED = "samples of stream {} lost before the detector, by the sequence numbers of their publishers"
+    OVERTAKEN = "samples of stream {} arrived after later ones, and were counted as lost"
+    MISFIT = "samples of stream {} dropped because their keys do not match the stream"
+    UNNUMBERED = "samples of stream {} received without a sequence number, so that losses are not counted"
+    UNROUTED = "messages of source {} dropped because no stream matches their keys"
+    FAILED = "times source {} failed and was restarted"
+    LEFT_BEHIND = "times source {} did not stop and was abandoned"
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class TallyEntry:
     """How often something happened."""
 
     cause: Cause
@@ -49,7 +49,7 @@ class Tally:
             before, _ = self._counts.get((cause, name), (0, ""))
             self._counts[cause, name] = before + count, last
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[TallyEntry]:
         """All that happened so far, in order of cause and name."""
         with self._lock:
-            return [Entry(*key, *value) for key, value in sorted(self._counts.items())]
+            return [TallyEntry(*key, *value) for key, value in sorted(self._counts.items())]

@@ -23,7 +23,7 @@ from detector.streams.inlets import Inlet
 from detector.streams.layouts import Pump, pump_for
 from detector.streams.liveliness import TokenWatch
 from detector.streams.membership import Membership
-from detector.streams.renewal import LOOK_EVERY, Renewal, Standing
+from detector.streams.renewal import LOOK_EVERY, CertificateState, Renewal
 from detector.streams.session import NetworkError, await_session, material_of, open_session
 from detector.streams.tally import Tally
 from wayside.api.stream import Stream
@@ -54,7 +54,7 @@ class Network:
         """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
 
         `answering` answers queries once there is a session. What was lost before the detector goes into the `tally`.
-        `on_failure` is told if a thread dies of an error. Certificates are looked at every so many seconds.
+        `on_failure` is called if a thread dies of an error. Certificates are checked every `look_every` seconds.
         """
         self._on_failure = on_failure
         self._config = config
@@ -75,7 +75,7 @@ class Network:
         self._make_answering = answering
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
         self.dropped_events = 0
-        """Events that found the queue full, or that Zenoh refused."""
+        """Events dropped because the queue was full, or that Zenoh refused."""
 
     def start(self) -> None:
         """Opens the session: a client's in the background until it succeeds, else at once (raises NetworkError)."""
@@ -85,7 +85,7 @@ class Network:
         self._thread.start()
 
     def publish(self, key: str, payload: bytes, encoding: str = EVENT_ENCODING) -> None:
-        """Queues an event, or what an action tells; never waits. With the queue full it is dropped and counted."""
+        """Enqueues an event or a message of an action; never waits. With the queue full it is dropped and counted."""
         with self._changed:
             if len(self._events) >= self._capacity or self._stop.is_set():
                 self.dropped_events += 1
@@ -93,10 +93,12 @@ class Network:
             self._events.append((key, payload, encoding))
             self._changed.notify()
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
-        """Sends a query to all who answer it, and waits for their answers, at most so many seconds.
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
+        """Sends a query to everyone who answers it, and waits at most `timeout` seconds for the answers.
 
-        Raises NetworkError where there is no session, nobody answers in time, or an answer is an error.
+        Raises NetworkError if there is no session, no answer in time, or an error as answer.
         """
         member = self._member
         if member is None:
@@ -117,12 +119,12 @@ class Network:
         if errors:
             raise NetworkError(f"{selector}: {errors[0]}")
         if not answers:
-            raise NetworkError(f"{selector}: nobody answered within {timeout:g} s")
+            raise NetworkError(f"{selector}: no response within {timeout:g} s")
         return answers
 
     @property
     def joined(self) -> bool:
-        """Whether there is a session: samples come in as soon as somebody is connected."""
+        """Whether there is a session: samples arrive as soon as there is a connection."""
         return self._member is not None
 
     @property
@@ -133,20 +135,20 @@ class Network:
 
     @property
     def listens(self) -> bool:
-        """Whether others may come by themselves, and it need not connect to anybody."""
+        """Whether others may come by themselves, and it need not connect itself."""
         return self._config.mode is not ZenohMode.CLIENT
 
     @property
-    def standing(self) -> Standing:
-        """What is known of the certificates in use."""
+    def certificate_state(self) -> CertificateState:
+        """The state of the certificates in use."""
         renewal = self._renewal
-        return Standing() if renewal is None else renewal.standing
+        return CertificateState() if renewal is None else renewal.certificate_state
 
     @property
     def dead(self) -> str | None:
         """What has ended that never should, so that nothing comes in any more; None where all is alive.
 
-        A router that is away is no such thing: the session seeks it.
+        A router that is unavailable does not count: the session reconnects.
         """
         if self._stop.is_set() or not self._thread.ident:
             return None
@@ -177,7 +179,7 @@ class Network:
             self._tokens.close(timeout)
         if (left := len(self._events)) > 0:
             self.dropped_events += left
-            log.warning("%d events were not published: the network did not take them within %g s", left, timeout)
+            log.warning("%d events were not published: the network did not accept them within %g s", left, timeout)
 
     def _join(self, session: zenoh.Session, material: Material) -> Membership:
         return Membership(session, material, self._streams, self._config.liveliness, self._tally)
@@ -218,14 +220,14 @@ class Network:
             pump(inlet.bursts())
         except Exception as error:  # noqa: BLE001  this thread's edge: without it, the stream would be silent for ever
             if not self._stop.is_set():
-                log.critical("a stream's thread ended, nothing is received on it any more: %s", error)
+                log.critical("the thread of a stream ended; receiving from it has stopped: %s", error)
                 self._on_failure(error)
 
     def _run(self) -> None:
         try:
             self._serve()
         except Exception as error:  # noqa: BLE001  this thread's edge: without it, events would wait for ever
-            log.critical("the network thread ended, no event is published any more: %s", error)
+            log.critical("the network thread ended; publishing events has stopped: %s", error)
             self._on_failure(error)
 
     def _serve(self) -> None:
@@ -260,7 +262,7 @@ class Network:
             except zenoh.ZError as error:
                 before, member = member, self._successor(member)
                 if member is before:
-                    log.warning("event on %s was not published: %s", key, error)
+                    log.warning("cannot publish the event on %s: %s", key, error)
                     break
         self.dropped_events += 1
 

@@ -1,4 +1,4 @@
-"""Listens on a Zenoh network for a while, and says of each key what a survey of a recording says."""
+"""Listens on a Zenoh network for a while, and surveys each key as a recording is surveyed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ENCODINGS = {"application/json": Encoding.JSON, "application/cbor": Encoding.CB
 
 
 def listen(config: Zenoh, seconds: float) -> Survey:
-    """What comes on all keys within so many seconds. Raises NetworkError where there is no session."""
+    """The samples on all keys within `seconds`. Raises NetworkError if there is no session."""
     came: queue.SimpleQueue[tuple[int, zenoh.Sample]] = queue.SimpleQueue()
     topics: dict[str, Topic] = {}
     with open_session(config) as session:

@@ -71,7 +71,7 @@ def proposals(topics: Sequence[Topic]) -> list[Proposal]:
 
     Messages without a type are of one kind if they have the same fields. The clients' chunk is the first in which such
     keys differ; other keys with the same text there are of that client,
-    too. Where no key has a sibling, nothing tells the client from the rest.
+    too. Where no key has a sibling, nothing distinguishes the client from the rest.
     """
     places = _places(topics)
     grouped: dict[tuple[str, int | None, Encoding, str | None], list[Topic]] = {}

@@ -1,4 +1,4 @@
-"""Reads recordings once, and says of each key how much came, how regularly, and what the messages look like."""
+"""Reads recordings once, and reports for each key the amount, the regularity and the shape of its messages."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
 
     def note(engine: Engine) -> None:
         """Pass on what happened, and keep the tasks' new versions."""
-        host.tell(engine.consequences.take(engine.now))
+        host.dispatch(engine.consequences.take(engine.now))
         for name, task in outcome.tasks.items():
             if versions.get(name) is not task:
                 versions[name] = task
@@ -121,7 +121,7 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
             with lock:
                 played.outcomes.append((which, said))
 
-    host.outcomes.heard = heard
+    host.outcomes.on_outcome = heard
     entries = inlets(detector)
     replay: Replay | None = None
     try:
@@ -140,7 +140,7 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
         if replay is not None:
             replay.take((), batch[-1].received)
             note(replay.engine)
-            host.tell(replay.engine.consequences.cut(replay.engine.now, "the recording ends"))
+            host.dispatch(replay.engine.consequences.cut(replay.engine.now, "the recording ends"))
         _wait(host)
     finally:
         host.close()
@@ -191,5 +191,7 @@ class _Wire:
         if not key.startswith("wayside/"):  # what the detector tells of itself
             self.notices.append(Notice(key, json.loads(payload)))
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
         raise ActionError(f"nobody answers {selector}: the examples run without a network")

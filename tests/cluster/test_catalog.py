@@ -59,7 +59,7 @@ def test_a_rule_that_cannot_be_read_is_told_and_the_others_are_listed(
     assert answer.returncode == 0, answer.stderr
     assert [each["name"] for each in json.loads(answer.stdout)["rules"]] == ["battery"]
     told, summary = answer.stderr.splitlines()
-    assert told.startswith("left out, since it cannot be read: EventRule broken: spec.actions[0].deploy.parameters")
+    assert told.startswith("left out, because it cannot be read: EventRule broken: spec.actions[0].deploy.parameters")
     assert summary == "1 of 1 rules"
 
 
@@ -69,6 +69,7 @@ def test_who_may_not_list_rules_is_told_so_in_one_line(control_plane: ControlPla
     assert answer.returncode == 2
     assert answer.stdout == ""
     assert answer.stderr == (
-        f"detector: the EventRules of namespace {namespace} cannot be listed: 401 Unauthorized: Unauthorized. "
-        "Check that KUBECONFIG leads to the right cluster, and that its account may list eventrules.wayside.dev there\n"
+        f"detector: cannot list the EventRules of namespace {namespace}: 401 Unauthorized: Unauthorized. "
+        "Check that KUBECONFIG points to the right cluster, and that its account may list "
+        "eventrules.wayside.dev there\n"
     )

@@ -93,7 +93,7 @@ def test_a_client_whose_poses_cannot_be_read_or_make_no_sense_harms_nobody_else(
             chain,
             vehicles,
             senseless,
-            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: no CDR of geometry_msgs",
+            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: not CDR of geometry_msgs",
             r"a sample had no position for EventRule close; the last: [xy] of van1 is ",
         )
 
@@ -109,7 +109,7 @@ def test_json_of_the_wrong_shape_harms_nobody_else(chain: Chain) -> None:
             chain,
             vehicles,
             in_turn(*(text.encode for text in shapes)),
-            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: (no JSON|JSON nested)",
+            r"a sample of stream pose could not be read; the last: vehicles/van1/pose: (not JSON|JSON nested)",
             r"evaluation errors in EventRule close; the last: ",
             r"a sample had no position for EventRule close; the last: x of van1 is absent",
         )
@@ -144,7 +144,9 @@ def test_with_clock_data_a_client_whose_clock_is_ahead_harms_nobody_else(chain: 
         vehicles.place(VANS, NEAR)
         chain.wait_events(VANS, "started")
         vehicles.instead("van1", from_the_future)
-        running.wait_for_output(r"stamps being ahead of the rest; the last: van1 is 3[56]\d\d(\.\d+)? s ahead")
+        running.wait_for_output(
+            r"because their stamps are ahead of the rest; the last: van1 is 3[56]\d\d(\.\d+)? s ahead"
+        )
         vehicles.place(BUSES, NEAR)  # time goes on, by the others' stamps
         chain.wait_events(BUSES, "started")
 
@@ -229,7 +231,7 @@ def refusal(chain: Chain, of_rule: str) -> Object:
     ("arguments", "said"),
     [
         (["run"], "give either --detector FILE and --rules FILE, or --name NAME"),
-        (["run", "--name", HOLDER, "--rules", "rules.yaml"], "--rules goes with --detector"),
+        (["run", "--name", HOLDER, "--rules", "rules.yaml"], "--rules requires --detector"),
         (["run", "--detector", "nowhere.yaml"], "nowhere.yaml"),
         (["replay", "nowhere.mcap", "--output", "out"], "give --detector FILE and --rules FILE"),
         (["chek"], "No such command"),

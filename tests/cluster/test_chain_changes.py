@@ -115,7 +115,7 @@ def test_a_detector_that_is_changed_to_a_wrong_one_goes_on_as_before(chain: Chai
         wrong = detector(chain.endpoint)
         wrong["spec"]["streams"][0] |= change
         chain.apply(wrong)
-        running.wait_for_output(rf"Detector {HOLDER} is not followed.*spec\.streams\[0\]\.{field}: ")
+        running.wait_for_output(rf"cannot apply the new Detector {HOLDER}.*spec\.streams\[0\]\.{field}: ")
     vehicles.place(VANS, NEAR)
     chain.wait_deployed(VANS)
     chain.apply(detector(chain.endpoint, clientTimeout="20m"))

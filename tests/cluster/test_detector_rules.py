@@ -136,7 +136,7 @@ def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
     following.wait_rules("sound")
     wait_until(lambda: following.rules.problems, bool, what="the problem is known")
     assert "not-an-identifier" in following.rules.problems["EventRule broken"]
-    assert "EventRule broken cannot be read" in caplog.text
+    assert "cannot read the EventRule broken" in caplog.text
     api.patch("EventRule", "broken", {"spec": {"actions": []}})
     following.wait_rules("broken", "sound")
     assert following.rules.problems == {}

@@ -27,7 +27,7 @@ class Nobody:
     def publish(self, *_: Any) -> None:
         raise AssertionError("the database action publishes nothing")
 
-    def ask(self, *_: Any) -> list[bytes]:
+    def query(self, *_: Any) -> list[bytes]:
         raise AssertionError("the database action asks nobody")
 
 

@@ -14,7 +14,7 @@ import zenoh
 from prometheus_client.parser import text_string_to_metric_families
 
 from detector.status.model import Status, read_status
-from detector.streams.asking import NoAnswerError, ask
+from detector.streams.querying import NoAnswerError, query_detectors
 from tests import programs
 from tests.driving import a_detector
 from tests.networks import session
@@ -61,7 +61,7 @@ class Process:
         end, status = time.monotonic() + PATIENCE, None
         while time.monotonic() < end:
             try:
-                (answer,) = ask(self.network, self.name, "status", {}, 5)
+                (answer,) = query_detectors(self.network, self.name, "status", {}, 5)
             except (NoAnswerError, ValueError):  # it is just starting
                 time.sleep(0.05)
                 continue

@@ -108,14 +108,14 @@ def test_renewals_under_load_lose_nothing_and_give_nothing_twice(
             wait_for(subscriber_known)
             for renewal in range(1, 6):
                 authority.mount(mounted, "detector")
-                wait_for(lambda renewal=renewal: running.standing.renewals == renewal)
+                wait_for(lambda renewal=renewal: running.certificate_state.renewals == renewal)
             before = len(arrivals.seen)
             wait_for(lambda: len(arrivals.seen) > before + 300)
         arrivals.wait_for(lambda _: all(numbers(arrivals, car)[-1:] == [traffic.sent - 1] for car in CARS))
         for car in CARS:
             came = numbers(arrivals, car)
             assert came == list(range(came[0], traffic.sent)), f"{car}: each once, in order"
-        assert running.standing.problem == ""
+        assert running.certificate_state.problem == ""
         assert running.dead is None
 
 
@@ -138,22 +138,22 @@ def test_a_certificate_that_the_router_does_not_take_leaves_the_session_alone(
         stranger = Authority(tmp_path, "stranger").sign("detector")
         foreign = {"tls.crt": stranger[0].read_bytes(), "tls.key": stranger[1].read_bytes()}
         authority.change(mounted, foreign)
-        wait_for(lambda: "no session as client" in running.standing.problem)
+        wait_for(lambda: "cannot open a session as client" in running.certificate_state.problem)
         authority.change(mounted, {"tls.crt": b"nonsense", "tls.key": foreign["tls.key"]})
-        wait_for(lambda: "are no certificate and key" in running.standing.problem)
+        wait_for(lambda: "are not a certificate and a key" in running.certificate_state.problem)
         authority.change(mounted, foreign | {"tls.key": authority.sign("other")[1].read_bytes()})
-        wait_for(lambda: "is not the key of" in running.standing.problem)
+        wait_for(lambda: "is not the key of" in running.certificate_state.problem)
         authority.mount(mounted, "detector", lasting=datetime.timedelta(seconds=-60))
-        wait_for(lambda: "expired" in running.standing.problem)
-        assert running.standing.renewals == 0
+        wait_for(lambda: "expired" in running.certificate_state.problem)
+        assert running.certificate_state.renewals == 0
         before = len(arrivals.seen)
         wait_for(lambda: len(arrivals.seen) > before + 10)
-        assert "the session of before goes on" in caplog.text
+        assert "keeping the current session" in caplog.text
         assert "PRIVATE KEY" not in caplog.text
         authority.mount(mounted, "detector", lasting=datetime.timedelta(days=30))
-        wait_for(lambda: running.standing.renewals == 1)
-        assert running.standing.problem == ""
-        assert (running.standing.expires or 0) > time.time() + 20 * 86400
+        wait_for(lambda: running.certificate_state.renewals == 1)
+        assert running.certificate_state.problem == ""
+        assert (running.certificate_state.expires or 0) > time.time() + 20 * 86400
     for car in CARS:
         came = numbers(arrivals, car)
         assert came == list(range(came[0], came[-1] + 1))
@@ -180,7 +180,7 @@ def test_a_certificate_to_which_the_router_gives_nothing_leaves_the_session_alon
     ):
         wait_for(lambda: bool(arrivals.seen))
         authority.mount(mounted, "renamed")
-        wait_for(lambda: "nothing is received" in running.standing.problem)
+        wait_for(lambda: "nothing is received" in running.certificate_state.problem)
         before = len(arrivals.seen)
         wait_for(lambda: len(arrivals.seen) > before + 10)
     for car in CARS:
@@ -205,7 +205,7 @@ def test_tokens_and_latched_samples_are_told_of_once(
         goes = source.liveliness().declare_token("alive/car2")
         arrivals.wait_for(lambda seen: len(seen) >= 3)
         authority.mount(mounted, "detector")
-        wait_for(lambda: running.standing.renewals == 1)
+        wait_for(lambda: running.certificate_state.renewals == 1)
         goes.undeclare()
         arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car2", Token.DROPPED.value) in seen)
         publisher.put("second")
@@ -233,14 +233,14 @@ def test_a_detector_that_listens_opens_its_session_anew_and_stays_as_it_was_with
 
             def is_renewed() -> bool:
                 running.publish("wayside/events/d/r/s", b"{}")
-                return running.standing.renewals == 1
+                return running.certificate_state.renewals == 1
 
             wait_for(is_renewed)
             before = len(arrivals.seen)
             wait_for(lambda: len(arrivals.seen) > before + 10)
-            assert "what was sent meanwhile is lost" in caplog.text
+            assert "samples sent in the meantime are lost" in caplog.text
             authority.change(mounted, {"tls.crt": b"nonsense", "tls.key": b"nonsense"})
-            wait_for(lambda: "are no certificate and key" in running.standing.problem)
+            wait_for(lambda: "are not a certificate and a key" in running.certificate_state.problem)
             before = len(arrivals.seen)
             wait_for(lambda: len(arrivals.seen) > before + 10)
         for car in CARS:
@@ -258,7 +258,7 @@ def test_a_router_that_is_away_does_not_keep_a_renewal_from_coming_later(
             wait_for(lambda: running.connected)
         wait_for(lambda: not running.connected)
         authority.mount(mounted, "detector")
-        wait_for(lambda: "no session as client" in running.standing.problem)
+        wait_for(lambda: "cannot open a session as client" in running.certificate_state.problem)
         assert running.dead is None
         with guarded_router(at, authority) as source:
 
@@ -268,4 +268,4 @@ def test_a_router_that_is_away_does_not_keep_a_renewal_from_coming_later(
 
             wait_for(arrived)
             authority.mount(mounted, "detector")
-            wait_for(lambda: running.standing.renewals == 1, PATIENCE * 2)
+            wait_for(lambda: running.certificate_state.renewals == 1, PATIENCE * 2)

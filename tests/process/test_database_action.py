@@ -187,7 +187,7 @@ def test_a_file_that_cannot_be_written_costs_the_scenarios_completeness(
     keep.finish(episode)
     outcome = keep.outcome()
     assert (outcome.state, outcome.missing) == (OutcomeState.FAILED, 1)
-    assert database["raw/blob"].find_one()["filesMissing"][0]["error"].startswith("a file could not be written")
+    assert database["raw/blob"].find_one()["filesMissing"][0]["error"].startswith("cannot write a file")
     assert scenario(database)["complete"] is False
 
 
@@ -239,5 +239,5 @@ def test_two_detectors_cannot_share_a_spool(desk: MakeDesk, tmp_path: Path, monk
     monkeypatch.setenv("OTHER_URI", "mongodb://127.0.0.1:1/")
     place = {"uriVariable": "OTHER_URI", "spool": {"path": str(tmp_path / "spool"), "bytes": "1Mi"}}
     other = Desk(place, "other")
-    with pytest.raises(ActionError, match=r"spec.database.spool.path: .* is used by another process"):
+    with pytest.raises(ActionError, match=r"spec.database.spool.path: another process uses"):
         other.begin()

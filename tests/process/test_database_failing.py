@@ -79,7 +79,7 @@ def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
     before.take(open_one, speeds(10))
     before.finish(episode)
     before.close()
-    assert "waits in the spool" in before.outcome("e1").message
+    assert "stay in the spool" in before.outcome("e1").message
     way.restore()
     after = desk(spool=2**26)
     wait_until(lambda: scenario_or_none(database, "e2.keep").get("state") == "Interrupted")
@@ -174,7 +174,7 @@ def test_open_episodes_say_that_the_database_is_away(desk: MakeDesk, way: Way) -
     def told(away: bool) -> bool:
         keep.take(episode, speeds(1000))
         last = keep.last()
-        return last is not None and last.message.startswith("the database is away") is away
+        return last is not None and last.message.startswith("the database is unavailable") is away
 
     wait_until(lambda: told(True))
     way.restore()

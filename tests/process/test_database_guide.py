@@ -118,12 +118,12 @@ class Drive:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         self.published.append(json.loads(payload))
 
-    def ask(self, *_: Any) -> list[bytes]:
+    def query(self, *_: Any) -> list[bytes]:
         raise AssertionError("the database action asks nobody")
 
     def take(self, samples: list[Any], until: float) -> None:
         self.engine.advance(samples, at(until))
-        self.host.tell(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.take(self.engine.now))
 
 
 def odometry(seconds: float, number: int, v: float) -> Any:

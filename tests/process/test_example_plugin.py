@@ -24,7 +24,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_before_it_is_installed_it_is_missed() -> None:
-    with pytest.raises(RefusedError, match=r"plugin\.name: no plugin stop-and-go is installed here"):
+    with pytest.raises(RefusedError, match=r"plugin\.name: no plugin stop-and-go is installed"):
         run(RULES, DETECTOR, DRIVE)
 
 

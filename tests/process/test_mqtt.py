@@ -36,7 +36,7 @@ def mqtt(
     try:
         yield thread
     finally:
-        thread.tell_to_stop()
+        thread.request_stop()
         thread.join(PATIENCE)
     assert thread.state is State.STOPPED
 
@@ -90,7 +90,7 @@ def test_over_tls_with_a_password(
         with mqtt(arrivals, Tally(), **given) as thread:
             wait_for(lambda: "MQTT_PASSWORD is not set" in thread.last_error)
             monkeypatch.setenv("MQTT_PASSWORD", "close sesame")
-            wait_for(lambda: "refuses the connection" in thread.last_error)
+            wait_for(lambda: "refused the connection" in thread.last_error)
             monkeypatch.setenv("MQTT_PASSWORD", PASSWORD)
             with publisher(port, str(authority.ca)) as client:
                 publish_until(client, "vehicles/car1/pose", lambda: arrivals.seen)

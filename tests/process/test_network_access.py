@@ -145,7 +145,7 @@ def test_only_the_right_password_opens_a_router_that_asks_for_one(
         with network(arrivals, mode="client", connect=[endpoint], credentials=credentials) as wrong:
             assert not flows(source, arrivals, within=1)
             assert not wrong.connected
-            wait_for(lambda: "no session" in caplog.text)
+            wait_for(lambda: "cannot open a session" in caplog.text)
         monkeypatch.setenv("ZENOH_PASSWORD", "open sesame")
         with network(arrivals, mode="client", connect=[endpoint], credentials=credentials):
             assert flows(source, arrivals)
@@ -216,7 +216,7 @@ def test_a_killed_router_is_said_and_so_is_its_return(
             wait_for(lambda: running.connected)
             arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", Token.DECLARED.value) in seen)
         wait_for(lambda: not running.connected)
-        wait_for(lambda: "is lost, nobody is connected" in caplog.text)
+        wait_for(lambda: "and no other is left" in caplog.text)
         arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", Token.UNSURE.value) in seen)
         arrivals.seen.clear()
         with router_process(endpoint):
@@ -224,7 +224,7 @@ def test_a_killed_router_is_said_and_so_is_its_return(
             arrivals.seen.clear()
             assert flows(vehicle, arrivals)
             wait_for(lambda: running.connected)
-            wait_for(lambda: "connected again" in caplog.text)
+            wait_for(lambda: "reconnected" in caplog.text)
         token.undeclare()
         vehicle.close()
 
@@ -263,7 +263,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
 @pytest.mark.parametrize(
     ("given", "problem"),
     [
-        ({"tls": {"ca": "missing.crt"}}, "spec.zenoh.tls.ca: missing.crt cannot be read: No such file"),
+        ({"tls": {"ca": "missing.crt"}}, "spec.zenoh.tls.ca: cannot read missing.crt: No such file"),
         ({"tlsSecret": "absent"}, "spec.zenoh.tlsSecret: the Secret absent is not mounted at"),
         (
             {"credentials": {"username": "u", "passwordVariable": "WAYSIDE_UNSET"}},
@@ -271,7 +271,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
         ),
         (
             {"credentials": {"username": "u", "passwordFile": "missing"}},
-            "spec.zenoh.credentials.passwordFile: missing cannot be read",
+            "spec.zenoh.credentials.passwordFile: cannot read missing",
         ),
     ],
 )
@@ -302,11 +302,11 @@ def test_a_secret_is_a_folder_and_a_password_is_never_shown(tmp_path: Path, monk
     folder.mkdir()
     (folder / "username").write_text("detector\n")
     access = Access.model_validate({"credentialsSecret": "login", "tlsSecret": "login"})
-    with pytest.raises(AccessError, match="password cannot be read"):
+    with pytest.raises(AccessError, match=r"cannot read .*password"):
         login(access, "spec.zenoh")
     (folder / "password").write_text("sesame\n")
     found = login(access, "spec.zenoh")
     assert found == Login("detector", "sesame")
     assert "sesame" not in repr(found)
-    with pytest.raises(AccessError, match=r"spec\.zenoh\.tlsSecret: .*ca\.crt cannot be read"):
+    with pytest.raises(AccessError, match=r"spec\.zenoh\.tlsSecret: cannot read .*ca\.crt"):
         tls_files(access, "spec.zenoh")

@@ -16,7 +16,7 @@ from tests.http_servers import Endpoint, answers, hangs, holds
 from tests.notifying import a_desk, an_episode
 from wayside.times import parse_time
 
-NOBODY = "alerts that nobody heard of"
+NOBODY = "alerts that reached nobody"
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +104,7 @@ def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(th
     first, second = posted(there, 2)
     assert parse_time(first["endsAt"]) > parse_time(second["endsAt"])
     failed = desk.outcome("e1", OutcomeState.FAILED)
-    assert "heard of only when it was over" in failed.message
+    assert "accepted only after the episode had ended" in failed.message
     assert desk.lost[NOBODY] == 1
     desk.end()
 
@@ -127,7 +127,7 @@ def test_what_is_over_and_refused_is_a_dead_letter(there: Endpoint, tmp_path: Pa
     there.behaviour = answers(400, b"bad label")
     desk = a_desk(notify(there), state=tmp_path)
     desk.action.started(open_of(an_episode()))
-    desk.until(lambda: desk.lost["times that alerts were refused"])
+    desk.until(lambda: desk.lost["alerts rejected by the Alertmanager"])
     desk.action.ended(an_episode())
     assert desk.outcome("e1", OutcomeState.FAILED).message == "not delivered: answered 400: bad label"
     (file,) = (tmp_path / "notify").glob("*.dead.jsonl")
@@ -140,7 +140,7 @@ def test_more_alerts_than_may_be_are_dead_letters(there: Endpoint) -> None:
     desk = a_desk(notify(there) | {"waiting": 2})
     for number in range(3):
         desk.action.started(open_of(an_episode(f"e{number}")))
-    assert "more messages wait" in desk.outcome("e2", OutcomeState.FAILED).message
+    assert "the queue is full" in desk.outcome("e2", OutcomeState.FAILED).message
     desk.end()
 
 

@@ -26,7 +26,7 @@ from tests.http_servers import (
 from tests.networks import session
 from tests.notifying import a_desk, an_episode
 
-LOST = "events that nobody was told of"
+LOST = "events not delivered to any target"
 
 
 @pytest.fixture(autouse=True)
@@ -173,7 +173,7 @@ def test_who_tells_does_not_wait_for_an_endpoint_that_hangs(there: Endpoint) -> 
     desk.run(*(an_episode(f"e{number}") for number in range(1, 200)))
     assert time.monotonic() - begun < 20
     assert desk.lost[LOST] == 197  # three wait, one of them being sent
-    assert "more messages wait than the rule allows" in desk.outcome("e199", OutcomeState.FAILED).message
+    assert "the queue is full" in desk.outcome("e199", OutcomeState.FAILED).message
     begun = time.monotonic()
     desk.end()
     assert time.monotonic() - begun < 20, "the end does not wait for the endpoint either"
@@ -254,7 +254,7 @@ def test_what_cannot_be_delivered_by_the_end_is_delivered_after_the_next_start(t
     there.received(1)
     first.end()
     assert not first.lost
-    assert "after the detector's next start" in first.outcomes[-1][1].message
+    assert "after its next start" in first.outcomes[-1][1].message
     there.requests.clear()
     there.behaviour = answers(200)
     second = a_desk(notify, state=tmp_path)

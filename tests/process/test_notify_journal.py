@@ -111,11 +111,11 @@ def test_the_file_does_not_grow_with_what_is_dropped(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_said_and_costs_only_the_keeping(tmp_path: Path) -> None:
     (tmp_path / "notify").write_text("a file where a folder should be")
-    with pytest.raises(JournalError, match="cannot be written"):
+    with pytest.raises(JournalError, match="cannot write"):
         Journal(tmp_path / "notify", "j")
     with endpoint() as there:
         desk = a_desk({"http": {"url": there.url}}, state=tmp_path)
-        assert desk.lost["events that would not survive the detector's end"] == 1
+        assert desk.lost["events that would not survive a restart"] == 1
         desk.end()
 
 

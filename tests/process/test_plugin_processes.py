@@ -79,7 +79,7 @@ def test_one_that_ends_is_told_and_the_others_go_on(host: ProcessHost) -> None:
     assert drive.take(until=6) == ["z a started 5"]
     counters = drive.engine.counters.rule("r")
     assert counters.errors == 1
-    assert counters.last_error.startswith("signal p: plugin counting: its process ended by itself; it is stopped")
+    assert counters.last_error.startswith("signal p: plugin counting: its process exited; stopped")
     assert counters.unknowns == 3 + 4  # the signal's, and those of the condition
 
 
@@ -94,7 +94,7 @@ def test_one_that_hangs_is_stopped_and_told(caplog: pytest.LogCaptureFixture) ->
         assert drive.take(until=4) == ["z a started 3"]
         assert process is not None
         assert process.returncode is not None
-        assert "its process gave no value in time; it is stopped" in caplog.text
+        assert "its process did not return a value in time; stopped" in caplog.text
         assert "EventRule r, signal p, plugin counting" in caplog.text
 
 
@@ -107,7 +107,7 @@ def test_live_it_is_started_again_after_a_pause_three_times() -> None:
             drive.take(arrival(start * 100 + 50, "a", {"v": 7}), until=start * 100 + 51)
             assert host._signals["r", "p"]._process is None
             clock.now += pause
-        assert "stays stopped until its rule changes" in host._signals["r", "p"].why
+        assert "stopped until the rule changes" in host._signals["r", "p"].why
         drive.take(until=500)
         assert host._signals["r", "p"]._process is None
 
@@ -130,7 +130,7 @@ def test_what_did_not_run_is_the_same_when_it_is_told_beforehand() -> None:
         live.take(until=7)
         wait_for_it(host, live, 7)
         live.take(until=14)
-        told = host.outages.news()
+        told = host.outages.take_changes()
     assert [(each["call"], each["running"]) for each in told][:2] == [(1, False), (2, True)]
     assert len(told) == 4
     again = [arrival(0.5, "a", {"v": 1}), *some_arrivals(), arrival(7.5, "a", {"v": 1})]
@@ -138,7 +138,7 @@ def test_what_did_not_run_is_the_same_when_it_is_told_beforehand() -> None:
         replayed = PluginDrive(a_detector(), rule, host=host)
         for each, until in ((again[:1], 1), (again[1:-1], 7), (again[-1:], 14)):
             replayed.take(*each, until=until)
-        assert host.outages.news() == []
+        assert host.outages.take_changes() == []
     assert live.events
     assert values(live.events) == values(replayed.events)
 

@@ -221,10 +221,10 @@ def test_the_reserve_keeps_the_disk_from_getting_full(small_disk: Path) -> None:
 def test_a_disk_that_is_full_from_the_start_is_told(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(small_disk)
     (small_disk / "filler").write_bytes(bytes(4 * 2**20))
-    with pytest.raises(ActionError, match=r"cannot begin: the disk would have less than 0 left free"):
+    with pytest.raises(ActionError, match=r"cannot start the recording: less than 0 of the disk would be free"):
         bench.action.started(an_episode())
     somebody_else_fills_the_disk(monkeypatch)
-    with pytest.raises(ActionError, match=r"cannot begin: writing failed: .*No space left on device"):
+    with pytest.raises(ActionError, match=r"cannot start the recording: writing failed: .*No space left on device"):
         bench.action.started(an_episode())
     assert sorted(each.name for each in small_disk.rglob("*")) == ["filler", "r"]
 
@@ -252,7 +252,7 @@ def test_a_write_error_costs_that_recording_only(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     bench = Bench(tmp_path / "file")
-    with pytest.raises(ActionError, match="the recording cannot begin: writing failed"):
+    with pytest.raises(ActionError, match="cannot start the recording: writing failed"):
         bench.action.started(an_episode())
     assert bench.action.wake() is not None
 
@@ -289,13 +289,13 @@ def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
     begun = Event("h", "r", "car1", ("car1",), "episode1", at(1), at(1), None, None, {}, None)
     points = [a_sample(1 + k / 10, "points", MEGABYTE) for k in range(8)]
     begin = time.monotonic()
-    worker.tell(Begun(run, begun, Rendered(), resumed=False))
+    worker.enqueue(Begun(run, begun, Rendered(), resumed=False))
     for sample in points:
-        worker.tell(Sampled(run, [sample]))
-    worker.tell(Completed(run))
+        worker.enqueue(Sampled(run, [sample]))
+    worker.enqueue(Completed(run))
     assert time.monotonic() - begin < 30  # the disk stands still for twice as long
     go_on.set()
-    worker.tell_to_close()
+    worker.request_close()
     assert worker.join(60)
     tally = outcomes.tallies()[which]
     assert (tally.failed, tally.samples, tally.missing) == (1, 5, 3)
@@ -320,7 +320,7 @@ def test_what_the_disk_did_not_confirm_waits_for_the_next_start(
         bench.action.completed(an_episode(), Completion())
     outcome = bench.outcome(an_episode())
     assert outcome.state is OutcomeState.FAILED
-    assert "cannot be completed, the next start tries again: [Errno 5] Input/output error" in outcome.message
+    assert "cannot complete the recording; the next start retries: [Errno 5] Input/output error" in outcome.message
     assert [each.name[0] for each in (tmp_path / "r").iterdir()] == ["."]
     place = Destination(Recordings.model_validate({"path": str(tmp_path)}))
     (kept,) = recover(place, place.take_left())

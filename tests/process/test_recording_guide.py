@@ -14,7 +14,7 @@ import yaml
 
 from detector.checking import check_documents
 from detector.status.model import read_status
-from detector.streams.asking import ask
+from detector.streams.querying import query_detectors
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import mcap_files, metadata_of, read_with_mcap
 from wayside.api import EventRule
@@ -63,7 +63,7 @@ def until_evaluated(process: Process, speed: float) -> None:
     while seen != [speed]:
         assert time.monotonic() < end, seen
         asked = {"rule": "threshold", "subject": "car1", "wait": "30"}
-        (answer,) = ask(process.network, process.name, "status", asked, PATIENCE)
+        (answer,) = query_detectors(process.network, process.name, "status", asked, PATIENCE)
         explanation = read_status(answer.payload).explanation
         assert explanation is not None
         seen = [each.values.get("speed") for each in explanation.subjects]

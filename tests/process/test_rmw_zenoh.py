@@ -171,13 +171,13 @@ def test_a_key_of_another_type_is_dropped_counted_and_said(receiver: Receiver, v
     (arrival,) = drained(receiver, 1)
     assert arrival.payload == b"last"
     wait_for(lambda: receiver.counted(Cause.MISFIT) == 2)
-    (line,) = [line for line in receiver.losses() if "not being the stream's" in line]
-    assert "town/vehicles/car1/pose/on/foot does not read <domain>/<topic>" in line
+    (line,) = [line for line in receiver.losses() if "do not match the stream" in line]
+    assert "town/vehicles/car1/pose/on/foot is not of the form <domain>/<topic>" in line
     Node(vehicle, "vehicles/car1/pose", type_name="nav_msgs/msg/Odometry").publish(cdr(odometry()))
     wait_for(lambda: receiver.counted(Cause.MISFIT) == 3)
-    (line,) = [line for line in receiver.losses() if "not being the stream's" in line]
+    (line,) = [line for line in receiver.losses() if "do not match the stream" in line]
     assert line.startswith("3 samples of stream pose dropped")
-    assert f"vehicles/car1/pose is nav_msgs/msg/Odometry, but the stream's type is {POSE_TYPE}" in line
+    assert f"vehicles/car1/pose is of type nav_msgs/msg/Odometry, but the type of the stream is {POSE_TYPE}" in line
 
 
 @pytest.mark.parametrize("receiver", [{"domain": 7}], indirect=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from detector.status.model import RuleState, Status, read_status
-from detector.streams.asking import NoAnswerError, ask
+from detector.streams.querying import NoAnswerError, query_detectors
 from tests import programs
 from tests.driving import a_rule, a_stream
 from tests.process.running import PATIENCE, Process
@@ -48,16 +48,18 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
     assert [client.name for client in status.clients] == ["car1", "car2"]
     metrics = process.metrics()
     assert metrics["stream_samples_total", "speed"] == 101
-    (answer,) = ask(process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "30"}, PATIENCE)
+    (answer,) = query_detectors(
+        process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "30"}, PATIENCE
+    )
     told = read_status(answer.payload).explanation
     assert told is not None
     assert [(each.subject, each.when, each.values) for each in told.subjects] == [("car2", False, {"v": 1.0})]
     with pytest.raises(NoAnswerError, match="detector d has no rule slow; it has fast"):
-        ask(process.network, "d", "status", {"rule": "slow"}, PATIENCE)
+        query_detectors(process.network, "d", "status", {"rule": "slow"}, PATIENCE)
     assert metrics["rule_episodes_open", "fast"] == 1
     assert metrics["process_resident_memory_bytes",] > 0
-    assert "looked" in process.page("/healthz")
-    assert "looked" in process.page("/readyz")
+    assert "the last evaluation" in process.page("/healthz")
+    assert "the last evaluation" in process.page("/readyz")
 
 
 def test_a_rule_is_asked_paused_and_resumed_by_commands(process: Process) -> None:
@@ -96,7 +98,7 @@ def test_rules_and_streams_change_without_losing_buffer_or_episodes(process: Pro
     process.change(FAST, broken, streams=more)
     refused = process.status_when(lambda s: s.rules[1].state == "Refused")
     assert refused.rules[1].open == 1
-    assert "goes on as it last was" in refused.rules[1].message
+    assert "keeping its last good version" in refused.rules[1].message
     (process.folder / "rules.yaml").write_text("no: [yaml")
     process.process.send_signal(signal.SIGHUP)
     process.send("car2", {"v": 1})

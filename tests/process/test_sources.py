@@ -20,7 +20,7 @@ from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.running import Running
 from detector.sources import Feed, Source
-from detector.sources.registry import OFFERS, plugin_problems
+from detector.sources.registry import OFFERS, source_problems
 from detector.sources.supervision import Sources, SourceThread, State
 from detector.streams.tally import Cause, Tally
 from tests.driving import a_detector, a_stream
@@ -154,7 +154,7 @@ def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, a
         return sum(entry.count for entry in tally.entries() if entry.cause is Cause.FAILED)
 
     wait_for(lambda: failures() >= 3)
-    thread.tell_to_stop()
+    thread.request_stop()
     thread.join(PATIENCE)
     assert thread.state is State.STOPPED
     assert thread.last_error == error
@@ -167,7 +167,7 @@ def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_take
     Hanging.ended.clear()
     thread = a_thread("hanging", arrivals, tally)
     assert Hanging.began.wait(PATIENCE)  # what is told to stop before it runs, ends
-    thread.tell_to_stop()
+    thread.request_stop()
     thread.join(0.05)
     assert [(entry.cause, entry.count) for entry in tally.entries()] == [(Cause.LEFT_BEHIND, 1)]
     Hanging.ended.set()
@@ -216,19 +216,19 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
             )
 
     asyncio.run(live())
-    assert "is not followed, the last good one goes on: spec.sources[0].plugin: no plugin unknown" in caplog.text
+    assert "keeping the last good one: spec.sources[0].plugin: no plugin unknown" in caplog.text
 
 
 @pytest.mark.parametrize(
     ("source", "problem"),
     [
-        ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed here; did you mean once?"),
+        ({"plugin": "onec"}, "spec.sources[0].plugin: no plugin onec is installed; did you mean once?"),
         (
             {"plugin": "unmet"},
-            "spec.sources[0].plugin: plugin unmet cannot be loaded: ModuleNotFoundError: No module named",
+            "spec.sources[0].plugin: cannot load plugin unmet: ModuleNotFoundError: No module named",
         ),
-        ({"plugin": "absent"}, "spec.sources[0].plugin: plugin absent cannot be loaded: AttributeError"),
-        ({"plugin": "noparameters"}, "which is no complete detector.sources.base.Source"),
+        ({"plugin": "absent"}, "spec.sources[0].plugin: cannot load plugin absent: AttributeError"),
+        ({"plugin": "noparameters"}, "which is not a complete detector.sources.base.Source"),
         (
             {"plugin": "unfinished"},
             "spec.sources[0].plugin: plugin unfinished: give tests.process.test_sources:Unfinished a",
@@ -241,7 +241,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
     ],
 )
 def test_what_is_wrong_with_a_source_is_told_with_its_field(source: dict[str, Any], problem: str) -> None:
-    found = [str(each) for each in plugin_problems(a_detector_of({"name": "s", **source}))]
+    found = [str(each) for each in source_problems(a_detector_of({"name": "s", **source}))]
     assert len(found) == 1
     assert problem in found[0]
 

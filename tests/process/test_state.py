@@ -168,7 +168,7 @@ def test_a_broken_file_is_said_and_set_aside(
     state = StateFile(tmp_path, "default", "h")
     with caplog.at_level(logging.ERROR):
         assert state.load() == []
-    assert "set aside as" in caplog.text
+    assert "set it aside as" in caplog.text
     assert state.set_aside == 1
     (aside,) = tmp_path.glob("*.unreadable-*")
     assert aside.read_bytes() == broken
@@ -190,7 +190,7 @@ def test_a_disk_that_refuses_is_said_once_and_the_newest_is_written_later(
         failures = state.failures
         state.save(before[:1])
         wait_for(lambda failures=failures: state.failures > failures, "a write fails")
-    assert caplog.text.count("the state cannot be written") == 1
+    assert caplog.text.count("cannot write the state") == 1
     draft.rmdir()
     state.save(before)
     state.close()
@@ -284,7 +284,9 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
         process.wait()
     car.close()
     with running(tmp_path, "--record-intake", str(tmp_path / "intake.mcap")) as process:
-        wait_for(lambda: b"1 open episodes of the state volume" in (tmp_path / "log").read_bytes(), "it is back")
+        wait_for(
+            lambda: b"restored 1 open episodes from the state volume" in (tmp_path / "log").read_bytes(), "it is back"
+        )
         car = Car(endpoint)
         car.value = 3.0
         car.wait_for(lambda: len(events_in(events)) == 2 and not kept(), "the episode ends")
@@ -302,6 +304,6 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
 def test_a_folder_that_cannot_be_made_is_said_with_its_field(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     detector = a_detector(state={"path": str(tmp_path / "file" / "state")})
-    with pytest.raises(OSError, match=r"spec\.state\.path: .*/file/state cannot be written \(Not a directory\): give"):
+    with pytest.raises(OSError, match=r"spec\.state\.path: cannot write .*/file/state \(Not a directory\): give"):
         state_file(detector, "h")
     assert state_file(a_detector(), "h") is None

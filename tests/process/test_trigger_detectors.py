@@ -208,15 +208,15 @@ def test_what_is_not_allowed_is_refused(rsu: Peer, town: Peer) -> None:
     refused = asked(rsu.endpoint, RecordingRequest(do="start", id="x", streams=["poes"]))
     assert (refused.state, refused.message) == (
         Progress.REFUSED,
-        "stream poes is none that may be recorded here: there is pose, speed",
+        "stream poes may not be recorded here; permitted are pose, speed",
     )
     refused = asked(rsu.endpoint, RecordingRequest(do="start", id="x"), "town")
-    assert refused.message.startswith("this detector records nothing on request")
+    assert refused.message.startswith("this detector accepts no recording requests")
     for number in range(8):
         assert asked(rsu.endpoint, RecordingRequest(do="start", id=f"x{number}")).state is Progress.RECORDING
     full = asked(rsu.endpoint, RecordingRequest(do="start", id="x8"))
-    assert full.message == "8 recordings are under way, as many as recordings.onRequest.maximumRecordings allows"
-    with pytest.raises(ValueError, match="start which recording"):
+    assert full.message == "8 recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
+    with pytest.raises(ValueError, match="start: give the id of the recording"):
         asked(rsu.endpoint, RecordingRequest(do="start"))
 
 
@@ -273,11 +273,11 @@ def test_nobody_who_records_costs_only_the_recording(endpoint: str, tmp_path: Pa
     town.start()
     town.send("car1", {"v": 20})
     status = town.status_when(lambda status: any(each.running == 1 and each.current for each in status.actions))
-    assert "nobody answered" in next(iter(status.actions[0].current.values()))
+    assert "no response" in next(iter(status.actions[0].current.values()))
     town.send("car1", {"v": 1})
     town.status_when(lambda status: status.rules[0].ended == 1)
     status = town.status_when(lambda status: status.actions[0].failed == 1)
-    assert status.actions[0].last_failure.startswith("not started, and given up:")
+    assert status.actions[0].last_failure.startswith("gave up starting it:")
     lost = town.status_when(lambda status: any(drops.cause.startswith("action_recordings") for drops in status.drops))
     assert [drops.count for drops in lost.drops if drops.cause.startswith("action_recordings")] == [1]
     assert town.stop() == 0
@@ -297,7 +297,7 @@ def test_people_ask_for_recordings_by_commands(unhurt: Peer) -> None:
     assert "Done" in told
     refused = command("recordings", "start", "other", "--stream", "poes", "--name", "rsu")
     assert refused.exit_code == 1
-    assert "stream poes is none that may be recorded here" in refused.stdout
+    assert "stream poes may not be recorded here" in refused.stdout
     wrong = command("recordings", "start", "x", "--name", "rsu", "--maximum-duration", "1 hour")
     assert "maximumDuration: '1 hour' is not a duration" in wrong.output
     shown = command("status", "--name", "rsu").stdout

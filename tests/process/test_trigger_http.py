@@ -27,7 +27,9 @@ class NoNetwork:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         raise AssertionError(key)
 
-    def ask(self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None) -> list[bytes]:
+    def query(
+        self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
+    ) -> list[bytes]:
         raise ActionError(f"{selector}: nobody answered")
 
 
@@ -165,10 +167,10 @@ def test_a_stop_that_is_never_confirmed_is_counted() -> None:
         there.behaviour = answers(500)
         driven.action.ended(end(episode))
         assert driven.finished().state is OutcomeState.FAILED
-        assert "the stop was not confirmed, and is given up" in driven.outcomes[-1].message
+        assert "gave up waiting for the confirmation of the stop" in driven.outcomes[-1].message
     (lost,) = driven.lost
     assert lost.startswith(
-        "1 recordings elsewhere whose stop was not confirmed: they end by their maximumDuration: h.r."
+        "1 recordings on other systems whose stop was not confirmed: their maximumDuration ends them: h.r."
     )
 
 
@@ -180,7 +182,7 @@ def test_a_recording_ends_after_its_maximum_duration_also_while_the_episode_last
         assert [request.method for request in there.requests] == ["PUT", "DELETE"]
     assert (outcome.state, outcome.message) == (
         OutcomeState.DONE,
-        "ended by its maximumDuration, before the episode did",
+        "its maximumDuration ended it before the episode ended",
     )
 
 

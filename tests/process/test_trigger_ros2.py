@@ -131,7 +131,7 @@ def test_what_a_service_refuses_is_told(process: Process) -> None:
     node.offer("recorder/on", "std_srvs/srv/Trigger", "", "bool success\nstring message\n", lambda request: refusal)
     process.send("car1", {"v": 20})
     status = process.status_when(lambda status: bool(status.actions and status.actions[0].failed))
-    assert status.actions[0].last_failure == "not started, and given up: /recorder/on refused: the disk is full"
+    assert status.actions[0].last_failure == "gave up starting it: /recorder/on refused: the disk is full"
     assert len(node.calls) >= 2
 
 
@@ -148,11 +148,10 @@ def test_what_is_wrong_with_a_call_is_told_with_its_place(tmp_path: Path) -> Non
     (tmp_path / "all.yaml").write_text(yaml.safe_dump_all(documents, sort_keys=False))
     told = [str(problem) for problem in check_documents(load_documents([tmp_path / "all.yaml"]))]
     assert [text.split("all.yaml:", 1)[1].split(" ", 1)[1] for text in told] == [
-        "spec.actions[0].trigger.ros2.start.type: the service type my/srv/Own is not known: give its .srv file as "
-        "definition",
+        "spec.actions[0].trigger.ros2.start.type: unknown service type my/srv/Own: give its .srv file as definition",
         "spec.actions[0].trigger.ros2.stop.request: request.data is 3, but must be of type bool",
-        "spec.actions[0].trigger.ros2.start.definition: the definition of my/srv/Own has 0 lines of ---: one stands "
-        "between request and response",
+        "spec.actions[0].trigger.ros2.start.definition: the definition of my/srv/Own has 0 lines of ---: there must "
+        "be exactly one, between request and response",
     ]
 
 

@@ -1,4 +1,4 @@
-"""The database action: it turns what it is told of episodes into requests, and reports what became of them."""
+"""The database action: it turns episodes into requests, and reports their results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from detector.actions.base import Action, ActionError, Setting
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.documents import Documents, Made
 from detector.actions.database.episodes import Writing
-from detector.actions.database.folder import Folder, FolderError
+from detector.actions.database.folder import AttachmentFolder, FolderError
 from detector.actions.database.scenario import Scenario
 from detector.actions.database.store import Store
 from detector.actions.database.stores import acquire, release
@@ -29,7 +29,7 @@ from wayside.api.database import Database as Place
 _log = logging.getLogger(__name__)
 
 FLUSH = 0.2
-"""Documents wait at most so many seconds for others to be sent with."""
+"""Maximum seconds that a document waits for others, to be sent in one batch."""
 
 
 @dataclass(slots=True)
@@ -50,12 +50,12 @@ class Database(Action[DatabaseAction]):
         super().__init__(parameters, setting)
         self._place: Place | None = None
         self._store: Store | None = None
-        self._folder: Folder | None = None
+        self._folder: AttachmentFolder | None = None
         self._writings: dict[str, Writing] = {}
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
         self._awake = False
-        self._told_away = False
+        self._reported_away = False
 
     def started(self, episode: Episode) -> None:
         """Make the scenario known in the database, as one that is not complete."""
@@ -108,7 +108,7 @@ class Database(Action[DatabaseAction]):
         """Complete the scenario; the episode goes on in another."""
         self._finish(writing, Completion(), continues=True)
         writing.go_on(*self._open(writing.episode, str(begin), resumed=False))
-        self._take(writing, list(writing.said.values()))
+        self._take(writing, list(writing.latest.values()))
 
     def _add(self, scenario: Scenario, made: Made) -> None:
         document = made.document if not made.files else self._with_files(scenario, made)
@@ -129,7 +129,7 @@ class Database(Action[DatabaseAction]):
             self._flush(made.collection)
 
     def _with_files(self, scenario: Scenario, made: Made) -> bytes:
-        """The document, once the files that it refers to are written; it says which could not be."""
+        """The document, once the files that it refers to are written; it names those that could not be."""
         if self.parameters.dry_run or self._folder is None:
             scenario.files += len(made.files)
             return made.document
@@ -148,7 +148,7 @@ class Database(Action[DatabaseAction]):
         return encoded({**bson.decode(made.document), "filesMissing": missing})
 
     def _flush(self, collection: str) -> None:
-        """Queue what there is for a collection."""
+        """Enqueue the documents of a collection."""
         batch = self._batches.pop(collection)
         if self._store is None:
             return
@@ -160,7 +160,7 @@ class Database(Action[DatabaseAction]):
         if self._store.put(write, self.setting.closing):
             return
         open_ones = {each.scenario.id: each.scenario for each in self._writings.values()}
-        why = "no room in the queue" if not self._store.away else "no room while the database is away"
+        why = "the queue is full" if not self._store.away else "the queue is full while the database is unavailable"
         for name, count in batch.owners.items():
             if name in open_ones:  # else it failed meanwhile
                 self._lose(open_ones[name], count, why)
@@ -168,7 +168,7 @@ class Database(Action[DatabaseAction]):
                 losing(count, why)
 
     def completed(self, episode: Episode, completion: Completion) -> None:
-        """Queue what makes the scenario complete, or what says why it is not."""
+        """Enqueue the request that completes the scenario, or records why it is incomplete."""
         writing = self._writings[episode.id]
         writing.episode = episode
         self._finish(writing, completion, continues=False)
@@ -184,8 +184,8 @@ class Database(Action[DatabaseAction]):
             writing.trouble = writing.trouble or incomplete or ("" if complete else why)
             if not continues:
                 state = OutcomeState.FAILED if writing.trouble else OutcomeState.DONE
-                said = writing.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
-                self._report(episode, state, said, writing, completion)
+                message = writing.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
+                self._report(episode, state, message, writing, completion)
 
         if self._store is None:
             confirm(not incomplete, incomplete)
@@ -195,14 +195,16 @@ class Database(Action[DatabaseAction]):
             self._store.put_change(write, confirm if write.completes else None)
 
     def wake(self) -> float | None:
-        """Queue what has waited long enough. The first time, what an earlier run left on disk is taken up."""
+        """Enqueue documents that have waited long enough. The first call also resumes what an earlier run left on
+        disk.
+        """
         if not self._awake:
             self._awake = True
             try:
                 self._connect()
             except ActionError as error:
                 _log.error("action %s of EventRule %s: %s", self.setting.action, self.setting.rule.name, error)
-        self._tell_whether_away()
+        self._report_availability()
         if not self._batches:
             return None
         left = self._due - time.monotonic()
@@ -212,16 +214,16 @@ class Database(Action[DatabaseAction]):
             self._flush(collection)
         return None
 
-    def _tell_whether_away(self) -> None:
-        """Say of each open episode that its documents have to wait, or no longer have to."""
+    def _report_availability(self) -> None:
+        """Report for each open episode whether its documents have to wait."""
         away = self._store.away if self._store is not None else ""
-        if bool(away) != self._told_away:
-            self._told_away = bool(away)
+        if bool(away) != self._reported_away:
+            self._reported_away = bool(away)
             for writing in self._writings.values():
-                self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is away: {away}")
+                self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is unavailable: {away}")
 
     def close(self) -> None:
-        """Let go of the queue; the last action that does waits for it, a few seconds."""
+        """Release the queue; the last action that does so waits a few seconds for it."""
         for collection in list(self._batches):
             self._flush(collection)
         if self._place is not None:
@@ -239,7 +241,9 @@ class Database(Action[DatabaseAction]):
         self._place, self._store = place, store
         self._folder = None
         if place.files is not None:
-            self._folder = Folder(Path(place.files.path), place.files.bytes.bytes if place.files.bytes else None)
+            self._folder = AttachmentFolder(
+                Path(place.files.path), place.files.bytes.bytes if place.files.bytes else None
+            )
         rule = self.setting.rule.name
         behind = (self.parameters.database, self.setting.holder, rule, self.setting.action)
         if store.first_time(behind):

@@ -72,8 +72,8 @@ def _form(around: Mapping[str, Any], name: str, content: bytes) -> tuple[bytes, 
                 return cloud, "pcd"
         except (TypeError, ValueError, KeyError):  # looks like one, and is none
             return content, "bin"
-        told = str(around.get("format", "")).lower()
+        encoding = str(around.get("format", "")).lower()
         for word, suffix in _COMPRESSED:
-            if word in told:
+            if word in encoding:
                 return content, suffix
     return content, "bin"

@@ -1,4 +1,4 @@
-"""From a sample of a scenario to its document: what was said, by whom, when.
+"""From a sample of a scenario to its document: content, sender and time.
 
 A document's id is made of the scenario and the sample alone, so however often it is sent, it is there once.
 """
@@ -25,7 +25,7 @@ LARGEST = 16 * 2**20 - 2**14
 
 
 _RECENT = 256
-"""Among so many times of a client's stream, samples that are the same are told apart."""
+"""Number of times of a client's stream among which equal samples are distinguished."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class Documents:
 
     def _stamp(self, sample: EpisodeSample, decoder: Decoder) -> int | None:
         near = self._near.get(sample.stream)
-        if near is None:  # asked once: the answer takes longer than all else
+        if near is None:  # looked up once: this takes longer than everything else
             near = self._near[sample.stream] = isinstance(decoder, NearDecoder)
         if near and isinstance(decoder, NearDecoder):
             return decoder.stamp_near(sample.payload, sample.received)
@@ -109,13 +109,13 @@ class Documents:
         *,
         undecoded: bool,
     ) -> Made:
-        """The document, or one that refers to the payload or says what is left out where it is too large."""
+        """The document, or one that refers to the payload or names what is left out where it is too large."""
         collection = collection_of(stream)
         try:
             made = encoded(document)
             if len(made) <= LARGEST:
                 return Made(collection, made, files, undecoded=undecoded)
-            reason = f"it would be a document of {len(made)} bytes, and MongoDB takes {LARGEST}"
+            reason = f"the document would have {len(made)} bytes; MongoDB accepts at most {LARGEST}"
         except UnfitError as error:
             reason = str(error)
         document.pop("msg", None)
@@ -131,13 +131,13 @@ class Documents:
         return f"{self.place}/{sample.stream}/{sample.client}/{sample.time}-{identity[8:14].hex()}"
 
     def _identity(self, sample: EpisodeSample) -> bytes:
-        """20 bytes: the time first, so that documents lie in the index as they come, then what tells samples apart.
+        """20 bytes: the time first, so that documents lie in the index as they come, then what distinguishes samples.
 
         With clock Data a client may send the same bytes twice with one stamp: the second one gets another number.
         """
         digest = hashlib.blake2b(sample.payload, digest_size=12)
-        said = (self.scenario, sample.client, sample.stream, sample.key, str(sample.received))
-        digest.update("\0".join(said).encode())
+        identity = (self.scenario, sample.client, sample.stream, sample.key, str(sample.received))
+        digest.update("\0".join(identity).encode())
         name = digest.digest()
         lane = (sample.client, sample.stream)
         times = self._recent.setdefault(lane, {})

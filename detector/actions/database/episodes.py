@@ -19,12 +19,12 @@ class Writing:
     scenario: Scenario
     documents: Documents
     latched: frozenset[str]
-    """The streams of which each scenario gets what was said last."""
+    """The streams of which each scenario gets the last samples."""
     renew_after: int | None
     """Nanoseconds."""
     seam: int | None = None
-    """From here on samples belong to the next scenario; None where nothing tells yet."""
-    said: dict[tuple[str, str, str], EpisodeSample] = field(default_factory=dict)
+    """From here on samples belong to the next scenario; None while this is unknown."""
+    latest: dict[tuple[str, str, str], EpisodeSample] = field(default_factory=dict)
     """The newest samples of latched streams."""
     trouble: str = ""
     """Why a scenario before is not complete, the first time."""
@@ -48,7 +48,7 @@ class Writing:
         rest = [sample for sample in samples if seam is not None and sample.time >= seam]
         for sample in now:
             if sample.stream in self.latched:
-                self.said[sample.client, sample.stream, sample.key] = sample
+                self.latest[sample.client, sample.stream, sample.key] = sample
         return now, rest
 
     def go_on(self, scenario: Scenario, documents: Documents) -> None:

@@ -10,10 +10,10 @@ from detector.actions.database.attachments import Attachment
 
 
 class FolderError(Exception):
-    """A file could not be written; the text says why."""
+    """A file could not be written; the message gives the reason."""
 
 
-class Folder:
+class AttachmentFolder:
     """Where attachments go, up to a number of bytes."""
 
     def __init__(self, path: Path, capacity: int | None) -> None:
@@ -37,7 +37,7 @@ class Folder:
         except OSError as error:
             with suppress(OSError):
                 unfinished.unlink(missing_ok=True)
-            raise FolderError(f"a file could not be written: {error.strerror or type(error).__name__}") from None
+            raise FolderError(f"cannot write a file: {error.strerror or type(error).__name__}") from None
         self._used += len(attachment.content)
 
 

@@ -1,7 +1,7 @@
 """Requests in their order: in memory, and on disk while the server is away.
 
-The spool's records are always older than what is in memory. Where neither has room, what is *new* finds none, and
-whoever puts it learns that at once; what is in the queue stays whole.
+The spool's records are always older than what is in memory. If both are full, *new* requests are rejected, and
+the caller learns that at once; what is in the queue stays whole.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from detector.actions.database.work import Write, unpacked
 _log = logging.getLogger(__name__)
 
 MEMORY = 64 * 2**20
-"""So many bytes wait in memory at most."""
+"""Maximum bytes in memory."""
 
 
 class Queue:
     """Several threads put and move to the disk, one takes."""
 
     def __init__(self, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` is told what cannot be read of the spool."""
+        """`lose` receives what cannot be read from the spool."""
         self.changed = threading.Condition()
-        """Held for a moment where the memory changes, and told of it."""
+        """Held briefly while the memory changes, and notified of it."""
         self._disk = threading.Lock()
         """Held while records are moved, taken or removed; taken before the other."""
         self._spool = spool
@@ -38,13 +38,13 @@ class Queue:
         self._bytes = 0
         self._inherited = 0 if spool is None else spool.records
         self.full = spool is None
-        """The disk takes nothing more for now."""
+        """The disk accepts nothing more for now."""
         self.damaged = False
         """Something in the spool could not be read in this run."""
         if spool is not None and spool.damaged:
-            lose("bytes of the database's spool", spool.damaged, "a crash or the disk damaged them")
+            lose("bytes of the database's spool", spool.damaged, "corrupted by a crash or by the disk")
         if spool is not None and spool.records:
-            _log.info("database: %d requests of an earlier run wait in the spool", spool.records)
+            _log.info("database: the spool holds %d requests of an earlier run", spool.records)
 
     @property
     def inherited(self) -> bool:
@@ -57,7 +57,7 @@ class Queue:
         return self._bytes + (0 if self._spool is None else self._spool.bytes)
 
     def has_room(self, size: int) -> bool:
-        """Whether so many bytes fit into the memory."""
+        """Whether this number of bytes fits into the memory."""
         return not self._bytes or self._bytes + size <= self._capacity
 
     def add(self, write: Write) -> None:
@@ -107,7 +107,9 @@ class Queue:
                 self.full = not self._move(self._spool)
             except OSError as error:
                 if not self.full:
-                    _log.warning("database: the spool takes nothing more: %s", error.strerror or type(error).__name__)
+                    _log.warning(
+                        "database: the spool accepts no more requests: %s", error.strerror or type(error).__name__
+                    )
                 self.full = True
 
     def _move(self, spool: Spool) -> bool:
@@ -127,7 +129,7 @@ class Queue:
         return not self._memory
 
     def close(self) -> list[Write]:
-        """What found no place on the disk, and is lost with the process."""
+        """Bytes that do not fit on the disk, and are lost with the process."""
         self.spill()
         with self._disk, self.changed:
             left = list(self._memory)

@@ -47,7 +47,7 @@ class Scenario:
     bytes: int = 0
     files: int = 0
     lost: Counter[str] = field(default_factory=Counter)
-    """What is not there and should be, by reason."""
+    """Missing parts, by reason."""
 
     def saw(self, client: str, stream: str, time: int) -> None:
         """Note a client's sample."""
@@ -57,7 +57,9 @@ class Scenario:
 
 
 def type_id(rule: EventRule) -> str:
-    """A version of a rule: its scenarios are of one type. A rule from a file has no generation: its text tells."""
+    """A version of a rule: its scenarios are of one type. A rule from a file has no generation: its text identifies
+    it.
+    """
     version = str(rule.metadata.generation)
     if not rule.metadata.generation:
         version = hashlib.sha256(_text(rule).encode()).hexdigest()[:12]
@@ -108,7 +110,7 @@ def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue
 
 
 def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
-    """Scenarios that an earlier run left open: nobody writes them any more."""
+    """Scenarios that an earlier run left open: nothing writes them any more."""
     find = {"holder": holder, "rule": rule, "action": action, "state": OPEN}
     change = {"find": find, "change": {"$set": {"state": INTERRUPTED, "interrupted": True}}, "many": True}
     return Write(database, SCENARIOS, changes=[change])
@@ -117,7 +119,7 @@ def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
 def finish(
     scenario: Scenario, episode: Episode, completion: Completion, detector: Detector, incomplete: str
 ) -> list[Write]:
-    """Say all that is known in the end. The last request makes it complete, where it is not `incomplete`."""
+    """Write the final documents. The last request makes it complete, where it is not `incomplete`."""
     labels = {client.name: client.labels for client in detector.spec.clients}
     clients = [
         {
@@ -161,16 +163,16 @@ def finish(
 
 
 def why_incomplete(scenario: Scenario, episode: Episode | None, completion: Completion) -> str:
-    """Why not all of it is there; empty where it is. Without the episode, another scenario follows."""
+    """Why it is incomplete; empty if it is complete. Without the episode, another scenario follows."""
     reasons = [f"{count} lost: {reason}" for reason, count in sorted(scenario.lost.items())]
     if completion.missing:
-        reasons.append(f"{completion.missing} lost: the samples came faster than they could be taken")
+        reasons.append(f"{completion.missing} lost: the samples arrived faster than the action could process them")
     if completion.cut:
         reasons.append(completion.cut)
     if scenario.resumed:
-        reasons.append("the beginning was seen by an earlier run of the detector")
+        reasons.append("an earlier run of the detector saw the start of the episode")
     if episode is not None and episode.end_time is None and not completion.cut:
-        reasons.append("its end was not seen")
+        reasons.append("this run did not see its end")
     return "; ".join(reasons)
 
 

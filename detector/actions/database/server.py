@@ -41,8 +41,8 @@ _COUNTING = 60.0
 """How long it may take to count a scenario's documents."""
 
 
-class UnavailableError(Exception):
-    """The server did not do it, and may later; the text is for people."""
+class DatabaseUnavailableError(Exception):
+    """The server is unavailable; a later attempt may succeed."""
 
     def __init__(self, text: str, *, broke: bool = False) -> None:
         super().__init__(text)
@@ -50,8 +50,8 @@ class UnavailableError(Exception):
         """The connection ended with this request: it may be the request's own doing."""
 
 
-class RefusedError(Exception):
-    """The request as a whole cannot be done, now or later; the text says why."""
+class WriteRefusedError(Exception):
+    """The request as a whole cannot be done, now or later; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Refused:
 
 
 class Redactor:
-    """Takes whatever is secret in a connection string out of texts."""
+    """Removes the secrets of a connection string from texts."""
 
     def __init__(self, uri: str) -> None:
         secrets = {uri}
@@ -118,9 +118,9 @@ class Server:
     def write(self, write: Write) -> tuple[int, list[Refused]]:
         """Do it: how many documents changes have matched, and what was refused of it; all else is done.
 
-        Raises UnavailableError, RefusedError.
+        Raises DatabaseUnavailableError, WriteRefusedError.
         """
-        with self._told():
+        with self._driver_errors():
             try:
                 return self._insert(write) if write.documents else self._change(write)
             except BulkWriteError as error:
@@ -129,9 +129,9 @@ class Server:
     def lacks(self, write: Write) -> str:
         """What the scenario that the request completes does not have of its documents; empty where it has all.
 
-        Raises UnavailableError, RefusedError.
+        Raises DatabaseUnavailableError, WriteRefusedError.
         """
-        with self._told(), pymongo.timeout(_COUNTING):
+        with self._driver_errors(), pymongo.timeout(_COUNTING):
             for collection, count in sorted(write.expected.items()):
                 found = self._client[write.database][collection].count_documents({"scenario": write.completes})
                 if found < count:
@@ -139,29 +139,29 @@ class Server:
         return ""
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _driver_errors(self) -> Iterator[None]:
         """The driver's errors as ours."""
         try:
             yield
         except DocumentTooLarge as error:
-            raise RefusedError(self.redact(error)) from None
+            raise WriteRefusedError(self.redact(error)) from None
         except ConnectionFailure as error:
             broke = isinstance(error, AutoReconnect) and not isinstance(
                 error, NetworkTimeout | NotPrimaryError | ServerSelectionTimeoutError
             )
-            raise UnavailableError(self._short(error), broke=broke) from None
+            raise DatabaseUnavailableError(self._short(error), broke=broke) from None
         except PyMongoError as error:
-            raise UnavailableError(self._short(error)) from None
+            raise DatabaseUnavailableError(self._short(error)) from None
         except (BSONError, OverflowError, ValueError, TypeError) as error:
-            raise RefusedError(self.redact(error)) from None
+            raise WriteRefusedError(self.redact(error)) from None
 
     def _insert(self, write: Write) -> tuple[int, list[Refused]]:
         collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]
         if (write.database, write.collection) not in self._indexed:
             try:
-                collection.create_index("scenario")  # what everybody asks for
+                collection.create_index("scenario")  # what most queries filter by
             except OperationFailure as error:  # it goes without
-                _log.warning("database: no index on %s: %s", write.collection, self._short(error))
+                _log.warning("database: cannot create the index on %s: %s", write.collection, self._short(error))
             self._indexed.add((write.database, write.collection))
         collection.insert_many([RawBSONDocument(document) for document in write.documents], ordered=False)
         return len(write.documents), []
@@ -180,10 +180,10 @@ class Server:
     def _refused(self, details: Mapping[str, Any], *, inserting: bool) -> list[Refused]:
         """What of a request was refused; that a document is there already is as it should be.
 
-        Raises UnavailableError where the rest is not safe yet, or another detector made the same at the same time.
+        Raises DatabaseUnavailableError if the rest is not safe yet, or another client made the same at the same time.
         """
         if not inserting and any(_there_already(each) for each in details.get("writeErrors", ())):
-            raise UnavailableError("somebody else makes the same document")
+            raise DatabaseUnavailableError("another client is writing the same document")
         refused = [
             Refused(int(each["index"]), self.redact(each.get("errmsg", "")))
             for each in details.get("writeErrors", ())
@@ -191,7 +191,7 @@ class Server:
         ]
         concerns: Sequence[Mapping[str, Any]] = details.get("writeConcernErrors", ())
         if concerns:
-            raise UnavailableError(self.redact(concerns[0].get("errmsg", "the write concern is not met")))
+            raise DatabaseUnavailableError(self.redact(concerns[0].get("errmsg", "the write concern is not satisfied")))
         return refused
 
     def _short(self, error: PyMongoError) -> str:

@@ -2,7 +2,7 @@
 
 Records are appended to segments (files that are numbered in their order) and synced before they count as kept. They
 are read in the same order; a segment is removed once all its records are done, so after a crash a few records come
-again. Each record carries its length and checksum: what a crash cut off is found and left out, and told.
+again. Each record carries its length and checksum: what a crash cut off is found, left out and reported.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SEGMENT = 8 * 2**20
 
 
 class SpoolError(Exception):
-    """The folder cannot be used; the text says why and what to do."""
+    """The folder cannot be used; the message gives the reason and the remedy."""
 
 
 @dataclass(slots=True)
@@ -45,10 +45,10 @@ class Spool:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._lock.close()
-            raise SpoolError(f"the spool {folder} is used by another process: give each detector its own") from None
+            raise SpoolError(f"another process uses the spool {folder}: give each detector its own") from None
         except OSError as error:
             reason = error.strerror or type(error).__name__
-            raise SpoolError(f"the spool {folder} cannot be used: {reason}: correct its path") from None
+            raise SpoolError(f"cannot use the spool {folder}: {reason}: correct its path") from None
         self._tail: int | None = None
         self.damaged = 0
         """Bytes of an earlier run's segments that could not be read."""
@@ -61,7 +61,7 @@ class Spool:
             self._take_stock()
         except OSError as error:
             self.close()
-            raise SpoolError(f"{error.filename} in the spool cannot be read: {error.strerror}: remove it") from None
+            raise SpoolError(f"cannot read {error.filename} in the spool: {error.strerror}: remove it") from None
 
     def _take_stock(self) -> None:
         for segment in self._segments:
@@ -165,7 +165,7 @@ class Spool:
             self._tail = None
 
     def close(self) -> None:
-        """Let go of the folder; the records stay."""
+        """Release the folder; the records stay."""
         self._close_tail()
         self._lock.close()
 

@@ -17,35 +17,35 @@ import bson
 
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.queue import Queue
-from detector.actions.database.server import RefusedError, Server, UnavailableError
+from detector.actions.database.server import DatabaseUnavailableError, Server, WriteRefusedError
 from detector.actions.database.spool import Spool
 from detector.actions.database.work import Write
 
 _log = logging.getLogger(__name__)
 
 _LONGEST = 5.0
-"""Between two attempts lie at most so many seconds."""
+"""Maximum seconds between two attempts."""
 _SUSPECT = 3
-"""After so many connections that ended with one request, while the server answers others, it is the request."""
+"""Number of connections lost with one request, while the server answers others, after which the request is to blame."""
 
 _PATIENCE = 10
-"""So many tenths of a second somebody who puts waits for room before the disk is asked."""
+"""Tenths of a second that a producer waits for room before the disk is used."""
 
 _LAST_TRY = 0.5
-"""At the end, a server that is away gets so many seconds more."""
+"""Extra seconds at the end for a server that is unavailable."""
 
-_ANEW = 1.0
-"""After an unexpected error the queue rests so many seconds."""
+_RESTART_DELAY = 1.0
+"""Seconds that the queue pauses after an unexpected error."""
 
 Confirm = Callable[[bool, str], None]
-"""Told that a scenario is complete in the database, or that it is not, and why."""
+"""Called with whether a scenario is complete in the database, and the reason if it is not."""
 
 
 class Store:
     """The queue, and the thread that empties it."""
 
     def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` is told what is lost of an earlier run's records."""
+        """`lose` receives what is lost of the records of an earlier run."""
         self._server = server
         self._lose = lose
         self._queue = Queue(spool, lose)
@@ -75,7 +75,7 @@ class Store:
         return self._queue.bytes
 
     def first_time(self, what: object) -> bool:
-        """Whether it is asked for the first time."""
+        """Whether this is the first call."""
         with self._lock:
             new = what not in self._seen
             self._seen.add(what)
@@ -102,7 +102,7 @@ class Store:
                 self._queue.spill()
 
     def put_change(self, write: Write, confirm: Confirm | None = None) -> None:
-        """Queue what is said about scenarios: small, and never dropped."""
+        """Enqueue a change of a scenario: small, and never dropped."""
         with self._lock:
             if not self._left:
                 if confirm is not None:
@@ -134,10 +134,10 @@ class Store:
                 if self._send(write) and not self._left:
                     self._queue.done()
             except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue goes on, since doing twice is doing once
-                self._lose("times the database's queue had to begin anew", 1, self._server.redact(error))
-                _log.error("database: the queue begins anew: %s", type(error).__name__)
+                self._lose("times the database queue was restarted", 1, self._server.redact(error))
+                _log.error("database: restarting the queue: %s", type(error).__name__)
                 _log.debug("in the queue", exc_info=error)
-                time.sleep(_ANEW)
+                time.sleep(_RESTART_DELAY)
         self._leave()
 
     def _late(self) -> bool:
@@ -156,21 +156,21 @@ class Store:
     def _send(self, write: Write, patience: int = _SUSPECT) -> bool:
         """Write it, however often that takes; False where there is no more time.
 
-        `patience`: after so many connections that ended with it, documents are looked for that are to blame.
+        `patience`: after this number of connections lost with it, the documents to blame are searched.
         """
         pause, broke = 0.05, 0
         while True:
             try:
                 doubts = self._doubts or self._queue.damaged or self._queue.inherited
-                lacking = self._server.lacks(write) if doubts else ""
-                matched, refused = self._server.write(scenarios.give_up(write, lacking) if lacking else write)
-            except RefusedError as error:
+                missing = self._server.lacks(write) if doubts else ""
+                matched, refused = self._server.write(scenarios.give_up(write, missing) if missing else write)
+            except WriteRefusedError as error:
                 return self._divide(write, str(error))
-            except UnavailableError as error:
+            except DatabaseUnavailableError as error:
                 self._note_away(str(error))
                 broke = broke + 1 if error.broke and self._server.answers() else 0
                 if broke >= patience:
-                    return self._divide(write, "the server ends the connection when it gets it")
+                    return self._divide(write, "the server closes the connection when it receives it")
                 if error.broke and broke:
                     pause = 0.05  # it is there
                 if not self._pause(pause * random.uniform(0.7, 1.3)):  # noqa: S311  no secret
@@ -182,7 +182,7 @@ class Store:
             if not all(self._reject(write, each.index, each.why) for each in refused):
                 return False
             if write.completes:
-                self._confirm(write, matched, lacking or (refused[0].why if refused else ""))
+                self._confirm(write, matched, missing or (refused[0].why if refused else ""))
             return True
 
     def _divide(self, write: Write, why: str) -> bool:
@@ -202,12 +202,12 @@ class Store:
         """
         lose = write.losing or self._lost_earlier
         if not write.documents:
-            lose(1, f"the database refused a change of {write.collection}: {why}")
+            lose(1, f"the database rejected a change of {write.collection}: {why}")
             return True
         scenario = bson.decode(write.documents[index]).get("scenario", "")
         if not self._send(scenarios.reject(write.database, scenario, why)):
             return False
-        lose(1, f"the database refused it: {why}")
+        lose(1, f"the database rejected it: {why}")
         return True
 
     def _lost_earlier(self, count: int, why: str) -> None:
@@ -216,7 +216,7 @@ class Store:
     def _confirm(self, write: Write, matched: int, why: str) -> None:
         confirm = self._confirms.pop(write.completes, None)
         if confirm is not None:
-            confirm(bool(matched) and not why, why or "the database refused some of it")
+            confirm(bool(matched) and not why, why or "the database rejected some of it")
 
     def _pause(self, seconds: float) -> bool:
         """Wait before the next attempt; what comes meanwhile goes to the disk. False where there is no more time."""
@@ -238,22 +238,24 @@ class Store:
         for write in self._queue.close():
             if write.documents:
                 lose = write.losing or self._lost_earlier
-                lose(len(write.documents), "the detector ended before it was written")
+                lose(len(write.documents), "the detector stopped before it was written")
         confirms, self._confirms = self._confirms, {}
         for confirm in confirms.values():
             confirm(False, self._end_text())
 
     def _end_text(self) -> str:
-        where = "what is not written waits in the spool" if self._spooling else "there is no spool"
-        return f"the detector ended before the database had it ({self._away or 'it was busy'}); {where}"
+        where = "unwritten requests stay in the spool" if self._spooling else "there is no spool"
+        return f"the detector stopped before the database stored it ({self._away or 'it was busy'}); {where}"
 
     def _note_away(self, why: str) -> None:
         if not self._away:
-            where = "waits in the spool on disk" if self._spooling else "waits in memory: there is no spool"
-            _log.warning("database: cannot be written to: %s; what comes %s", why, where)
+            where = (
+                "is queued in the spool on disk" if self._spooling else "is queued in memory, because there is no spool"
+            )
+            _log.warning("database: cannot write: %s; new data %s", why, where)
         self._away = why
 
     def _note_back(self) -> None:
         if self._away:
-            _log.info("database: can be written to again; %d bytes wait", self.waiting)
+            _log.info("database: writing again; %d bytes are queued", self.waiting)
             self._away = ""

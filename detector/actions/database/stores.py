@@ -15,7 +15,7 @@ from wayside.api.database import Database, WriteConcern
 
 _FIELD = "spec.database"
 _CLOSING = 3.0
-"""At the end, so many seconds are left to write what there is."""
+"""Seconds at the end to write what is queued."""
 
 _lock = threading.Lock()
 _stores: dict[Database, tuple[Store, int]] = {}
@@ -41,7 +41,7 @@ def release(database: Database) -> None:
             _stores[key] = (store, users - 1)
             return
         del _stores[key]
-        store.close(_CLOSING)  # before another one can ask for the same spool
+        store.close(_CLOSING)  # before another one can open the same spool
 
 
 def _key(database: Database) -> Database:

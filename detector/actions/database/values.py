@@ -16,7 +16,7 @@ _DEPTH = 100
 
 
 class UnfitError(ValueError):
-    """A message that cannot be a document; the text says why."""
+    """A message that cannot be a document; the error gives the reason."""
 
 
 def encoded(document: Mapping[str, Any]) -> bytes:
@@ -39,7 +39,7 @@ def plain(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _plain(value: Any, depth: int) -> Any:
     if depth > _DEPTH:
-        raise UnfitError(f"it is nested deeper than {_DEPTH} levels")
+        raise UnfitError(f"it is nested more than {_DEPTH} levels deep")
     match value:
         case np.generic():
             return _plain(value.item(), depth)  # first: numpy's doubles are Python's as well

@@ -10,7 +10,7 @@ import bson
 
 BATCH_DOCUMENTS = 1000
 BATCH_BYTES = 8 * 2**20
-"""A request is sent once it has so many documents, or so many bytes."""
+"""A request is sent once it has this number of documents, or of bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Write:
     expected: Mapping[str, int] = field(default_factory=dict)
     """By collection, how many documents the scenario must have by then."""
     losing: Callable[[int, str], None] | None = field(default=None, compare=False)
-    """Told how many of its documents were refused, and why; None where nobody knows of it any more."""
+    """Receives the number of refused documents and the reason; None if nothing tracks the request any more."""
 
     @property
     def size(self) -> int:

@@ -1,4 +1,4 @@
-"""Tasks as files, one each: the same loop works without a cluster, and whoever reads the folder sees the demands."""
+"""Tasks as files, one each: the same loop works without a cluster, and the folder shows the demands."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ Result = TypeVar("Result")
 
 
 class FileTaskStore:
-    """The tasks of one holder in a folder: `<name>.yaml` each, replaced in one step, so that nobody reads half a task.
+    """The tasks of one holder in a folder: `<name>.yaml` each, replaced in one step, so that no reader sees half a
+    task.
 
     A task's creationTimestamp is its event's start, to the second: the same drive gives the same files.
     """
 
     def __init__(self, folder: Path, holder: str, interval: float = 0.5) -> None:
-        """Prepare; `interval`: seconds between two looks at what others changed."""
+        """Prepare; `interval`: seconds between two scans for changes by others."""
         self._folder = _Folder(folder, holder)
         self._lock = asyncio.Lock()
         self._interval = interval
@@ -52,7 +53,7 @@ class FileTaskStore:
                 snapshot = await self._run(self._folder.look)
             except StoreUnavailableError as error:
                 if not away:
-                    _log.warning("cannot read the tasks in %s, and try again until I can: %s", self._folder.path, error)
+                    _log.warning("cannot read the tasks in %s; retrying with backoff: %s", self._folder.path, error)
                 away = True
             else:
                 away = False
@@ -143,9 +144,9 @@ class _Folder:
     def change(self, name: str, field: str, value: JsonValue) -> StoredTask:
         stored = self.look().tasks.get(name)
         if stored is None:
-            raise TaskRefusedError("NotFound", f"{self._file(name)} is gone, or somebody else's")
+            raise TaskRefusedError("NotFound", f"{self._file(name)} does not exist, or belongs to another holder")
         if not stored.live:
-            raise TaskRefusedError("Ended", f"{self._file(name)} has ended: a demand that ended does not come back")
+            raise TaskRefusedError("Ended", f"{self._file(name)} has ended: an ended task cannot become active again")
         spec = stored.task.spec.model_copy(update={field: value})
         return self._write(stored.task.model_copy(update={"spec": spec}))
 
@@ -163,7 +164,7 @@ class _Folder:
         except FileNotFoundError:
             return None
         except (yaml.YAMLError, ValidationError, UnicodeDecodeError) as error:
-            _log.warning("%s is left alone, since it is no ApplicationTask: %s", file, error)
+            _log.warning("ignoring %s, which is not an ApplicationTask: %s", file, error)
             return None
         return StoredTask(task, self._next()) if belongs_to(task, self._holder) else None
 

@@ -97,14 +97,14 @@ class KubernetesTaskStore:
             return _stored(await self._api.patch(TASKS, self._namespace, metadata.name, patch))
 
     def _own(self, obj: JsonObject) -> StoredTask | None:
-        """The task if it is the holder's and can be read; one of a newer version is left alone, and it is said once."""
+        """The task if it is the holder's and can be read; one of a newer version is ignored, and logged once."""
         try:
             stored = _stored(obj)
         except ValidationError as error:
             name = obj["metadata"]["name"]
             if name not in self._unreadable:
                 self._unreadable.add(name)
-                _log.warning("the ApplicationTask %s is left alone, since it cannot be read: %s", name, error)
+                _log.warning("ignoring the ApplicationTask %s, which cannot be read: %s", name, error)
             return None
         return stored if belongs_to(stored.task, self._holder) else None
 
@@ -127,4 +127,4 @@ def _store_errors() -> Iterator[None]:
     except ApiError as error:
         raise TaskRefusedError(error.reason, str(error)) from error
     except ValidationError as error:
-        raise TaskRefusedError("Unreadable", f"the stored ApplicationTask cannot be read: {error}") from error
+        raise TaskRefusedError("Unreadable", f"cannot read the stored ApplicationTask: {error}") from error

@@ -1,8 +1,8 @@
 """The holder's Lease: the sign of life by which the manager knows that the holder's demands still count.
 
-At most one process emits tasks as a holder. Who the Lease says so of (`holderIdentity`) renews it; another process
-with the same holder waits until it has itself seen the Lease unchanged for its duration, so the clocks of two machines
-are never compared. A process takes over at once
+At most one process emits tasks as a holder. The process named by the Lease (`holderIdentity`) renews it; another
+process with the same holder waits until it has itself seen the Lease unchanged for its duration, so the clocks of two
+machines are never compared. A process takes over at once
 
 - what was released: an orderly end clears the identity, and leaves all else, so that the manager keeps the demands for
   the usual time;
@@ -13,7 +13,7 @@ are never compared. A process takes over at once
 A Standalone detector's next pod has another name than the last. It waits at most one duration where the last one was
 killed, unless the Lease went with that pod, which owns it.
 
-What the pod tells about itself comes by the downward API: the environment variables POD_NAME and POD_UID.
+The identity of the pod comes from the downward API: the environment variables POD_NAME and POD_UID.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Identity:
 
 
 class HolderLease:
-    """Acquires and renews the Lease `wayside-<holder>` until it is told to stop."""
+    """Acquires and renews the Lease `wayside-<holder>` until `stop`."""
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class HolderLease:
             identity: which process this is. Default: found out.
             duration: seconds for which a renewal holds; whole, at least 3. Renewed after each third of it.
             monotonic: seconds, for observing.
-            now: seconds since the epoch, for what is written; nobody computes with it.
+            now: seconds since the epoch, for what is written; nothing is computed from it.
         """
         self.name = lease_name(holder)
         self._api = api
@@ -108,12 +108,12 @@ class HolderLease:
         self._backoff = Backoff(0.2, duration / 3)
         self._stopping = asyncio.Event()
         self.held = asyncio.Event()
-        """Set while this process may emit tasks. An outage of the API server does not clear it: nobody else can have
-        taken over."""
+        """Set while this process may emit tasks. An outage of the API server does not clear it: no other process can
+        have taken over."""
         self.attempts = 0
-        """How often it was looked at, to renew or acquire it."""
+        """Number of attempts to renew or acquire it."""
         self.failures = 0
-        """How many of the attempts failed."""
+        """Number of failed attempts."""
 
     async def run(self) -> None:
         """Acquire and renew until `stop`, then release."""
@@ -124,7 +124,7 @@ class HolderLease:
                 self._backoff.succeed()
             except ApiError as error:
                 if not self._backoff.failures:
-                    _log.warning("cannot renew the Lease %s, and try again until I can: %s", self.name, error)
+                    _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
                 self.failures += 1
                 delay = self._backoff.fail()
             with suppress(TimeoutError):
@@ -154,7 +154,7 @@ class HolderLease:
             else:
                 await self._api.replace(LEASES, self._namespace, self.name, body)
         except (AlreadyExistsError, ConflictError, NotFoundError):
-            return 0.1  # somebody else was faster: look again
+            return 0.1  # another process was faster: read it again
         if not self.held.is_set():
             _log.info("holding the Lease %s as %s", self.name, self._identity.text)
         self._refused_by = ""
@@ -179,7 +179,7 @@ class HolderLease:
         return {"apiVersion": LEASES.api_version, "kind": "Lease", "metadata": metadata, "spec": spec}
 
     def _lapsed(self, lease: JsonObject) -> bool:
-        """Whether we have seen the Lease unchanged for as long as it promises to hold."""
+        """Whether we have seen the Lease unchanged for its duration."""
         version, now = lease["metadata"]["resourceVersion"], self._monotonic()
         if self._seen is None or self._seen[0] != version:
             self._seen = (version, now)
@@ -191,17 +191,21 @@ class HolderLease:
         if self.held.is_set():
             self.held.clear()
             _log.error(
-                "the process %s has taken over the Lease %s while this one did not renew it; this one (%s) emits no "
-                "more tasks until it holds the Lease again",
+                (
+                    "process %s took over the Lease %s, because this process (%s) did not renew it; it creates "
+                    "no more tasks until it holds the Lease again"
+                ),
                 holder,
                 self.name,
                 self._identity.text,
             )
         elif holder != self._refused_by:
             _log.warning(
-                "the Lease %s is held by %s: either another detector of the same name runs (stop one of them, or name "
-                "them differently), or it has just been killed; this one (%s) emits no tasks until the Lease has not "
-                "been renewed for %g s",
+                (
+                    "the Lease %s is held by %s: either another detector with the same name is running (stop "
+                    "or rename one of them), or that process has just been killed; this process (%s) creates "
+                    "no tasks until the Lease has not been renewed for %g s"
+                ),
                 self.name,
                 holder,
                 self._identity.text,
@@ -238,5 +242,5 @@ def _alive(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True  # somebody else's
+        return True  # a process of another user
     return True

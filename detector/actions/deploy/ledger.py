@@ -1,4 +1,4 @@
-"""What is demanded beside what is stored: for each task, which step comes next. No waiting, no I/O."""
+"""The demanded and the stored tasks, and the next step for each. No waiting, no I/O."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Ledger:
         self.demands: Mapping[str, Demand] | None = None
         """None before the first `accept`: until then nothing may be changed, least of all ended."""
         self.stored: dict[str, StoredTask] | None = None
-        """None before the first snapshot: until then nobody knows what is there."""
+        """None before the first snapshot: until then the content of the store is unknown."""
         self.held: set[str] = set()
         """Demands whose task this process has seen live."""
         self.surrendered: set[str] = set()
-        """Demands whose task somebody else ended; they stay without one."""
+        """Demands whose task another client ended; they stay without a task."""
         self._ends: dict[str, int] = {}
 
     def accept(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> list[str]:
@@ -47,7 +47,7 @@ class Ledger:
         return self._due([*(name for name in before if name not in demands), *changed])
 
     def see(self, change: Snapshot | Update) -> list[str]:
-        """Take over what the store says."""
+        """Apply a change of the store."""
         known = self.stored or {}
         if isinstance(change, Snapshot):
             # What we wrote after the snapshot was taken is newer than it.
@@ -61,7 +61,7 @@ class Ledger:
         return self._due((change.name,))
 
     def put(self, name: str, stored: StoredTask | None) -> None:
-        """Take over the answer to a change of our own."""
+        """Apply the response to a change of our own."""
         if self.stored is None:
             self.stored = {}
         if stored is None:
@@ -88,10 +88,10 @@ class Ledger:
             self.held.add(name)
         elif name not in self.surrendered:
             self.surrendered.add(name)
-            _log.warning("somebody ended the task %s, which is still demanded; it stays ended", name)
+            _log.warning("another client ended the task %s, which is still demanded; it stays ended", name)
 
     def end_of(self, name: str) -> int | None:
-        """When the demand ended, in nanoseconds since the epoch; None where nobody said."""
+        """When the demand ended, in nanoseconds since the epoch; None if it is unknown."""
         return self._ends.get(name)
 
     def _due(self, names: Iterable[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Names that need attention: each at most once in the queue, and never in two hands at the same time."""
+"""A work queue of names: each is queued at most once, and processed by one worker at a time."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class WorkQueue:
         self._none.set()
 
     def __len__(self) -> int:
-        """How many names wait or are being worked on."""
+        """Number of names that are queued or being processed."""
         return len(self._waiting) + len(self._working)
 
     def add(self, name: str) -> None:
-        """Ask for attention to a name."""
+        """Enqueue a name."""
         if name in self._working:
             self._again.add(name)
         else:
@@ -44,7 +44,7 @@ class WorkQueue:
         return name
 
     def done(self, name: str) -> None:
-        """A name that was taken has had its attention."""
+        """Mark a taken name as processed."""
         self._working.discard(name)
         if name in self._again:
             self._again.discard(name)
@@ -53,5 +53,5 @@ class WorkQueue:
             self._none.set()
 
     async def empty(self) -> None:
-        """Wait until no name waits or is being worked on."""
+        """Wait until no name is queued or being processed."""
         await self._none.wait()

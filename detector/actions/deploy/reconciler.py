@@ -42,17 +42,17 @@ class DeployCounts:
 
     created: int = 0
     recreated: int = 0
-    """Created again, since somebody deleted them while they were demanded."""
+    """Recreated, because another client deleted them while they were demanded."""
     adopted: int = 0
     """Found there when they were to be created: made by a request whose answer was lost."""
     replaced: int = 0
-    """Deleted to be created anew, since what is demanded differs in what cannot be changed."""
+    """Deleted to be recreated, because the demand differs in an immutable field."""
     patched: int = 0
     ended: int = 0
     retried: int = 0
-    """Attempts that found the store away or busy."""
+    """Attempts that failed because the store was unavailable or busy."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Attempts that the store refused, by its reason. Each is made again at the next resync."""
+    """Attempts that the store refused, by its reason. Each is retried at the next resync."""
 
 
 class DemandReconciler:
@@ -71,10 +71,10 @@ class DemandReconciler:
 
         Args:
             store: the holder's tasks.
-            now: nanoseconds since the epoch: when a task ends whose demand is gone and nobody says since when.
+            now: nanoseconds since the epoch: the end of a task whose demand is gone at an unknown time.
             concurrency: how many tasks are changed at the same time; the changes of one task are always in order.
             permitted: nothing is changed while this is not set, e.g. `HolderLease.held`. Default: always permitted.
-            traces: told of the tasks that were created.
+            traces: receives the tasks that were created.
         """
         self._traces = traces
         self._store = store
@@ -89,16 +89,16 @@ class DemandReconciler:
         self._away = Backoff(0.1, 5.0)
         self._reachable = asyncio.Event()
         self._pause = 0.0
-        self._said: set[tuple[Step, str]] = set()
+        self._logged: set[tuple[Step, str]] = set()
         self._stopping = asyncio.Event()
         self._deadline = 0.0
         self.counts = DeployCounts()
         self.looks = 0
-        """How often the store has told all that it has."""
+        """Number of snapshots of the store."""
 
     @property
     def pending(self) -> int:
-        """How many tasks are not yet as demanded and are being worked on."""
+        """Number of tasks in the work queue."""
         return len(self._queue)
 
     def update(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
@@ -114,7 +114,7 @@ class DemandReconciler:
             self._handed = (dict(demands), {**(waiting[1] if waiting else {}), **ended})
             loop = self._loop
         if waiting is None and loop is not None:
-            with suppress(RuntimeError):  # the loop is closed: nobody is left to act, and the next start makes good
+            with suppress(RuntimeError):  # the loop is closed: the next start reconciles
                 loop.call_soon_threadsafe(self._accept)
 
     async def run(self) -> None:
@@ -130,12 +130,12 @@ class DemandReconciler:
                 async with asyncio.timeout(self._deadline if self._may_change() else 0.0):
                     await self._queue.empty()
             if self.pending:
-                _log.warning("%d tasks are not yet as demanded: the next start makes good", self.pending)
+                _log.warning("%d tasks are not reconciled yet; the next start completes them", self.pending)
             for task in working:
                 task.cancel()
 
     def stop(self, deadline: float = 3.0) -> None:
-        """Let `run` do what is due, for at most `deadline` seconds, and return. Live tasks stay alive."""
+        """Let `run` finish its work within `deadline` seconds, and return. Live tasks stay alive."""
         self._deadline = deadline
         self._stopping.set()
 
@@ -201,7 +201,7 @@ class DemandReconciler:
             try:
                 await self._change(step, name, demand, stored)
             except TaskRefusedError:
-                # Perhaps only because it is not what we thought: ended, deleted or made anew meanwhile.
+                # Possibly only because our copy is outdated: ended, deleted or recreated in the meantime.
                 current = await self._store.get(name)
                 self._ledger.put(name, current)
                 if self._ledger.next(name) is step and _same(current, stored):
@@ -212,21 +212,21 @@ class DemandReconciler:
         try:
             task = to_task(demand) if self._traces is None else self._traces.task(demand, to_task(demand))
         except ValueError as error:
-            raise TaskRefusedError("Invalid", f"the demand makes no ApplicationTask: {error}") from error
+            raise TaskRefusedError("Invalid", f"cannot make an ApplicationTask of the demand: {error}") from error
         deleted = name in self._ledger.held
         try:
             self._ledger.put(name, await self._store.create(task))
         except TaskExistsError as error:
             found = await self._store.get(name)
             if found is None or found.leaving:
-                why = "it is being deleted" if found else "it is not this holder's"
-                raise TaskRefusedError("AlreadyExists", f"the name is taken, and {why}: {error}") from error
+                why = "it is being deleted" if found else "it belongs to another holder"
+                raise TaskRefusedError("AlreadyExists", f"the name is already in use ({why}): {error}") from error
             self._ledger.put(name, found)
             self.counts.adopted += 1
         else:
             if deleted:
                 self.counts.recreated += 1
-                _log.info("created the task %s again, since somebody deleted it", name)
+                _log.info("recreated the task %s, which another client deleted", name)
             else:
                 self.counts.created += 1
             if self._traces is not None and not deleted:
@@ -246,19 +246,24 @@ class DemandReconciler:
             self._ledger.put(name, await self._store.set_parameters(stored, plain(demand.parameters)))
             self.counts.patched += 1
             if self._ledger.next(name) is Step.SET_PARAMETERS:
-                raise TaskRefusedError("Altered", "the store changed the parameters that it was given")
+                raise TaskRefusedError("Altered", "the store changed the parameters that it received")
 
     def _unavailable(self, error: StoreUnavailableError) -> None:
         if not self._away.failures:
-            _log.warning("tasks cannot be changed now, and are as soon as possible: %s", error)
+            _log.warning("cannot update tasks; retrying with backoff: %s", error)
         self._reachable.clear()
         self._pause = self._away.fail(error.retry_after)
 
     def _refused(self, step: Step, name: str, error: TaskRefusedError) -> None:
         self.counts.refused[error.reason] += 1
-        if (step, error.reason) not in self._said:
-            self._said.add((step, error.reason))
-            _log.error("cannot %s the task %s (others alike are only counted): %s", step.value, name, error)
+        if (step, error.reason) not in self._logged:
+            self._logged.add((step, error.reason))
+            _log.error(
+                "cannot %s the task %s (further failures of this kind are counted, not logged): %s",
+                step.value,
+                name,
+                error,
+            )
 
 
 def _same(one: StoredTask | None, other: StoredTask) -> bool:

@@ -1,4 +1,6 @@
-"""What to do next about one task, from what is demanded and what is stored. Pure: the same answer whenever asked."""
+"""What to do next about one task, from what is demanded and what is stored. Pure: the same input gives the same
+step.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ class Step(Enum):
     NOTHING = "nothing"
     CREATE = "create"
     REPLACE = "replace"
-    """Delete the task, then create it anew: what is demanded differs in what cannot be changed."""
+    """Delete the task, then recreate it: the demand differs in an immutable field."""
     SET_PARAMETERS = "set parameters"
     END = "end"
 
@@ -29,7 +31,8 @@ def next_step(demand: Demand | None, stored: StoredTask | None, held: bool) -> S
         demand: what is demanded under the task's name; None: nothing (any more).
         stored: the task, if there is one and it is the holder's own.
         held: whether this process has seen the task live for this demand. If it has, and the task has ended, then
-            somebody ended it on purpose and it stays ended. If not, it is left from an earlier run over the same data.
+            another client ended it on purpose and it stays ended. If not, it is left from an earlier run over the same
+            data.
     """
     if demand is None:
         return Step.END if stored is not None and stored.live else Step.NOTHING

@@ -18,7 +18,7 @@ class StoredTask:
 
     task: ApplicationTask
     version: int
-    """Grows with each change of anything in the store, so that of two states the newer one can be told."""
+    """Grows with each change of anything in the store, so that the newer one of two states is known."""
 
     @property
     def live(self) -> bool:
@@ -27,7 +27,7 @@ class StoredTask:
 
     @property
     def leaving(self) -> bool:
-        """Whether somebody deleted it and the store has not yet removed it."""
+        """Whether it is deleted but not yet removed from the store."""
         return self.task.metadata.deletion_timestamp is not None
 
 
@@ -49,7 +49,7 @@ class Update:
 
 
 class StoreError(Exception):
-    """The store did not do what was asked."""
+    """The store did not carry out a request."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -58,30 +58,30 @@ class StoreError(Exception):
 
 
 class StoreUnavailableError(StoreError):
-    """The store is away or busy: the same may succeed soon."""
+    """The store is unavailable or busy: a retry may succeed soon."""
 
     def __init__(self, reason: str, message: str, retry_after: float = 0.0) -> None:
         super().__init__(reason, message)
         self.retry_after = retry_after
-        """Seconds that it asks to wait; 0 where it does not say."""
+        """Seconds to wait as the store requests; 0 if it gives none."""
 
 
 class TaskRefusedError(StoreError):
-    """The store will not have it, until somebody changes something."""
+    """The store refuses it; retrying without a change is useless."""
 
 
 class TaskExistsError(StoreError):
-    """A task of this name exists, perhaps somebody else's."""
+    """A task of this name exists, perhaps of another holder."""
 
 
 class TaskStore(Protocol):
     """The tasks of one holder. Every method but `follow` raises a `StoreError`."""
 
     def follow(self) -> AsyncGenerator[Snapshot | Update, None]:
-        """What is, then what changes, with a fresh snapshot at least every half minute. Never ends, raises nothing."""
+        """A snapshot, then changes, with a new snapshot at least every half minute. Never ends, raises nothing."""
 
     async def get(self, name: str) -> StoredTask | None:
-        """The holder's task of this name; None if there is none, or it is somebody else's."""
+        """The holder's task of this name; None if there is none, or it belongs to another holder."""
 
     async def create(self, task: ApplicationTask) -> StoredTask:
         """Store a new task. `TaskExistsError` if the name is taken."""
@@ -105,7 +105,7 @@ async def restore(store: TaskStore) -> list[Demand]:
         async for change in changes:
             if isinstance(change, Snapshot):
                 return live_demands(change)
-    raise AssertionError("a store's changes never end")
+    raise AssertionError("the stream of a store's changes ended")
 
 
 def live_demands(snapshot: Snapshot) -> list[Demand]:
@@ -120,7 +120,7 @@ def belongs_to(task: ApplicationTask, holder: str) -> bool:
 
 
 def manifest(task: ApplicationTask) -> dict[str, Any]:
-    """The task as it is sent or written: without the fields that say nothing."""
+    """The task as it is sent or written: without empty fields."""
     document = task.to_json()
     document["metadata"] = {key: value for key, value in document["metadata"].items() if value}
     event = task.spec.event

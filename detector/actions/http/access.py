@@ -1,4 +1,4 @@
-"""Headers and certificates of a request, read anew for each: a Secret that is renewed is used from then on."""
+"""Headers and certificates of a request, read again for each: a renewed Secret takes effect at once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wayside.api.actions.http import HttpAccess, HttpHeader
 
 @dataclass(frozen=True, slots=True)
 class Headers:
-    """The headers that the resource asks for, and which texts in them are secret."""
+    """The headers that the resource gives, and which texts in them are secret."""
 
     values: Mapping[str, str]
     secrets: tuple[str, ...]
@@ -38,7 +38,9 @@ def read_headers(access: HttpAccess, field: str) -> Headers:
         at = f"{field}.headers[{index}]"
         value = _value(header, at)
         if any(character in value for character in "\r\n\0"):
-            raise AccessError(f"{at}: the value has line breaks, which no header can have: write it in one line")
+            raise AccessError(
+                f"{at}: the value has line breaks, which an HTTP header cannot have: write it in one line"
+            )
         values[header.name] = value
         if header.value is None and value:
             secrets += [value, *(part for part in value.split() if len(part) >= 4)]
@@ -62,7 +64,7 @@ def _value(header: HttpHeader, at: str) -> str:
 
 
 class TlsContexts:
-    """The TLS context of one endpoint, made anew when its files change."""
+    """The TLS context of one endpoint, rebuilt when its files change."""
 
     def __init__(self) -> None:
         self._made: tuple[object, ssl.SSLContext] | None = None
@@ -92,5 +94,5 @@ def _context(files: TlsFiles | None, field: str) -> ssl.SSLContext:
             context.load_cert_chain(str(files.certificate), str(files.key))
     except (ssl.SSLError, OSError) as error:
         places = ", ".join(str(path) for path in (files.ca, files.certificate, files.key) if isinstance(path, Path))
-        raise AccessError(f"{field}: no certificates can be read from {places}: give files in PEM format") from error
+        raise AccessError(f"{field}: cannot read certificates from {places}: give files in PEM format") from error
     return context

@@ -12,7 +12,7 @@ _AGAIN = frozenset({408, 425, 429})
 """Refusals that are about the moment, not about the request (RFC 9110, RFC 8470, RFC 6585)."""
 
 _BUSY = frozenset({429, 502, 503, 504})
-"""Answers that say of the endpoint that it cannot just now, whatever it is sent."""
+"""Responses of an endpoint that is busy, whatever the request."""
 
 
 class Verdict(Enum):
@@ -31,9 +31,9 @@ class Answer:
 
     status: int
     body: bytes = b""
-    """As much as was asked for at most."""
+    """At most the requested number of bytes."""
     whole: bool = True
-    """Whether the body ended as announced, within what was asked for."""
+    """Whether the body ended as announced, within the requested number of bytes."""
     headers: Mapping[str, str] | None = None
     """By lower-case name."""
     excerpt: str = ""
@@ -54,23 +54,23 @@ def judge(answer: Answer) -> tuple[Verdict, str]:
     """What follows, and why, for people."""
     if 200 <= answer.status < 300:
         return Verdict.DONE, f"answered {answer.status}"
-    said = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")
+    response = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")
     if 300 <= answer.status < 400:
-        return Verdict.FINAL, f"{said}: redirects are not followed, give the place where it is now"
+        return Verdict.FINAL, f"{response}: redirects are not followed, give the place where it is now"
     if answer.status in _AGAIN or answer.status >= 500:
-        return Verdict.AGAIN, said
-    return Verdict.FINAL, said
+        return Verdict.AGAIN, response
+    return Verdict.FINAL, response
 
 
-def wait_asked(retry_after: str, now: float) -> float:
-    """The seconds that a Retry-After header asks for, in either of its forms (RFC 9110, section 10.2.3).
+def retry_after_seconds(retry_after: str, now: float) -> float:
+    """The seconds of a Retry-After header, in either of its forms (RFC 9110, section 10.2.3).
 
     Args:
         retry_after: the header's value, perhaps empty.
         now: seconds since the epoch.
 
     Returns:
-        0 where it says nothing that can be understood.
+        0 if it cannot be parsed.
     """
     text = retry_after.strip()
     if text.isascii() and text.isdigit():

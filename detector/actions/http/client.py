@@ -2,9 +2,9 @@
 
 An endpoint may hang, send a byte a second, announce more than it sends, or send without end. aiohttp runs the exchange
 as a task of an event loop that lives as long as the request: a task can be ended at any moment, which a blocking socket
-cannot. Each request has a connection of its own, nothing of it stays, and no more is read than is asked for.
+cannot. Each request has a connection of its own, nothing of it stays, and no more is read than requested.
 
-What is told of a failure names the endpoint's scheme, host and port only: paths and queries may hold secrets.
+The message of a failure names the endpoint's scheme, host and port only: paths and queries may hold secrets.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _REFUSAL = 4096
 _REFUSAL_TIME = 1.0
 """Seconds that are spent on it."""
 _EXCERPT = 200
-"""Characters of it that are told."""
+"""Maximum characters of it in a message."""
 _LOOK = 0.05
 """Seconds between two looks at whether to give up."""
 
 
 class HttpError(Exception):
-    """A request that got no answer; the text says why, and holds no secret."""
+    """A request without a response; the message gives the reason, and contains no secret."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,19 +71,19 @@ class HttpClient:
         want: int = 0,
         give_up: Callable[[], bool] = lambda: False,
     ) -> Answer:
-        """Send a request and wait for its answer, at most as long as the access says.
+        """Send a request and wait for its answer, at most for the timeout of the access.
 
         Args:
             method: e.g. POST.
             url: http or https, as in the resource.
             headers: of this request; those of the access come on top.
             body: may be empty.
-            want: so many bytes of the body of a success are read; with 0, its status is enough. Of a refusal some
+            want: maximum bytes of the body of a success that are read; with 0, its status is enough. Of a refusal some
                 hundred bytes are read in any case.
-            give_up: asked twenty times a second; once it is true, nobody waits any more.
+            give_up: polled twenty times a second; once it is true, the request is aborted.
 
         Raises:
-            HttpError: there was no answer, or a header or certificate is not where the resource says.
+            HttpError: there was no answer, or a header or certificate is not where the resource places it.
         """
         try:
             target = URL(url, encoded=True)
@@ -103,7 +103,7 @@ class HttpClient:
 
 
 def origin(url: URL) -> str:
-    """What may be told of a URL: scheme, host and port."""
+    """The part of a URL that may be logged: scheme, host and port."""
     return f"{url.scheme}://{url.host}:{url.port}"
 
 
@@ -112,7 +112,7 @@ async def _watched(exchange: _Exchange, give_up: Callable[[], bool]) -> Answer:
     try:
         while not task.done():
             if give_up():
-                raise HttpError(f"{exchange.where}: given up before it answered, since the detector ends")
+                raise HttpError(f"{exchange.where}: aborted before it answered, because the detector is stopping")
             await asyncio.wait({task}, timeout=_LOOK)
         return task.result()
     finally:
@@ -168,14 +168,14 @@ async def _read(exchange: _Exchange, response: aiohttp.ClientResponse) -> Answer
             body, whole = await _body(response, _REFUSAL)
     except TimeoutError:
         body, whole = b"", False
-    said = exchange.headers.strike_out(body.decode(errors="replace"))
-    printable = "".join(character if character.isprintable() else " " for character in said)
+    excerpt = exchange.headers.strike_out(body.decode(errors="replace"))
+    printable = "".join(character if character.isprintable() else " " for character in excerpt)
     excerpt = " ".join(printable.split())[:_EXCERPT]
     return Answer(response.status, body, whole, headers, excerpt)
 
 
 async def _body(response: aiohttp.ClientResponse, limit: int) -> tuple[bytes, bool]:
-    """At most so many bytes, and whether these were all."""
+    """At most `want` bytes, and whether these were all."""
     read = bytearray()
     try:
         while len(read) <= limit:
@@ -193,17 +193,17 @@ def _why(error: Exception) -> str:
     match error:
         case aiohttp.ClientConnectorCertificateError():
             found = error.certificate_error
-            return f"its certificate is not accepted: {getattr(found, 'verify_message', '') or found}"
+            return f"its certificate is not trusted: {getattr(found, 'verify_message', '') or found}"
         case aiohttp.ClientConnectorDNSError():
-            return f"the name cannot be looked up: {error.os_error.strerror or error.os_error}"
+            return f"cannot resolve the host name: {error.os_error.strerror or error.os_error}"
         case aiohttp.ClientConnectorSSLError():
-            return f"TLS fails: {getattr(error.os_error, 'reason', None) or 'it speaks another protocol'}"
+            return f"TLS handshake failed: {getattr(error.os_error, 'reason', None) or 'it speaks another protocol'}"
         case aiohttp.ClientConnectorError():
-            return f"cannot be reached: {error.os_error.strerror or error.os_error}"
+            return f"cannot connect: {error.os_error.strerror or error.os_error}"
         case aiohttp.ServerDisconnectedError():
-            return "it hung up without an answer"
+            return "it closed the connection without a response"
         case aiohttp.ClientResponseError():
-            return "its answer is no HTTP"
+            return "its response is not HTTP"
         case OSError():
             return f"the connection broke: {error.strerror or type(error).__name__}"
         case _:

@@ -1,4 +1,4 @@
-"""Names to addresses, in threads that nobody waits for.
+"""Names to addresses, in threads that are never joined.
 
 The system's resolver cannot be interrupted. On a vehicle without a network it hangs for many seconds, and the threads
 of an executor are waited for when the process ends: these are not.
@@ -23,17 +23,17 @@ class Resolver(AbstractResolver):
         loop = asyncio.get_running_loop()
         found: asyncio.Future[list[ResolveResult]] = loop.create_future()
 
-        def ask() -> None:
+        def look_up() -> None:
             try:
                 answer: list[ResolveResult] | OSError = _addresses(host, port, family)
             except (OSError, UnicodeError) as error:
-                answer = error if isinstance(error, OSError) else OSError(f"{host!r} is no host's name")
+                answer = error if isinstance(error, OSError) else OSError(f"{host!r} is not a host name")
             try:
                 loop.call_soon_threadsafe(_settle, found, answer)
-            except RuntimeError:  # the loop is closed: nobody waits any more
+            except RuntimeError:  # the loop is closed: nothing waits any more
                 return
 
-        threading.Thread(target=ask, name=f"resolve {host}", daemon=True).start()
+        threading.Thread(target=look_up, name=f"resolve {host}", daemon=True).start()
         return await found
 
     async def close(self) -> None:

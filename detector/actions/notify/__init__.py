@@ -1,10 +1,10 @@
-"""The notify action: somebody is told of a rule's episodes.
+"""The notify action: sends a notification of the episodes of a rule.
 
-Notify (the action's thread) ─▶ desk: EventDesk or AlertDesk ◀─ Courier (a thread of its own) ─▶ target
+Notify (the action's thread) ─▶ queue: EventQueue or AlertQueue ◀─ Sender (a thread of its own) ─▶ target
                                   └▶ keeping: journal, dead letters
 
-What is told waits at the desk; the courier sends it, one request at a time, so that an endpoint that hangs costs
-nothing but what it is to be told.
+Notifications wait in the queue; the sender sends one request at a time, so that an endpoint that hangs delays
+only its own notifications.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pydantic import BaseModel
 
 from detector.actions.base import Action, Setting
 from detector.actions.episode import Completion, Episode
-from detector.actions.notify.alerting import AlertDesk, AlertTarget
+from detector.actions.notify.alerting import AlertQueue, AlertTarget
 from detector.actions.notify.alerts import Batch
-from detector.actions.notify.courier import Courier
-from detector.actions.notify.events import EventDesk
+from detector.actions.notify.events import EventQueue
 from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import Notice, Texts, texts
 from detector.actions.notify.outbox import Delivery, Message
+from detector.actions.notify.sender import Sender
 from detector.actions.notify.targets import HttpTarget, Target, ZenohTarget
 from wayside.api.actions import notify as api
 from wayside.api.actions.notify import Moment
@@ -33,7 +33,7 @@ __all__ = ["Notify"]
 
 
 class Notify(Action[api.Notify]):
-    """Tells somebody. What takes time is done by the courier: here nothing waits but for the disk."""
+    """Enqueues notifications. The sender does what takes time: here only the disk blocks."""
 
     Parameters: ClassVar[type[BaseModel]] = api.Notify
 
@@ -49,21 +49,21 @@ class Notify(Action[api.Notify]):
             self._work = _Alerts(parameters, parameters.alertmanager, setting, self._keeping, name, field)
 
     def started(self, episode: Episode) -> None:
-        """Tell of the start, unless another run of the action has."""
-        with self._work.at_desk():
+        """Notify of the start, unless another run of the action has."""
+        with self._work.changing():
             kept = self._keeping.rendered(episode.id) if episode.resumed else None
             rendered = texts(episode.rendered) if kept is None else kept
             self._keeping.open(episode.id, rendered)
             self._work.started(episode, rendered)
 
     def ended(self, episode: Episode) -> None:
-        """Tell of the end."""
-        with self._work.at_desk():
+        """Notify of the end."""
+        with self._work.changing():
             self._work.ended(episode, self._keeping.rendered(episode.id) or texts(episode.rendered))
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """Nothing more will come of it."""
-        with self._work.at_desk():
+        with self._work.changing():
             if episode.ended is not None:
                 self._keeping.over(episode.id)
             self._work.completed(episode)
@@ -76,43 +76,43 @@ class Notify(Action[api.Notify]):
 
 
 class _Events:
-    """Somebody is told by CloudEvents."""
+    """Notifications as CloudEvents."""
 
     def __init__(self, parameters: api.Notify, setting: Setting, keeping: Keeping, name: str, target: Target) -> None:
         self._moments = parameters.moments
-        self._desk = EventDesk(parameters, setting, keeping)
+        self._queue = EventQueue(parameters, setting, keeping)
 
         def send(message: Message, give_up: Callable[[], bool]) -> Delivery:
             return target.send(message.event, give_up)
 
-        self._courier = Courier(name, self._desk, send)
+        self._sender = Sender(name, self._queue, send)
 
-    def at_desk(self) -> AbstractContextManager[None]:
-        return self._courier.at_desk()
+    def changing(self) -> AbstractContextManager[None]:
+        return self._sender.changing()
 
     def started(self, episode: Episode, rendered: Texts) -> None:
-        self._desk.opened(episode)
+        self._queue.opened(episode)
         if not episode.resumed:
-            self._tell(Moment.STARTED, episode, episode.started, rendered)
+            self._notify(Moment.STARTED, episode, episode.started, rendered)
 
     def ended(self, episode: Episode, rendered: Texts) -> None:
         if episode.ended is not None:
-            self._tell(Moment.ENDED, episode, episode.ended, rendered)
+            self._notify(Moment.ENDED, episode, episode.ended, rendered)
 
     def completed(self, episode: Episode) -> None:
-        self._desk.ledger.close(episode.id)
+        self._queue.ledger.close(episode.id)
 
     def close(self, keep: bool) -> None:
-        self._courier.finish()
-        self._desk.leave(keep)
+        self._sender.finish()
+        self._queue.drain(keep)
 
-    def _tell(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: Texts) -> None:
+    def _notify(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: Texts) -> None:
         if moment in self._moments:
-            self._desk.add(Notice(episode.id, event, rendered, time.time()), time.monotonic())
+            self._queue.add(Notice(episode.id, event, rendered, time.time()), time.monotonic())
 
 
 class _Alerts:
-    """Somebody is told by an Alertmanager."""
+    """Notifications through an Alertmanager."""
 
     def __init__(
         self,
@@ -123,24 +123,24 @@ class _Alerts:
         name: str,
         field: str,
     ) -> None:
-        self._desk = AlertDesk(parameters, alertmanager, setting, keeping)
-        self._courier: Courier[Batch] = Courier(name, self._desk, AlertTarget(alertmanager, field).send)
+        self._queue = AlertQueue(parameters, alertmanager, setting, keeping)
+        self._sender: Sender[Batch] = Sender(name, self._queue, AlertTarget(alertmanager, field).send)
 
-    def at_desk(self) -> AbstractContextManager[None]:
-        return self._courier.at_desk()
+    def changing(self) -> AbstractContextManager[None]:
+        return self._sender.changing()
 
     def started(self, episode: Episode, rendered: Texts) -> None:
-        self._desk.opened(episode, rendered)
+        self._queue.opened(episode, rendered)
 
     def ended(self, episode: Episode, rendered: Texts) -> None:
-        self._desk.over(episode)
+        self._queue.over(episode)
 
     def completed(self, episode: Episode) -> None:
-        """An alert is told to be over when its episode ends, and that is all."""
+        """Nothing to do: an alert is resolved when its episode ends."""
 
     def close(self, keep: bool) -> None:
-        self._courier.finish()
-        self._desk.leave()
+        self._sender.finish()
+        self._queue.drain()
 
 
 def _target(parameters: api.Notify, setting: Setting, field: str) -> Target:
@@ -148,4 +148,4 @@ def _target(parameters: api.Notify, setting: Setting, field: str) -> Target:
         return HttpTarget(parameters.http, f"{field}.http")
     if parameters.zenoh is not None:
         return ZenohTarget(parameters.zenoh, setting.messenger)
-    raise ValueError("the model lets nothing through without a target")
+    raise ValueError("the model requires a target")

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from detector.actions.base import Setting
 from detector.actions.episode import Episode, Outcome, OutcomeState
 from detector.actions.notify.alerts import Alert, Alerts, Batch, document, labels_of
-from detector.actions.notify.events import FULL, UNTOLD
+from detector.actions.notify.events import FULL, UNDELIVERED
 from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import Notice, Texts
 from detector.actions.notify.outbox import Delivery, Fate
@@ -19,8 +19,8 @@ from wayside.api.actions.notify import Notify, NotifyAlertmanager
 _PATH = "/api/v2/alerts"
 
 
-class AlertDesk:
-    """What fires and what is over. Its lock is the courier's."""
+class AlertQueue:
+    """Firing and resolved alerts. Guarded by the lock of the sender."""
 
     def __init__(self, notify: Notify, alertmanager: NotifyAlertmanager, setting: Setting, keeping: Keeping) -> None:
         self._alerts = Alerts(alertmanager.repeat.seconds, notify.give_up_after.seconds, notify.waiting)
@@ -40,7 +40,7 @@ class AlertDesk:
             self._lose(alert, FULL)
 
     def over(self, episode: Episode) -> None:
-        """It is to be told that it is over."""
+        """Resolve its alert."""
         if episode.id in self._episodes:
             self._episodes[episode.id] = episode, self._episodes[episode.id][1]
             now = time.time_ns()
@@ -56,38 +56,45 @@ class AlertDesk:
         return self._alerts.wait(now)
 
     def hurry(self) -> None:
-        """What was not yet told is told once more."""
+        """Try undelivered alerts once more."""
         self._alerts.hurry()
 
     def settle(self, sent: Batch, delivery: Delivery, now: float) -> None:
         """What came of a request."""
-        told, given_up = self._alerts.settle(sent, delivery, now)
+        ended, given_up = self._alerts.settle(sent, delivery, now)
         if delivery.fate is Fate.REFUSED:
-            self._setting.lose("times that alerts were refused", len(sent.alerts), delivery.why)
+            self._setting.lose("alerts rejected by the Alertmanager", len(sent.alerts), delivery.why)
         for alert in given_up:
             self._lose(alert, delivery.why)
-        for alert in told:
-            self._told(alert)
-        done = {alert.episode for alert in (*told, *given_up)}
+        for alert in ended:
+            self._delivered(alert)
+        done = {alert.episode for alert in (*ended, *given_up)}
         for alert in sent.alerts:
             if alert.episode not in done and alert.episode in self._episodes:
-                said = "fires" if delivery.fate is Fate.DELIVERED else f"not delivered yet: {delivery.why}"
-                self._report(alert, OutcomeState.RUNNING, said)
+                text = "fires" if delivery.fate is Fate.DELIVERED else f"not delivered yet: {delivery.why}"
+                self._report(alert, OutcomeState.RUNNING, text)
 
-    def leave(self) -> None:
-        """The end. What was not heard is lost. What still fires lapses, or goes on after the next start."""
-        for alert in self._alerts.leave():
-            if alert.heard and alert.ends_at is None:
-                self._report(alert, OutcomeState.DONE, "it had not ended: its alert lapses, or the next start goes on")
+    def drain(self) -> None:
+        """The end. Undelivered alerts are lost. Firing alerts expire, or continue after the next start."""
+        for alert in self._alerts.drain():
+            if alert.delivered and alert.ends_at is None:
+                self._report(
+                    alert,
+                    OutcomeState.DONE,
+                    "the episode had not ended: its alert expires, unless the next start takes it up",
+                )
             else:
-                self._lose(alert, UNTOLD)
+                self._lose(alert, UNDELIVERED)
 
-    def _told(self, alert: Alert) -> None:
-        if alert.heard or alert.attempts == 1:
+    def _delivered(self, alert: Alert) -> None:
+        if alert.delivered or alert.attempts == 1:
             self._report(alert, OutcomeState.DONE, "")
         else:
-            why = "it was heard of only when it was over, after failures: an Alertmanager tells nobody of such alerts"
-            self._setting.lose("alerts that nobody heard of", 1, why)
+            why = (
+                "it was accepted only after the episode had ended, because of failures: an Alertmanager "
+                "notifies nobody of such alerts"
+            )
+            self._setting.lose("alerts that reached nobody", 1, why)
             self._report(alert, OutcomeState.FAILED, why)
         self._episodes.pop(alert.episode, None)
 
@@ -104,8 +111,8 @@ class AlertDesk:
     def _report(self, alert: Alert, state: OutcomeState, message: str) -> None:
         episode, _ = self._episodes[alert.episode]
         remark = "; ".join(f"{name}: {why}" for name, why in sorted(episode.unrendered.items()))
-        told = f"{message} ({remark})" if message and remark else message or remark
-        self._setting.report(episode, Outcome(state, told, details={"attempts": alert.attempts}))
+        text = f"{message} ({remark})" if message and remark else message or remark
+        self._setting.report(episode, Outcome(state, text, details={"attempts": alert.attempts}))
 
 
 class AlertTarget:

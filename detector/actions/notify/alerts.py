@@ -1,8 +1,8 @@
-"""Alerts as an Alertmanager has them: what fires is told time and again, what is over is told until it is heard. Pure.
+"""Alerts as an Alertmanager has them: firing alerts are repeated, resolved ones are sent until delivered. Pure.
 
 An alert is known by its labels, and those of an episode never change: alertname (the rule), detector, subject, episode,
-the element of `each` where there is one, and the rule's own. Without word for four times `repeat` the Alertmanager
-takes it to be over: so nothing fires for ever when a detector is lost.
+the element of `each` where there is one, and the rule's own. Without an update for four times `repeat` the Alertmanager
+resolves it, so nothing fires for ever when a detector is lost.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from detector.actions.notify.notice import Texts
-from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_ASKED, Delivery, Fate
+from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_RETRY_AFTER, Delivery, Fate
 from detector.cluster.backoff import Backoff
 from wayside.times import format_time
 
@@ -34,7 +34,7 @@ class Alert:
     ends_at: int | None = None
     since: float = 0.0
     """When it was over."""
-    heard: bool = False
+    delivered: bool = False
     """Whether it was ever delivered."""
     attempts: int = 0
 
@@ -45,7 +45,7 @@ class Batch:
 
     alerts: Sequence[Alert]
     over: frozenset[str]
-    """The episodes of those that are told to be over: while it is sent, more may end."""
+    """The episodes of the resolved alerts: during the request, more may end."""
 
 
 def labels_of(texts: Texts, rule: str, holder: str, subject: str, episode: str, element: str | None) -> dict[str, str]:
@@ -66,7 +66,7 @@ def document(alert: Alert, over: bool, now: int, repeat: float) -> dict[str, Any
 
 
 class Alerts:
-    """Those that fire, and those that are over and not yet told. `now` is in seconds of a monotonic clock."""
+    """Firing alerts, and resolved ones that are not yet delivered. `now` is in seconds of a monotonic clock."""
 
     def __init__(self, repeat: float, give_up_after: float, capacity: int) -> None:
         self._repeat, self._give_up_after, self._capacity = repeat, give_up_after, capacity
@@ -89,14 +89,14 @@ class Alerts:
             alert.ends_at, alert.since, alert.due = ends_at, now, now
 
     def hurry(self) -> None:
-        """From now on, only what was not yet told is told, once more, without waiting for its time."""
+        """From now on, only undelivered alerts are sent, once more and at once."""
         self._last_tries = set()
 
     def take(self, now: float) -> Batch | None:
         """What to send now, in one request."""
         if self._last_tries is not None:
-            untold = (alert for alert in self._alerts.values() if alert.ends_at is not None or not alert.heard)
-            chosen = [alert for alert in untold if alert.episode not in self._last_tries][:BATCH]
+            pending = (alert for alert in self._alerts.values() if alert.ends_at is not None or not alert.delivered)
+            chosen = [alert for alert in pending if alert.episode not in self._last_tries][:BATCH]
             self._last_tries |= {alert.episode for alert in chosen}
         elif now < self._paused_until:
             return None
@@ -111,33 +111,33 @@ class Alerts:
         return None if due is None else max(0.0, due - now, self._paused_until - now)
 
     def settle(self, sent: Batch, delivery: Delivery, now: float) -> tuple[list[Alert], list[Alert]]:
-        """Those that are over and told, and those that are over and given up; none of them is here any more.
+        """Resolved alerts that were delivered, and resolved alerts that were given up; both are removed.
 
         Those that fire go on: a refusal holds until the next time they are due.
         """
         if delivery.fate is Fate.AGAIN:
-            self._paused_until = now + max(min(delivery.asked, LONGEST_ASKED), self._pause.fail())
+            self._paused_until = now + max(min(delivery.retry_after, LONGEST_RETRY_AFTER), self._pause.fail())
         else:
             self._pause.succeed()
-        told: list[Alert] = []
+        ended: list[Alert] = []
         given_up: list[Alert] = []
         for alert in sent.alerts:
             alert.attempts += 1
             if alert.episode in sent.over:
                 if delivery.fate is Fate.DELIVERED:
-                    told.append(alert)
+                    ended.append(alert)
                 elif delivery.fate is Fate.REFUSED or now - alert.since >= self._give_up_after:
                     given_up.append(alert)
                 continue
-            alert.heard |= delivery.fate is Fate.DELIVERED
+            alert.delivered |= delivery.fate is Fate.DELIVERED
             if alert.ends_at is None and delivery.fate is not Fate.AGAIN:
                 alert.due = now + self._repeat
-        for alert in (*told, *given_up):
+        for alert in (*ended, *given_up):
             self._alerts.pop(alert.episode, None)
-        return told, given_up
+        return ended, given_up
 
-    def leave(self) -> list[Alert]:
+    def drain(self) -> list[Alert]:
         """All that are here; they are here no more."""
-        left = list(self._alerts.values())
+        drained = list(self._alerts.values())
         self._alerts.clear()
-        return left
+        return drained

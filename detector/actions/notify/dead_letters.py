@@ -1,4 +1,4 @@
-"""Events that nobody was told of, in a file: one JSON object a line, with why.
+"""Undelivered events, in a file: one JSON object a line, with why.
 
 The file is bounded: when it is full it becomes `….old.jsonl`, in place of the one before, and a new one begins.
 """

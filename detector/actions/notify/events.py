@@ -1,4 +1,4 @@
-"""CloudEvents to tell of: kept, grouped, sent, and at last delivered or dead letters."""
+"""CloudEvents to send: kept, grouped, sent, and finally delivered or dead letters."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from detector.actions.base import Setting
 from detector.actions.episode import Episode
 from detector.actions.notify.grouping import Groups
 from detector.actions.notify.keeping import Keeping
-from detector.actions.notify.ledger import Ledger
+from detector.actions.notify.ledger import DeliveryLedger
 from detector.actions.notify.notice import Notice, event_of, event_of_group
 from detector.actions.notify.outbox import Budget, Delivery, Fate, Message, Outbox
 from detector.actions.notify.targets import encoded
 from wayside.api.actions.notify import Notify
 
-UNTOLD = "the detector ended, or the rule no longer has this action, before it was delivered"
-FULL = "more messages wait than the rule allows (waiting)"
+UNDELIVERED = "the detector stopped, or the action was removed from the rule, before it was delivered"
+FULL = "the queue is full (waiting)"
 
 
-class EventDesk:
-    """What a rule has to tell by one action, from `add` to delivery. Its lock is the courier's."""
+class EventQueue:
+    """The events of one action, from `add` to delivery. Guarded by the lock of the sender."""
 
     def __init__(self, notify: Notify, setting: Setting, keeping: Keeping) -> None:
         rate, grouping = notify.rate, notify.grouping
@@ -31,12 +31,12 @@ class EventDesk:
         self._action = setting.action
         self._keeping = keeping
         self._hurrying = False
-        self.ledger = Ledger(setting.report)
+        self.ledger = DeliveryLedger(setting.report)
         for notice in keeping.waiting():
             self._admit(notice, time.monotonic())
 
     def add(self, notice: Notice, now: float) -> None:
-        """Tell of this as well."""
+        """Enqueue an event."""
         self._keeping.keep(notice)
         self._admit(notice, now)
 
@@ -74,13 +74,13 @@ class EventDesk:
         return min((wait for wait in waits if wait is not None), default=None)
 
     def settle(self, sent: Message, delivery: Delivery, now: float) -> None:
-        """What came of an attempt."""
+        """Apply the result of an attempt."""
         fate = self._outbox.settle(sent, delivery, now, time.time())
         if fate is Fate.DELIVERED:
             size = len(encoded(sent.event))
             for notice in sent.notices:
                 self.ledger.delivered(notice.episode, size)
-            self._keeping.told(sent.notices)
+            self._keeping.delivered(sent.notices)
         elif fate is Fate.REFUSED:
             attempts = f"after {sent.attempts} attempts, " if delivery.fate is Fate.AGAIN else ""
             self._lose(sent, f"{attempts}{delivery.why}")
@@ -94,14 +94,14 @@ class EventDesk:
         self._close_groups(0.0)
         self._outbox.hurry()
 
-    def leave(self, keep: bool) -> None:
-        """The end: what waits is told after the next start if it is to be kept and can be, and else lost."""
-        for message in self._outbox.leave():
+    def drain(self, keep: bool) -> None:
+        """The end: events that wait are sent after the next start if they are kept, else they are lost."""
+        for message in self._outbox.drain():
             if keep and all(map(self._keeping.keeps_notice, message.notices)):
                 for episode in message.episodes:
                     self.ledger.kept(episode)
             else:
-                self._lose(message, UNTOLD)
+                self._lose(message, UNDELIVERED)
 
     def _lose(self, message: Message, why: str) -> None:
         self._keeping.lose(message.notices, why, message.attempts)

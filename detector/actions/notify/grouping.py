@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from detector.actions.notify.notice import Notice
 
 MOST = 10_000
-"""So many events wait in all groups together; beyond, the oldest group is closed early."""
+"""Maximum number of events in all groups together; beyond it, the oldest group is closed early."""
 
 
 @dataclass(slots=True)

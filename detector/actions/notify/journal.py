@@ -1,11 +1,11 @@
-"""What is not yet told, in a file: it outlives a kill -9.
+"""Undelivered events, in a file that survives a kill -9.
 
 One JSON object a line: `{"put": key, "document": {…}}` or `{"drop": [keys]}`. What the system was given survives the
-process; a power cut may take the last seconds. A line that was cut by the end is skipped. The file is written anew, in
+process; a power cut may take the last seconds. A line that was cut by the end is skipped. The file is rewritten, in
 one step, when it holds much that is dropped.
 
 A changed action works beside its predecessor for as long as that has episodes to complete: each has a file that it
-locks, and takes over those that nobody has locked.
+locks, and takes over those that are not locked.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from typing import Any, BinaryIO
 _log = logging.getLogger(__name__)
 
 _FILES = 16
-"""An action has so many files at most: one, and those of predecessors that still work."""
+"""Maximum number of files of an action: its own, and those of predecessors that still run."""
 _SLACK = 1 << 20
 """Bytes of what is dropped that a file may hold beside what is not."""
 
 
 class JournalError(Exception):
-    """There can be no journal; the text says why."""
+    """The journal cannot be opened; the message gives the reason."""
 
 
 class Journal:
@@ -54,9 +54,9 @@ class Journal:
                     taken.append((path, file))
                     self._read(file)
         except OSError as error:
-            raise JournalError(f"{folder} cannot be written ({error.strerror})") from error
+            raise JournalError(f"cannot write {folder} ({error.strerror})") from error
         if not taken:
-            raise JournalError(f"{folder} has {_FILES} journals of {name} in use")
+            raise JournalError(f"{folder} already has {_FILES} journals of {name} in use")
         self._path, self._file = taken[0]
         try:
             self._rewrite()
@@ -64,7 +64,7 @@ class Journal:
                 path.unlink()
                 file.close()
         except OSError as error:
-            raise JournalError(f"{folder} cannot be written ({error.strerror})") from error
+            raise JournalError(f"cannot write {folder} ({error.strerror})") from error
 
     def put(self, key: str, document: Mapping[str, Any]) -> None:
         """Keep a document. Raises OSError where the disk refuses; it is then not kept."""
@@ -133,7 +133,7 @@ class Journal:
 
 
 def _locked(path: Path) -> BinaryIO | None:
-    """The file, made where there is none; None where somebody has it."""
+    """The file, made where there is none; None if it is locked."""
     file = path.open("a+b", buffering=0)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

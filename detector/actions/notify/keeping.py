@@ -1,7 +1,7 @@
-"""What an action keeps on the state volume: what is not yet told, what is rendered for open episodes, dead letters.
+"""What an action keeps on the state volume: undelivered events, rendered texts of open episodes, dead letters.
 
-Where the Detector has no state volume, or its disk refuses, everything else goes on: what would not survive is counted,
-and so is what nobody was told of.
+Without a state volume, or if its disk fails, everything else continues: events that would not survive are counted,
+and so are undelivered ones.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _log = logging.getLogger(__name__)
 FOLDER = "notify"
 """In the folder of `spec.state`."""
 _NOTICE, _OPEN = "notice/", "open/"
-_LOST = "events that nobody was told of"
-_UNKEPT = "events that would not survive the detector's end"
+_LOST = "events not delivered to any target"
+_UNKEPT = "events that would not survive a restart"
 
 
 class Keeping:
@@ -47,28 +47,30 @@ class Keeping:
         try:
             self._journal = Journal(folder, name)
         except JournalError as error:
-            _log.error("what action %s of EventRule %s has to tell is not kept: %s", *whose[:1:-1], error)
+            _log.error("the events of action %s of EventRule %s are not kept on disk: %s", *whose[:1:-1], error)
             setting.lose(_UNKEPT, 1, str(error))
             return
         if self._journal.unreadable:
-            setting.lose("lines of the journal that could not be read", self._journal.unreadable, "no JSON of ours")
+            setting.lose(
+                "lines of the journal that could not be read", self._journal.unreadable, "not JSON of this format"
+            )
 
     def waiting(self) -> list[Notice]:
-        """What earlier runs did not tell, oldest first."""
+        """Undelivered events of earlier runs, oldest first."""
         found: list[Notice] = []
         for key, document in list(self._kept(_NOTICE).items()):
             try:
                 found.append(notice_from(document))
             except (KeyError, TypeError, ValueError, AttributeError) as error:
-                self._setting.lose(_LOST, 1, f"the journal's entry cannot be read: {type(error).__name__}")
+                self._setting.lose(_LOST, 1, f"cannot read the entry of the journal: {type(error).__name__}")
                 self._drop([key])
         return found
 
     def keep(self, notice: Notice) -> None:
-        """Until `told`."""
+        """Until `delivered`."""
         self._put(_NOTICE + notice.id, notice.to_json())
 
-    def told(self, notices: Iterable[Notice]) -> None:
+    def delivered(self, notices: Iterable[Notice]) -> None:
         """These need not be kept any more."""
         self._drop([_NOTICE + notice.id for notice in notices])
 
@@ -98,7 +100,7 @@ class Keeping:
         self._drop([_OPEN + episode])
 
     def lose(self, notices: Iterable[Notice], why: str, attempts: int) -> None:
-        """Nobody will be told of these: they become dead letters, and are counted."""
+        """These are given up: they become dead letters, and are counted."""
         lost = list(notices)
         self._setting.lose(_LOST, len(lost), why)
         for notice in lost:
@@ -113,12 +115,12 @@ class Keeping:
             }
             try:
                 if self._letters is None:
-                    _log.error("nobody was told of event %s: %s", notice.id, why)
+                    _log.error("event %s was not delivered to any target: %s", notice.id, why)
                 else:
                     self._letters.write(letter)
             except (OSError, ValueError) as error:
                 self._setting.lose("dead letters that could not be written", 1, str(error))
-        self.told(lost)
+        self.delivered(lost)
 
     def close(self, keep: bool) -> None:
         """The last call. Without `keep` nothing is left for the next start."""
@@ -127,7 +129,7 @@ class Keeping:
             try:
                 self._journal.close()
             except OSError as error:
-                _log.error("the journal of action %s cannot be closed: %s", self._setting.action, error)
+                _log.error("cannot close the journal of action %s: %s", self._setting.action, error)
 
     def _kept(self, prefix: str) -> Mapping[str, dict[str, Any]]:
         live = {} if self._journal is None else self._journal.live
@@ -147,4 +149,4 @@ class Keeping:
         try:
             self._journal.drop(keys)
         except OSError as error:
-            self._setting.lose("entries of the journal that could not be dropped", len(keys), str(error))
+            self._setting.lose("journal entries that could not be dropped", len(keys), str(error))

@@ -11,7 +11,7 @@ from detector.actions.episode import Episode, Outcome, OutcomeState
 @dataclass(slots=True)
 class _Entry:
     episode: Episode | None = None
-    """None: it is of before the restart."""
+    """None: it is from before the restart."""
     open: bool = False
     waiting: int = 0
     delivered: int = 0
@@ -21,7 +21,7 @@ class _Entry:
     remark: str = ""
 
 
-class Ledger:
+class DeliveryLedger:
     """Counts by episode. An episode is done with once nothing of it waits and nothing more will come."""
 
     def __init__(self, report: Callable[[Episode, Outcome], None]) -> None:
@@ -46,26 +46,26 @@ class Ledger:
         self._entry(episode).waiting += 1
 
     def delivered(self, episode: str, size: int) -> None:
-        """One arrived, of so many bytes."""
+        """A message of `size` bytes was delivered."""
         entry = self._entry(episode)
         entry.waiting -= 1
         entry.attempts += 1
         entry.delivered += 1
         entry.bytes += size
         if entry.open or entry.waiting:
-            self._tell(entry, OutcomeState.RUNNING, f"{entry.delivered} delivered")
+            self._report_entry(entry, OutcomeState.RUNNING, f"{entry.delivered} delivered")
         self._settle(episode)
 
     def retried(self, episode: str, why: str) -> None:
         """One was not delivered, and is tried again."""
         entry = self._entry(episode)
         entry.attempts += 1
-        self._tell(entry, OutcomeState.RUNNING, f"not delivered yet: {why}")
+        self._report_entry(entry, OutcomeState.RUNNING, f"not delivered yet: {why}")
 
     def kept(self, episode: str) -> None:
         """One is left to the next start of the detector."""
         entry = self._entry(episode)
-        self._tell(entry, OutcomeState.RUNNING, "not delivered yet: it is tried again after the detector's next start")
+        self._report_entry(entry, OutcomeState.RUNNING, "not delivered yet: the detector retries after its next start")
 
     def failed(self, episode: str, why: str) -> None:
         """One was given up."""
@@ -74,7 +74,7 @@ class Ledger:
         entry.attempts += 1
         entry.failures.append(why)
         if entry.open or entry.waiting:
-            self._tell(entry, OutcomeState.RUNNING, f"not delivered: {why}")
+            self._report_entry(entry, OutcomeState.RUNNING, f"not delivered: {why}")
         self._settle(episode)
 
     def _entry(self, episode: str) -> _Entry:
@@ -86,14 +86,14 @@ class Ledger:
             return
         del self._entries[episode]
         if entry.failures:
-            self._tell(entry, OutcomeState.FAILED, "not delivered: " + "; ".join(dict.fromkeys(entry.failures)))
+            self._report_entry(entry, OutcomeState.FAILED, "not delivered: " + "; ".join(dict.fromkeys(entry.failures)))
         else:
-            self._tell(entry, OutcomeState.DONE, "" if entry.delivered else "there was nothing to tell of it")
+            self._report_entry(entry, OutcomeState.DONE, "" if entry.delivered else "there was nothing to send")
 
-    def _tell(self, entry: _Entry, state: OutcomeState, message: str) -> None:
+    def _report_entry(self, entry: _Entry, state: OutcomeState, message: str) -> None:
         if entry.episode is None:
             return
-        told = f"{message} ({entry.remark})" if message and entry.remark else message or entry.remark
+        text = f"{message} ({entry.remark})" if message and entry.remark else message or entry.remark
         details = {"messages": entry.delivered, "attempts": entry.attempts}
         lost = len(entry.failures)
-        self._report(entry.episode, Outcome(state, told, bytes=entry.bytes, missing=lost, details=details))
+        self._report(entry.episode, Outcome(state, text, bytes=entry.bytes, missing=lost, details=details))

@@ -1,4 +1,4 @@
-"""What somebody is told of: one event of an episode, with the texts that the rule has for it."""
+"""A notification: one event of an episode, with the texts that the rule gives it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GROUP_TYPE = "dev.wayside.event.group"
 
 @dataclass(frozen=True, slots=True)
 class Texts:
-    """What a rule says in words of an episode."""
+    """The texts of a rule about an episode."""
 
     title: str | None = None
     text: str | None = None
@@ -48,7 +48,7 @@ def _text(value: Any) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One event to tell of."""
+    """One event to notify of."""
 
     episode: str
     event: Mapping[str, Any]
@@ -59,7 +59,7 @@ class Notice:
 
     @property
     def id(self) -> str:
-        """That of the event, which is the same however often it is told."""
+        """That of the event, which is the same for every attempt."""
         return str(self.event["id"])
 
     @property
@@ -87,8 +87,8 @@ def notice_from(document: Mapping[str, Any]) -> Notice:
 
 def event_of(notice: Notice) -> dict[str, Any]:
     """The CloudEvent of a single event: as published on Zenoh, its data with the rule's texts."""
-    told = notice.texts.to_json()
-    data = {**notice.event["data"], **({"notification": told} if told else {})}
+    notification = notice.texts.to_json()
+    data = {**notice.event["data"], **({"notification": notification} if notification else {})}
     return {**notice.event, "data": data}
 
 
@@ -102,14 +102,14 @@ def event_of_group(notices: Sequence[Notice], action: str, by: Sequence[str], ma
         notices: at least one.
         action: the action's name in the rule.
         by: the labels that they are grouped by.
-        maximum: so many are given in full.
+        maximum: number of events given in full.
     """
     first, last = notices[0], notices[-1]
     ids = "\n".join(notice.id for notice in notices)
     more = len(notices) - 1
     labels = {name: first.texts.labels.get(name, "") for name in by}
     text = first.texts.text
-    told = Texts(first.texts.title, f"{text} (and {more} more)" if text and more else text, labels).to_json()
+    notification = Texts(first.texts.title, f"{text} (and {more} more)" if text and more else text, labels).to_json()
     starts = sum(notice.moment is Moment.STARTED for notice in notices)
     return {
         "specversion": "1.0",
@@ -127,6 +127,6 @@ def event_of_group(notices: Sequence[Notice], action: str, by: Sequence[str], ma
             "ended": len(notices) - starts,
             "events": [event_of(notice) for notice in notices[:maximum]],
             "omitted": max(0, len(notices) - maximum),
-            **({"notification": told} if told else {}),
+            **({"notification": notification} if notification else {}),
         },
     }

@@ -1,7 +1,7 @@
 """Messages that wait to be delivered: which is next, when, and when it is given up. Pure: `now` comes in.
 
 A message that fails waits longer each time, and others pass it by, but never those of the same episode: the end is not
-told before the start. An endpoint that does not answer, or says that it is busy, is left alone as a whole for a while.
+sent before the start. An endpoint that does not answer, or reports that it is busy, is paused as a whole.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from detector.cluster.backoff import Backoff
 
 FIRST, LONGEST = 1.0, 300.0
 """Seconds until the second attempt, and between two attempts at most."""
-LONGEST_ASKED = 3600.0
+LONGEST_RETRY_AFTER = 3600.0
 """Seconds that a Retry-After is heeded at most."""
 
 
@@ -36,15 +36,15 @@ class Delivery:
 
     fate: Fate
     why: str = ""
-    asked: float = 0.0
-    """Seconds that the endpoint asks to be left alone, at least."""
+    retry_after: float = 0.0
+    """Minimum seconds until the next attempt, as the endpoint requests."""
     whole: bool = False
-    """It is the endpoint that is away or busy, not this message that it does not like."""
+    """The endpoint as a whole is unavailable or busy; the message is not at fault."""
 
 
 @dataclass(eq=False, slots=True)
 class Message:
-    """One CloudEvent to deliver, and the events that it tells of."""
+    """One CloudEvent to deliver, and the events that it contains."""
 
     event: Mapping[str, Any]
     notices: Sequence[Notice]
@@ -54,17 +54,17 @@ class Message:
 
     @property
     def created(self) -> float:
-        """When the first of its events was told, in seconds since the epoch."""
+        """When the first of its events was created, in seconds since the epoch."""
         return min(notice.created for notice in self.notices)
 
     @property
     def episodes(self) -> frozenset[str]:
-        """Those that it tells of."""
+        """The episodes of its events."""
         return frozenset(notice.episode for notice in self.notices)
 
 
 class Budget:
-    """At most so many messages in any stretch of so much time."""
+    """At most `messages` messages in any period of `per` seconds."""
 
     def __init__(self, messages: int, per: float) -> None:
         self._per = per
@@ -108,7 +108,7 @@ class Outbox:
         self._last_tries = set()
 
     def take(self, now: float) -> Message | None:
-        """The message to send now; tell `settle` what came of it before the next."""
+        """The message to send now; call `settle` with the result before the next."""
         if self._budget is not None and self._budget.wait(now) > 0:
             return None
         if self._last_tries is None and now < self._paused_until:
@@ -150,17 +150,17 @@ class Outbox:
             self._pause.succeed()
         fate = delivery.fate
         if fate is Fate.AGAIN:
-            asked = min(delivery.asked, LONGEST_ASKED)
-            message.due = now + max(asked, message.backoff.fail())
+            wait = min(delivery.retry_after, LONGEST_RETRY_AFTER)
+            message.due = now + max(wait, message.backoff.fail())
             if delivery.whole:
-                self._paused_until = now + max(asked, self._pause.fail())
+                self._paused_until = now + max(wait, self._pause.fail())
             if wall - message.created >= self._give_up_after:
                 fate = Fate.REFUSED
         if fate is not Fate.AGAIN:
             self._waiting.remove(message)
         return fate
 
-    def leave(self) -> list[Message]:
+    def drain(self) -> list[Message]:
         """What still waits; it is here no more."""
-        left, self._waiting = self._waiting, []
-        return left
+        drained, self._waiting = self._waiting, []
+        return drained

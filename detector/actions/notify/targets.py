@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from detector.access import AccessError, secret_text
 from detector.actions.base import Messenger
 from detector.actions.http import HttpClient, HttpError, Verdict, judge
-from detector.actions.http.answer import wait_asked
+from detector.actions.http.answer import retry_after_seconds
 from detector.actions.notify.outbox import Delivery, Fate
 from wayside.api.actions.http import HttpAccess
 from wayside.api.actions.notify import ContentMode, NotifyHttp, NotifyZenoh
@@ -56,7 +56,7 @@ def _header_value(text: str) -> str:
 
 
 class Poster:
-    """Posts to one endpoint, and says what follows from its answer."""
+    """Posts to one endpoint, and interprets its response."""
 
     def __init__(self, access: HttpAccess, field: str) -> None:
         """`field` is where `access` stands in the rule."""
@@ -73,7 +73,9 @@ class Poster:
             return Delivery(Fate.DELIVERED, why)
         if verdict is Verdict.FINAL:
             return Delivery(Fate.REFUSED, why)
-        return Delivery(Fate.AGAIN, why, asked=wait_asked(answer.retry_after, time.time()), whole=answer.busy)
+        return Delivery(
+            Fate.AGAIN, why, retry_after=retry_after_seconds(answer.retry_after, time.time()), whole=answer.busy
+        )
 
 
 class HttpTarget:
@@ -88,7 +90,7 @@ class HttpTarget:
         try:
             headers, body = structured(event) if self._http.mode is ContentMode.STRUCTURED else binary(event)
         except ValueError as error:
-            return Delivery(Fate.REFUSED, f"the event cannot be sent as JSON: {error}")
+            return Delivery(Fate.REFUSED, f"cannot send the event as JSON: {error}")
         try:
             url = self._url()
         except AccessError as error:
@@ -102,7 +104,7 @@ class HttpTarget:
         at = f"{self._field}.urlSecret"
         url = secret_text(secret.name, secret.key, at).strip()
         if not url.startswith(("http://", "https://")):
-            raise AccessError(f"{at}: what the Secret {secret.name} holds is no URL: write https://… there")
+            raise AccessError(f"{at}: the content of the Secret {secret.name} is not a URL: write https://… there")
         return url
 
 
@@ -117,5 +119,5 @@ class ZenohTarget:
         try:
             self._messenger.publish(self._key, encoded(event), STRUCTURED)
         except ValueError as error:
-            return Delivery(Fate.REFUSED, f"the event cannot be sent as JSON: {error}")
+            return Delivery(Fate.REFUSED, f"cannot send the event as JSON: {error}")
         return Delivery(Fate.DELIVERED)

@@ -2,7 +2,7 @@
 
 `action` keeps a `recording` for each open episode; its `folder` is hidden until it is whole, its room comes from the
 `destination` that all rules share, and its samples go through an `mcap_file`. What a killed process leaves behind,
-`recovery` completes. `description`, `channels` and `bag` say what recordings tell of themselves.
+`recovery` completes. `description`, `channels` and `bag` describe recordings.
 """
 
 from detector.actions.record.action import Record

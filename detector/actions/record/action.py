@@ -17,7 +17,7 @@ from detector.actions.base import Action, ActionError, Setting, Surroundings
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from detector.actions.record.description import Description
 from detector.actions.record.destination import Destination, Kept, NoRoomError, destination
-from detector.actions.record.folder import Folder
+from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.recording import Recording, reason
 from detector.actions.record.recovery import REASON, recover
 from detector.actions.record.series import Series
@@ -63,7 +63,7 @@ class Record(Action[api.Record]):
                 renew_after=None if renew is None else renew.ns,
             )
         except (NoRoomError, OSError) as error:
-            raise ActionError(f"the recording cannot begin: {reason(error)}") from error
+            raise ActionError(f"cannot start the recording: {reason(error)}") from error
         self._open[episode.id] = _Open(series, episode, time.monotonic())
         self.setting.report(episode, Outcome(OutcomeState.RUNNING, series.problem))
 
@@ -90,7 +90,7 @@ class Record(Action[api.Record]):
         self._settle(current, over=True)
 
     def wake(self) -> float | None:
-        """Flushes what waits, says how far recordings are, and deletes those that are too old."""
+        """Flushes queued samples, reports the progress of recordings, and deletes those that are too old."""
         now = time.monotonic()
         if now - self._expired >= _EXPIRE_SECONDS:
             self._expired = now
@@ -105,11 +105,11 @@ class Record(Action[api.Record]):
     def close(self) -> None:
         """Completes what is still open, marked as cut."""
         for current in [*self._open.values()]:
-            current.series.finish("the detector ended", 0)
+            current.series.finish("the detector stopped", 0)
             self._settle(current, over=True)
 
     def _know(self, episode: Episode) -> _Open | None:
-        """What is known of the episode now is what its recording tells."""
+        """Update what the recording describes with the present state of the episode."""
         current = self._open.get(episode.id)
         if current is not None:
             current.episode = episode
@@ -137,13 +137,15 @@ class Record(Action[api.Record]):
 
     def _lose(self, samples: int) -> None:
         if samples:
-            self.setting.lose("samples to record", samples, "their recording ended early")
+            self.setting.lose("samples to record", samples, "the recording ended early")
 
     def _begin(self, description: Description, start: int | None) -> Recording:
         """A new recording. Raises NoRoomError, OSError."""
         surroundings = self.setting.surroundings()
-        folder = Folder.create(self._destination(surroundings), description.rule, description.name, self._dropped)
-        return Recording(folder, description.told(), self.parameters, surroundings, start=start)
+        folder = RecordingFolder.create(
+            self._destination(surroundings), description.rule, description.name, self._dropped
+        )
+        return Recording(folder, description.fields(), self.parameters, surroundings, start=start)
 
     def _tidy(self) -> None:
         """What earlier runs left behind is completed, beside this thread; what is too old is deleted."""
@@ -156,14 +158,14 @@ class Record(Action[api.Record]):
                 thread.start()
             self._dropped(place.expire(), "older than spec.recordings.age")
         except (ActionError, OSError) as error:
-            log.error("rule %s: the folder of recordings cannot be used: %s", self.setting.rule.name, error)
+            log.error("rule %s: cannot use the folder of recordings: %s", self.setting.rule.name, error)
 
     def _recover(self, place: Destination, left: Sequence[Path]) -> None:
         try:
             kept = recover(place, left)
         except Exception as error:  # what a kill left may be anything, and must not keep new recordings from being made
-            log.exception("recordings that were left behind cannot be completed")
-            self.setting.lose("times recordings that were left behind could not be completed", 1, str(error))
+            log.exception("cannot complete interrupted recordings")
+            self.setting.lose("times interrupted recordings could not be completed", 1, str(error))
             return
         if kept:
             self.setting.lose("recordings cut short", len(kept), REASON)
@@ -171,12 +173,12 @@ class Record(Action[api.Record]):
     def _destination(self, surroundings: Surroundings) -> Destination:
         recordings = surroundings.detector.spec.recordings
         if recordings is None:
-            raise ActionError(f"Detector {surroundings.detector.name} does not say where: give its spec.recordings")
+            raise ActionError(f"Detector {surroundings.detector.name} has no spec.recordings: add it")
         return destination(recordings)
 
-    def _dropped(self, dropped: Sequence[Kept], why: str = "dropped to make room for newer ones") -> None:
+    def _dropped(self, dropped: Sequence[Kept], why: str = "deleted to make room for newer ones") -> None:
         for each in dropped:
-            log.warning("%s: the recording was deleted: %s", each.path, why)
+            log.warning("%s: deleted the recording: %s", each.path, why)
         if dropped:
             self.setting.lose("recordings", len(dropped), why)
 

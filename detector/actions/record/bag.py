@@ -27,7 +27,7 @@ class Part:
 
 
 def metadata_yaml(parts: Sequence[Part], custom: Mapping[str, str]) -> str:
-    """The text of metadata.yaml. `custom` is what the bag says beside."""
+    """The text of metadata.yaml. `custom` is further metadata of the bag."""
     topics: dict[tuple[str, str], dict[str, Any]] = {}
     for part in parts:
         for name, type_name, digest, latched, count in _topics(part.contents):

@@ -1,7 +1,7 @@
 """How the samples of a stream stand in a recording: topic, encoding, schema, and what ROS wants to know of a topic.
 
 Schemas are written for ROS 2 messages only. JSON, CBOR, ETSI ITS and raw messages have none (MCAP's schema 0), their
-encoding says how they read.
+encoding gives their format.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Place = tuple[str, str, str]
 """A stream, a key and a client: what has a channel of its own."""
 
 _HISTORY = 100
-"""A latched topic may have so many publishers: what each said last is played again."""
+"""Maximum number of publishers of a latched topic: the last message of each is played again."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ def compressor(compression: Compression) -> Compress:
 
 
 def decompress(name: str, data: bytes, size: int) -> bytes:
-    """The chunk of so many bytes. Raises ValueError where it cannot be read."""
+    """The chunk of `size` bytes. Raises ValueError where it cannot be read."""
     try:
         match name:
             case "":
@@ -39,4 +39,4 @@ def decompress(name: str, data: bytes, size: int) -> bytes:
                 return zstandard.decompress(data, max_output_size=size)
     except (RuntimeError, zstandard.ZstdError) as error:
         raise ValueError(str(error)) from error
-    raise ValueError(f"no compression of recordings is called {name!r}")
+    raise ValueError(f"unknown compression of recordings: {name!r}")

@@ -1,4 +1,4 @@
-"""What a recording says of itself: its name, and the records that tell of its episode. Pure."""
+"""The description of a recording: its name, and the records about its episode. Pure."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ FORMAT = "wayside recording 1"
 DESCRIPTION = "recording.json"
 """The description's file, in the recording's folder."""
 METADATA = "wayside"
-"""The MCAP metadata record that tells of the episode, at the start of each file."""
+"""The MCAP metadata record about the episode, at the start of each file."""
 METADATA_END = "wayside/end"
-"""The one that tells how it ended, at the end of each file."""
+"""The metadata record about its end, at the end of each file."""
 METADATA_CUT = "cut"
-"""The one that says why the file is not whole."""
+"""The metadata record with the reason why the file is incomplete."""
 METADATA_USER = "metadata"
 """The one with what the rule gives as `metadata`."""
 
 _SUBJECT = 60
-"""A longer subject is shortened in names: they have 255 characters at most. The episode's id tells them apart."""
+"""A longer subject is shortened in names: they have 255 characters at most. The id of the episode distinguishes
+them.
+"""
 
 
 @dataclass(frozen=True)
@@ -58,10 +60,10 @@ class Description:
             parts.append(f"part{self.part:04}")
         return "_".join(parts)
 
-    def told(self) -> dict[str, Any]:
+    def fields(self) -> dict[str, Any]:
         """All of it, as the description's file and the metadata have it."""
         episode = self.episode
-        told: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "format": FORMAT,
             "holder": self.holder,
             "detector": self.detector,
@@ -83,12 +85,12 @@ class Description:
             "continued": self.continued or None,
             "part": self.part or None,
         }
-        return {name: value for name, value in told.items() if value is not None}
+        return {name: value for name, value in fields.items() if value is not None}
 
 
-def with_ending(told: Mapping[str, Any], **changes: JsonValue) -> dict[str, Any]:
+def with_ending(fields: Mapping[str, Any], **changes: JsonValue) -> dict[str, Any]:
     """The same, with other values; None takes one out."""
-    return {name: value for name, value in {**told, **changes}.items() if value is not None}
+    return {name: value for name, value in {**fields, **changes}.items() if value is not None}
 
 
 _BEGINNING = (
@@ -97,15 +99,15 @@ _BEGINNING = (
 )
 
 
-def beginning(told: Mapping[str, Any]) -> dict[str, str]:
+def beginning(fields: Mapping[str, Any]) -> dict[str, str]:
     """What is known at the start of a file, as MCAP's metadata have it: text, and JSON where it is more."""
-    return as_text({name: value for name, value in told.items() if name in _BEGINNING})
+    return as_text({name: value for name, value in fields.items() if name in _BEGINNING})
 
 
-def ending(told: Mapping[str, Any]) -> dict[str, str]:
+def ending(fields: Mapping[str, Any]) -> dict[str, str]:
     """What is known at the end."""
     names = ("rule", "episode", "endTime", "reason", "samples", "missing", "cut", "continues")
-    return as_text({name: told[name] for name in names if name in told})
+    return as_text({name: fields[name] for name in names if name in fields})
 
 
 def as_text(values: Mapping[str, JsonValue]) -> dict[str, str]:

@@ -25,7 +25,7 @@ DROPPED = ".dropped"
 """The ending of the hidden folder of a recording that is being deleted."""
 
 _SCAN_SECONDS = 2.0
-"""So often at most, the folder is looked at anew where there is no room."""
+"""Minimum seconds between two scans of a full folder."""
 
 
 class NoRoomError(Exception):
@@ -75,7 +75,7 @@ class Destination:
             return self._total
 
     def claim(self, now: int, later: int, files: int = 0, *, forced: bool = False) -> list[Kept]:
-        """Room for so many bytes that are written now, and for more that complete the recording later.
+        """Reserve room for the bytes that are written now, and for those that complete the recording later.
 
         Negative numbers give room back; forced, no limit counts. Returns what was dropped for it. Raises NoRoomError,
         OSError.
@@ -84,13 +84,13 @@ class Destination:
             needed = now + later
             dropped: list[Kept] = []
             while not forced and (needed > 0 or files > 0) and (short := self._short(needed, files)):
-                if time.monotonic() - self._scanned > _SCAN_SECONDS:  # somebody may have tidied up
+                if time.monotonic() - self._scanned > _SCAN_SECONDS:  # files may have been deleted by hand
                     self._scan()
                     continue
                 if self._limits.when_full is WhenFull.STOP:
                     raise NoRoomError(f"{short}; whenFull is Stop: make room in {self.path}, or raise the limit")
                 if not self._kept:
-                    raise NoRoomError(f"{short}; there is no finished recording left to drop: raise the limit")
+                    raise NoRoomError(f"{short}; there is no finished recording left to delete: raise the limit")
                 dropped.append(self._drop(self._kept[0]))
             self._bytes += needed
             self._files += files
@@ -122,15 +122,15 @@ class Destination:
         return self._bytes + self._kept_bytes
 
     def _short(self, size: int, files: int) -> str:
-        """Which limit there is no room under, for so much more; empty where there is room."""
+        """The limit that this many more bytes would exceed; empty if none."""
         limits = self._limits
         if size > 0 and self._total + size > limits.bytes.bytes:
-            return f"the recordings would take more than spec.recordings.bytes ({limits.bytes})"
+            return f"the recordings would use more than spec.recordings.bytes ({limits.bytes})"
         total = self._files + self._kept_files + files
         if files > 0 and limits.files is not None and total > limits.files:
             return f"there would be more than {limits.files} files (spec.recordings.files)"
         if size > 0 and self._free() - self._ahead - size < limits.reserve.bytes:
-            return f"the disk would have less than {limits.reserve} left free (spec.recordings.reserve)"
+            return f"less than {limits.reserve} of the disk would be free (spec.recordings.reserve)"
         return ""
 
     def _free(self) -> int:
@@ -144,7 +144,7 @@ class Destination:
         try:
             kept.path.rename(hidden)
         except FileNotFoundError:
-            return kept  # somebody else did
+            return kept  # another process did
         shutil.rmtree(hidden)
         return kept
 
@@ -187,8 +187,8 @@ def _folders(path: Path) -> list[Path]:
 def _kept(folder: Path) -> Kept | None:
     description = folder / DESCRIPTION
     try:
-        told = json.loads(description.read_bytes())
-        if not isinstance(told, dict) or told.get("format") != FORMAT:
+        fields = json.loads(description.read_bytes())
+        if not isinstance(fields, dict) or fields.get("format") != FORMAT:
             return None
         stats = {each.name: each.stat() for each in folder.iterdir()}
     except (OSError, ValueError):

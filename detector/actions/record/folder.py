@@ -1,6 +1,6 @@
 """The folder of a recording in the making: hidden and locked, until it gets its final name in one step.
 
-The lock tells a recording in progress from one that a process left behind when it was killed.
+The lock distinguishes a recording in progress from one that a killed process left behind.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Dropped = Callable[[Sequence[Kept]], None]
 """Told of recordings that were deleted to make room."""
 
 
-class Folder:
+class RecordingFolder:
     """A hidden folder, locked by this process. Counts what it claims of the destination."""
 
     def __init__(
@@ -40,7 +40,7 @@ class Folder:
         """
         self.path = path
         self.name = name
-        """Its final name, but for what tells how it ended."""
+        """Its final name, without the suffix for how it ended."""
         self._destination = destination
         self._dropped = dropped
         self._forced = forced
@@ -53,7 +53,7 @@ class Folder:
             raise
 
     @classmethod
-    def create(cls, destination: Destination, rule: str, name: str, dropped: Dropped) -> Folder:
+    def create(cls, destination: Destination, rule: str, name: str, dropped: Dropped) -> RecordingFolder:
         """A new one. A number is added to the name where there is one already. Raises NoRoomError, OSError."""
         parent = destination.path / rule
         parent.mkdir(exist_ok=True)
@@ -85,24 +85,24 @@ class Folder:
             room.unlink()
             self.claim(-_ROOM_BYTES, 0)
 
-    def describe(self, told: Mapping[str, Any]) -> None:
+    def describe(self, fields: Mapping[str, Any]) -> None:
         """Writes the description. Raises OSError."""
-        _write(self.path / DESCRIPTION, json.dumps(told, ensure_ascii=False, indent=1))
+        _write(self.path / DESCRIPTION, json.dumps(fields, ensure_ascii=False, indent=1))
 
     def described(self) -> dict[str, Any] | None:
         """The description that is there; None where there is none that can be read."""
         try:
-            told = json.loads((self.path / DESCRIPTION).read_bytes())
+            fields = json.loads((self.path / DESCRIPTION).read_bytes())
         except (OSError, ValueError):
             return None
-        return told if isinstance(told, dict) else None
+        return fields if isinstance(fields, dict) else None
 
-    def publish(self, parts: Sequence[Part], told: Mapping[str, Any]) -> Kept:
+    def publish(self, parts: Sequence[Part], fields: Mapping[str, Any]) -> Kept:
         """Gives the folder its final name, once the disk has everything. Raises OSError: then it is as it was."""
-        _write(self.path / "metadata.yaml", metadata_yaml(parts, as_text(told)))
-        self.describe(told)
+        _write(self.path / "metadata.yaml", metadata_yaml(parts, as_text(fields)))
+        self.describe(fields)
         os.fsync(self._lock)
-        final = self.path.with_name(self.name + (CUT if "cut" in told else ""))
+        final = self.path.with_name(self.name + (CUT if "cut" in fields else ""))
         self.path.rename(final)
         _sync(final.parent)
         size = sum(each.stat().st_size for each in final.iterdir())

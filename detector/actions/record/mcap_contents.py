@@ -1,4 +1,6 @@
-"""What an MCAP file holds, as far as its summary tells: enough to complete a file, newly written or found cut."""
+"""The content of an MCAP file, as far as its summary describes it: enough to complete a file, newly written or found
+cut.
+"""
 
 from __future__ import annotations
 

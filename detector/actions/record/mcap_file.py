@@ -22,9 +22,9 @@ from detector.actions.record.compressing import Compress, Pieces
 from detector.actions.record.mcap_contents import LIBRARY, MAGIC, Contents, packed, packed_message_indexes
 
 _CHUNK = 2**20
-"""A chunk holds about so many bytes at most, or one message."""
+"""Approximate maximum bytes of a chunk of more than one message."""
 _APART = 2**15
-"""A payload of so many bytes stays where it is; smaller ones are copied side by side."""
+"""Payloads of at least this many bytes are not copied; smaller ones are copied into one buffer."""
 _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")
 _ENDING = 512
@@ -36,7 +36,7 @@ room. With negative numbers: they were not written."""
 
 
 class SyncError(OSError):
-    """The kernel could not bring to the disk what it had taken: nobody knows how much of it is there."""
+    """The kernel could not write accepted data to the disk: how much of it was written is unknown."""
 
 
 class McapFile:

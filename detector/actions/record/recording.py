@@ -26,7 +26,7 @@ from detector.actions.record.description import (
     with_ending,
 )
 from detector.actions.record.destination import Kept, NoRoomError
-from detector.actions.record.folder import Folder
+from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.mcap_file import McapFile, SyncError
 from detector.actions.record.stamps import Stamps
 from detector.engine.buffering.lanes import latched_topics
@@ -34,7 +34,7 @@ from wayside.api.actions.record import Record
 
 
 class _Latched(NamedTuple):
-    """What was said last on a latched stream: the files that follow begin with it."""
+    """The last samples of a latched stream: the following files begin with them."""
 
     sample: EpisodeSample
     number: int
@@ -45,19 +45,19 @@ class Recording:
 
     def __init__(
         self,
-        folder: Folder,
-        told: Mapping[str, Any],
+        folder: RecordingFolder,
+        description: Mapping[str, Any],
         parameters: Record,
         surroundings: Surroundings,
         *,
         start: int | None,
     ) -> None:
-        """`told` describes it; `start` is the window's, in nanoseconds, where it is known.
+        """`description` is its description; `start` is the window's, in nanoseconds, where it is known.
 
         Raises NoRoomError, OSError: nothing of it is left then.
         """
         self._folder = folder
-        self._told = told
+        self._description = description
         self._parameters = parameters
         self._start = start
         self._parts: list[Part] = []
@@ -73,7 +73,7 @@ class Recording:
         """Samples that it got, each message counted once."""
         self.follow(surroundings)
         try:
-            folder.describe(told)
+            folder.describe(description)
             self._open()
         except BaseException:
             self._give_up()
@@ -117,7 +117,7 @@ class Recording:
 
     @property
     def latched(self) -> list[EpisodeSample]:
-        """What was last said on latched streams, in order of time."""
+        """The last samples of latched streams, in order of time."""
         known = sorted(self._latched.values(), key=lambda each: each.sample.time)
         return [*(each.sample for each in known), *self._held]
 
@@ -141,11 +141,11 @@ class Recording:
         """Whether there is something to flush."""
         return self._file is not None and self._file.waiting > 0
 
-    def finish(self, told: Mapping[str, Any], cut: str, missing: int) -> tuple[Kept | None, dict[str, Any]]:
+    def finish(self, description: Mapping[str, Any], cut: str, missing: int) -> tuple[Kept | None, dict[str, Any]]:
         """Completes the recording under its final name; also gives the last description of it.
 
         Args:
-            told: describes it, now that the episode ended.
+            description: the description, now that the episode ended.
             cut: why something of the window is missing; empty where nothing is.
             missing: samples of the window that never came here.
 
@@ -160,24 +160,26 @@ class Recording:
         try:
             self._folder.use_room()
             while self._file is not None:
-                cut = self._complete(self._file, told, cut, missing)
-            told = self._ending(told, cut, missing)
-            if "cut" in told and not self.written:
+                cut = self._complete(self._file, description, cut, missing)
+            description = self._ending(description, cut, missing)
+            if "cut" in description and not self.written:
                 self._folder.remove()
-                return None, told
-            return self._folder.publish(self._parts, told), told
+                return None, description
+            return self._folder.publish(self._parts, description), description
         except OSError:
             self._give_up()
             self._folder.leave()
             raise
 
-    def _complete(self, file: McapFile, told: Mapping[str, Any], cut: str, missing: int) -> str:
-        """Tries to complete the last file, or makes room for the next try; says why the recording is cut, if it is."""
-        told = self._ending(told, cut, missing)
+    def _complete(self, file: McapFile, description: Mapping[str, Any], cut: str, missing: int) -> str:
+        """Tries to complete the last file, or makes room for the next try; returns the reason why the recording is
+        cut, if any.
+        """
+        description = self._ending(description, cut, missing)
         try:
-            if "cut" in told:
-                file.add_metadata(METADATA_CUT, {"reason": told["cut"]})
-            file.add_metadata(METADATA_END, ending(told))
+            if "cut" in description:
+                file.add_metadata(METADATA_CUT, {"reason": description["cut"]})
+            file.add_metadata(METADATA_END, ending(description))
             file.finish()
         except SyncError:
             raise
@@ -201,15 +203,15 @@ class Recording:
         if self._file is not None:
             self._file.give_up()
 
-    def _ending(self, told: Mapping[str, Any], cut: str, missing: int) -> dict[str, Any]:
+    def _ending(self, description: Mapping[str, Any], cut: str, missing: int) -> dict[str, Any]:
         missing += self.given - self.written
         if missing and not cut:
             cut = f"{missing} samples of the window are missing"
         names = [part.name for part in self._parts] + ([] if self._file is None else [self._file.path.name])
-        return with_ending(told, samples=self.written, missing=missing or None, cut=cut or None, files=names)
+        return with_ending(description, samples=self.written, missing=missing or None, cut=cut or None, files=names)
 
     def _release(self) -> None:
-        """What was said on latched streams before the window's start is written, at its start."""
+        """The last samples of latched streams before the window are written at its start."""
         held, self._held = self._held, []
         for sample in held:
             self._take(sample)
@@ -248,7 +250,7 @@ class Recording:
         return self._file
 
     def _split(self, time: int, size: int) -> None:
-        """Goes on in another file where it is time for it; that begins with what was last said on latched streams."""
+        """Goes on in another file where it is time for it; that begins with the last samples of latched streams."""
         split, first, file = self._parameters.split, self._first, self._writer
         if first is None:
             return
@@ -276,9 +278,9 @@ class Recording:
             self._folder.claim,
         )
         self._channels, self._first = FileChannels(self._file), None
-        self._file.add_metadata(METADATA, {**beginning(self._told), "file": str(len(self._parts))})
-        if self._told.get("metadata"):
-            self._file.add_metadata(METADATA_USER, as_text(self._told["metadata"]))
+        self._file.add_metadata(METADATA, {**beginning(self._description), "file": str(len(self._parts))})
+        if self._description.get("metadata"):
+            self._file.add_metadata(METADATA_USER, as_text(self._description["metadata"]))
 
     def _channel(self, place: Place) -> int | None:
         return self._channels.number(place, self._readings.get(place[0]))

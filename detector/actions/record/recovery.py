@@ -11,7 +11,7 @@ from typing import Any
 from detector.actions.record.bag import Part
 from detector.actions.record.description import METADATA_CUT, METADATA_END, ending, with_ending
 from detector.actions.record.destination import DROPPED, PARTIAL, Destination, Kept, hidden
-from detector.actions.record.folder import Folder
+from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.salvage import contents_of, salvage
 
 log = logging.getLogger(__name__)
@@ -34,38 +34,38 @@ def recover(destination: Destination, left: Iterable[Path]) -> list[Kept]:
         except BlockingIOError:
             continue
         except OSError as error:
-            log.error("%s: the recording that was left behind cannot be completed: %s", path, error)
+            log.error("%s: cannot complete the interrupted recording: %s", path, error)
             continue
         if recording is not None:
-            log.warning("%s: %s; what there is of it was completed", recording.path, REASON)
+            log.warning("%s: %s; completed the recording with the data that was written", recording.path, REASON)
             kept.append(recording)
     return kept
 
 
 def _recovered(destination: Destination, path: Path) -> Kept | None:
     name = path.name.removeprefix(".").removesuffix(PARTIAL)
-    folder = Folder(destination, path, name, lambda dropped: None, forced=True)
+    folder = RecordingFolder(destination, path, name, lambda dropped: None, forced=True)
     files = sorted(path.glob("*.mcap"), key=lambda each: int(each.stem.rpartition("_")[2]))
     folder.claim(sum(each.stat().st_size for each in path.iterdir()), 0, len(files))
     folder.use_room()
-    told = folder.described()
+    fields = folder.described()
     try:
         last = files[-1:]
-        found = () if told is None else ((_part(file, folder, told, file in last)) for file in files)
+        found = () if fields is None else ((_part(file, folder, fields, file in last)) for file in files)
         parts = [part for part in found if part is not None]
         samples = sum(part.contents.messages for part in parts)
-        if told is None or not samples:
+        if fields is None or not samples:
             folder.remove()
             return None
         return folder.publish(
-            parts, with_ending(told, cut=REASON, samples=samples, files=[part.name for part in parts])
+            parts, with_ending(fields, cut=REASON, samples=samples, files=[part.name for part in parts])
         )
     except OSError:
         folder.leave()
         raise
 
 
-def _part(path: Path, folder: Folder, told: dict[str, Any], last: bool) -> Part | None:
+def _part(path: Path, folder: RecordingFolder, fields: dict[str, Any], last: bool) -> Part | None:
     """The file, completed; None where nothing of it can be read: it is deleted.
 
     The last one is looked through even if it seems complete: the disk may not have had all of it.
@@ -80,7 +80,7 @@ def _part(path: Path, folder: Folder, told: dict[str, Any], last: bool) -> Part 
             return None
         try:
             file.add_metadata(METADATA_CUT, {"reason": REASON})
-            file.add_metadata(METADATA_END, ending(with_ending(told, cut=REASON, samples=file.contents.messages)))
+            file.add_metadata(METADATA_END, ending(with_ending(fields, cut=REASON, samples=file.contents.messages)))
             file.finish()
         finally:
             file.give_up()

@@ -163,7 +163,7 @@ def _messages(data: bytes) -> dict[int, list[int]]:
     while at < len(data):
         opcode, length, channel, _, log_time = _MESSAGE.unpack_from(data, at)
         if opcode != Opcode.MESSAGE:
-            raise ValueError("a chunk of a recording holds messages alone")
+            raise ValueError("a chunk of a recording may contain messages only")
         messages[channel] += (log_time, at)
         at += _RECORD.size + length
     return messages

@@ -38,7 +38,7 @@ class Series:
         self.problem = ""
         """Why something of the window is missing, the first time."""
         self.lost = 0
-        """Samples that found no recording, since they were last asked for."""
+        """Samples without a recording, since the last read."""
         try:
             self._recording = begin(description, start)
         except (NoRoomError, OSError) as error:
@@ -124,7 +124,7 @@ class Series:
             self._next(surroundings)
 
     def _next(self, surroundings: Surroundings) -> None:
-        """Begins the next recording, which knows what was last said on latched streams."""
+        """Begins the next recording, which knows the last samples of latched streams."""
         description = self.description
         self.description = replace(description, part=description.part + 1, continued=True)
         try:
@@ -139,18 +139,18 @@ class Series:
         self._recording = None
         self._latched = recording.latched
         try:
-            kept, told = recording.finish(
-                with_ending(self.description.told(), continues=continues or None), cut, missing
+            kept, fields = recording.finish(
+                with_ending(self.description.fields(), continues=continues or None), cut, missing
             )
         except OSError as error:
-            self.problem = self.problem or f"the recording cannot be completed, the next start tries again: {error}"
+            self.problem = self.problem or f"cannot complete the recording; the next start retries: {error}"
             self._missing += recording.given + missing
             return
-        self.problem = self.problem or str(told.get("cut", ""))
-        self._missing += int(told.get("missing", 0))
+        self.problem = self.problem or str(fields.get("cut", ""))
+        self._missing += int(fields.get("missing", 0))
         if kept is not None:
             self._kept = kept
             self._count += 1
-            self._files = [f"{kept.path.parent.name}/{kept.path.name}/{name}" for name in told["files"]]
+            self._files = [f"{kept.path.parent.name}/{kept.path.name}/{name}" for name in fields["files"]]
             self._samples += recording.written
             self._bytes += kept.bytes

@@ -1,4 +1,4 @@
-"""When a message was published, as far as it says so."""
+"""When a message was published, if it carries that time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LATEST = 2**63 - 1
 
 
 class Stamps:
-    """Reads the stamps of messages, as the Detector says for each stream."""
+    """Reads the stamps of messages, as the Detector defines for each stream."""
 
     def __init__(self, surroundings: Surroundings) -> None:
         self._surroundings = surroundings

@@ -1,6 +1,6 @@
 """The action: one course for each episode, and one request after the other.
 
-Requests wait for the network, on the action's own thread. Where a system is silent, all that it is to be told waits a
+Requests wait for the network, on the action's own thread. While a system is silent, all requests to it wait a
 while, so that a dead one costs one timeout at a time and not one for each episode.
 """
 
@@ -16,10 +16,10 @@ from typing import Any
 
 from detector.actions.base import Action, ActionError, Setting
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
-from detector.actions.trigger.course import FOREVER, Course, Limits, Step
+from detector.actions.trigger.course import FOREVER, Course, CourseStep, Limits
 from detector.actions.trigger.detectors import OtherDetector
 from detector.actions.trigger.endpoints import HttpEndpoint
-from detector.actions.trigger.journal import Journal
+from detector.actions.trigger.journal import OrderJournal
 from detector.actions.trigger.orders import Order, Report, System
 from detector.actions.trigger.ros2 import Ros2Services, problems
 from wayside.api import Detector
@@ -63,9 +63,9 @@ class Trigger(Action[api.Trigger]):
         )
         self._courses: dict[str, Course] = {}
         self._episodes: dict[str, Episode] = {}
-        self._said: dict[str, Outcome] = {}
+        self._reported: dict[str, Outcome] = {}
         self._silent: dict[str, tuple[int, float]] = {}
-        """Places that did not answer: how often in a row, and when to ask again."""
+        """Places that did not answer: how often in a row, and when to try again."""
         self._digest = _digest(parameters)
         self._journal = self._make_journal()
         self._left = {} if self._journal is None else self._journal.load()
@@ -73,9 +73,9 @@ class Trigger(Action[api.Trigger]):
         self._claim = time.monotonic() + _CLAIM
 
     def started(self, episode: Episode) -> None:
-        """Ask for a recording, or for its continuation."""
+        """Request a recording, or its continuation."""
         if len(self._courses) >= _MOST:
-            raise ActionError(f"{_MOST} recordings elsewhere are under way already: this one is not asked for")
+            raise ActionError(f"{_MOST} recordings on other systems are already in progress: this one is not requested")
         identity = f"{self._prefix}.{encode(episode.id)}"
         left = self._left.pop(identity, None)
         order = Order(identity, self._rendered(episode) if left is None else left.rendered, episode.started)
@@ -87,7 +87,7 @@ class Trigger(Action[api.Trigger]):
         self._save()
 
     def ended(self, episode: Episode) -> None:
-        """It is to stop."""
+        """Stop its recording."""
         course = self._courses.get(f"{self._prefix}.{encode(episode.id)}")
         if course is not None and episode.end_time is not None:
             now = time.monotonic()
@@ -101,7 +101,7 @@ class Trigger(Action[api.Trigger]):
             return
         if self.setting.closing.is_set() and self._outlives():
             del self._courses[identity], self._episodes[identity]  # but not in the journal
-            message = "it goes on: the episode is taken up again after the restart, or its maximumDuration ends it"
+            message = "it continues: the episode is resumed after the restart, or its maximumDuration ends it"
             self.setting.report(episode, self._outcome(OutcomeState.DONE, course, message))
         else:
             now = time.monotonic()
@@ -112,23 +112,23 @@ class Trigger(Action[api.Trigger]):
         now = time.monotonic()
         if self._left and now >= self._claim:
             self._stop_left(now)
-        due: list[tuple[float, Course, Step]] = []
+        due: list[tuple[float, Course, CourseStep]] = []
         for course in self._courses.values():
             step = course.look(now)
-            if step is not None and self._asked_again(course.order) <= now:
+            if step is not None and self._next_attempt(course.order) <= now:
                 due.append((course.due, course, step))
         if due:
-            self._ask(*min(due, key=lambda each: each[0])[1:])
+            self._request(*min(due, key=lambda each: each[0])[1:])
         self._forget_finished()
         if len(due) > 1:
             return 0.0
-        nexts = [max(each.next_look(), self._asked_again(each.order)) for each in self._courses.values()]
+        nexts = [max(each.next_look(), self._next_attempt(each.order)) for each in self._courses.values()]
         nexts += [self._claim] if self._left else []
         soonest = min(nexts, default=FOREVER)
         return None if soonest == FOREVER else max(0.0, soonest - time.monotonic())
 
     def close(self) -> None:
-        """Stop what nobody will stop later, as far as that goes quickly."""
+        """Stop recordings that nothing stops later, as far as that is quick."""
         end = time.monotonic() + _LEAVE
         self._system.timeout = min(self._system.timeout, 1.0)
         while time.monotonic() < end:
@@ -136,20 +136,20 @@ class Trigger(Action[api.Trigger]):
             stops = [
                 course
                 for course in self._courses.values()
-                if course.look(max(now, course.due)) is Step.STOP and self._asked_again(course.order) <= now
+                if course.look(max(now, course.due)) is CourseStep.STOP and self._next_attempt(course.order) <= now
             ]
             if not stops:
                 break
-            self._ask(stops[0], Step.STOP)
+            self._request(stops[0], CourseStep.STOP)
             self._forget_finished()
         if self._journal is None:
             for course in self._courses.values():
-                if course.step in (Step.START, Step.STOP):
-                    self._lose(course, "the detector ends")
+                if course.step in (CourseStep.START, CourseStep.STOP):
+                    self._lose(course, "the detector is stopping")
         self._courses = {identity: each for identity, each in self._courses.items() if not each.finished}
         for identity, course in self._courses.items():
-            problem = course.problem or f"the detector ended before its {course.step.value} was confirmed"
-            state = OutcomeState.DONE if course.step is Step.AWAIT else OutcomeState.FAILED
+            problem = course.problem or f"the detector stopped before its {course.step.value} was confirmed"
+            state = OutcomeState.DONE if course.step is CourseStep.AWAIT else OutcomeState.FAILED
             self._report(identity, self._outcome(state, course, problem if state is OutcomeState.FAILED else ""))
 
     @property
@@ -164,11 +164,11 @@ class Trigger(Action[api.Trigger]):
             return HttpEndpoint(self.parameters, self.setting.closing)
         return Ros2Services(self.parameters, self.setting.messenger, lambda: self.setting.surroundings().types)
 
-    def _make_journal(self) -> Journal | None:
+    def _make_journal(self) -> OrderJournal | None:
         state = self.setting.surroundings().detector.spec.state
         if state is None:
             return None
-        return Journal(Path(state.path) / "triggers" / f"{self._prefix}.json")
+        return OrderJournal(Path(state.path) / "triggers" / f"{self._prefix}.json")
 
     def _rendered(self, episode: Episode) -> Mapping[str, Any]:
         """The templates; of an episode that is resumed, those that need nothing of its start."""
@@ -191,31 +191,31 @@ class Trigger(Action[api.Trigger]):
         by_task = any(action.deploy is not None for action in self.setting.rule.spec.actions)
         return by_task or self.setting.surroundings().detector.spec.state is not None
 
-    def _asked_again(self, order: Order) -> float:
+    def _next_attempt(self, order: Order) -> float:
         return self._silent.get(self._system.place(order), (0, 0.0))[1]
 
-    def _ask(self, course: Course, step: Step) -> None:
+    def _request(self, course: Course, step: CourseStep) -> None:
         order, begin = course.order, time.monotonic()
         place = self._system.place(order)
         try:
-            report = self._asked(course, step, begin)
+            report = self._send(course, step, begin)
         except (ActionError, ValueError) as error:
             now = time.monotonic()
             times = self._silent.get(place, (0, 0.0))[0] + 1
             self._silent[place] = times, now + _SILENCES[min(times, len(_SILENCES)) - 1]
             course.failed(now, str(error), silent=True)
-            self._say(course, f"{step.value} is not confirmed yet: {error}")
+            self._report_progress(course, f"{step.value} is not confirmed yet: {error}")
         else:
             self._silent.pop(place, None)
             course.answered(time.monotonic(), report)
             waits = f": {report.message}" if report.message else ""
-            self._say(course, f"at {place}: {report.progress.value}{waits}")
+            self._report_progress(course, f"at {place}: {report.progress.value}{waits}")
 
-    def _asked(self, course: Course, step: Step, now: float) -> Report:
+    def _send(self, course: Course, step: CourseStep, now: float) -> Report:
         order = course.order
-        if step is Step.AWAIT:
+        if step is CourseStep.AWAIT:
             return self._system.status(order)
-        if step is Step.STOP:
+        if step is CourseStep.STOP:
             return self._system.stop(order, 0.0 if course.ended is None else now - course.ended)
         return self._system.start(order, now - course.onset, again=course.confirmed)
 
@@ -224,10 +224,10 @@ class Trigger(Action[api.Trigger]):
         for identity, order in self._left.items():
             course = Course(order, self._limits, now, now, resumed=True)
             course.confirmed = False  # that it is not known there any more is as good as stopped
-            course.step = Step.STOP
+            course.step = CourseStep.STOP
             course.end(now, now)
             self._courses[identity] = course
-            _log.info("recording %s was not stopped before the restart: stopping it", identity)
+            _log.info("stopping recording %s, which was not stopped before the restart", identity)
         self._left = {}
 
     def _forget_finished(self) -> None:
@@ -240,28 +240,28 @@ class Trigger(Action[api.Trigger]):
             self._report(identity, self._outcome(state, course, course.problem or course.note))
             del self._courses[identity]
             self._episodes.pop(identity, None)
-            self._said.pop(identity, None)
+            self._reported.pop(identity, None)
         if finished:
             self._save()
 
     def _lose(self, course: Course, why: str) -> None:
-        what = "recordings elsewhere whose stop was not confirmed: they end by their maximumDuration"
+        what = "recordings on other systems whose stop was not confirmed: their maximumDuration ends them"
         self.setting.lose(what, 1, f"{course.order.id}: {why}")
 
-    def _say(self, course: Course, message: str) -> None:
+    def _report_progress(self, course: Course, message: str) -> None:
         if not course.finished:
             self._report(course.order.id, self._outcome(OutcomeState.RUNNING, course, message))
 
     def _outcome(self, state: OutcomeState, course: Course, message: str) -> Outcome:
-        said = course.report
+        report = course.report
         return Outcome(
-            state, message, said.samples, said.bytes, said.missing, said.files, {"recording": course.order.id}
+            state, message, report.samples, report.bytes, report.missing, report.files, {"recording": course.order.id}
         )
 
     def _report(self, identity: str, outcome: Outcome) -> None:
         episode = self._episodes.get(identity)
-        if episode is not None and self._said.get(identity) != outcome:
-            self._said[identity] = outcome
+        if episode is not None and self._reported.get(identity) != outcome:
+            self._reported[identity] = outcome
             self.setting.report(episode, outcome)
 
     def _save(self) -> None:
@@ -270,5 +270,5 @@ class Trigger(Action[api.Trigger]):
 
 
 def _digest(parameters: api.Trigger) -> str:
-    """Eight hexadecimal digits that tell one text of the action from another."""
+    """Eight hexadecimal digits that distinguish versions of the action."""
     return hashlib.sha256(json.dumps(parameters.to_json(), sort_keys=True).encode()).hexdigest()[:8]

@@ -1,4 +1,4 @@
-"""Plain maps made ROS 2 messages: what a request says in YAML becomes what rosbags serialises."""
+"""Plain maps made ROS 2 messages: a request in YAML becomes what rosbags serialises."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rosbags.typesys.store import Typestore
 
 
 class ServiceError(ValueError):
-    """A service that is not known or badly defined, or a request that does not fit; the text says what to do."""
+    """A service that is not known or badly defined, or a request that does not match; the message gives the remedy."""
 
 
 def message(store: Typestore, name: str, values: object, where: str) -> object:
-    """A message of rosbags with these values; `where` tells errors their place.
+    """A message of rosbags with these values; `where` is its place, for errors.
 
     Raises ServiceError where a value is of no field, or does not fit its field.
     """
@@ -26,7 +26,7 @@ def message(store: Typestore, name: str, values: object, where: str) -> object:
     unknown = sorted(str(key) for key in values if key not in fields)
     if unknown:
         there = ", ".join(field for field in fields if field != "structure_needs_at_least_one_member") or "none"
-        raise ServiceError(f"{where}.{unknown[0]} is no field of {name}: it has {there}")
+        raise ServiceError(f"{where}.{unknown[0]} is not a field of {name}: its fields are {there}")
     made = [_value(store, desc, values.get(field), f"{where}.{field}") for field, desc in fields.items()]
     return store.types[name](*made)
 

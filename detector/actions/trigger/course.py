@@ -1,7 +1,7 @@
-"""The course of one recording elsewhere: what has been confirmed, and what is to be asked next, and when.
+"""The course of one recording elsewhere: what is confirmed, and the next request and its time.
 
 Level, not edge: as long as the episode lasts, the other system is to record, and afterwards it is not to. What is not
-confirmed is asked again, later and later, until it is given up. A start is asked for even where the episode is over
+confirmed is requested again with backoff, until it is given up. A start is requested even if the episode is over
 meanwhile, since the other system may hold what led to it in its buffer.
 
     START ─confirmed→ HOLD ─end or maximumDuration→ STOP ─confirmed→ AWAIT ─over→ FINISHED
@@ -24,8 +24,8 @@ _POLL = 1.0
 FOREVER = float("inf")
 
 
-class Step(Enum):
-    """What is to be asked."""
+class CourseStep(Enum):
+    """The next request."""
 
     START = "start"
     HOLD = "hold"
@@ -43,22 +43,22 @@ class Limits:
     give_up: float
     """A request that is not confirmed."""
     renew: float | None
-    """Until a start is said again."""
+    """Until a start is repeated."""
 
 
 class Course:
     """One recording elsewhere."""
 
     def __init__(self, order: Order, limits: Limits, now: float, onset: float, *, resumed: bool = False) -> None:
-        """`onset` is when the condition began to hold; `resumed`: another run of the detector may have asked before."""
+        """`onset` is when the condition began to hold; `resumed`: another run of the detector may have requested it."""
         self.order = order
         self._limits = limits
         self.onset = onset
         self.ended: float | None = None
         """When the episode ended."""
-        self.step = Step.START
+        self.step = CourseStep.START
         self.due = now
-        """When to ask next."""
+        """Time of the next request."""
         self.failures = 0
         """Requests in a row that were not confirmed."""
         self.confirmed = resumed
@@ -68,9 +68,9 @@ class Course:
         self.problem = ""
         """Why it did not go as it should; empty where it did."""
         self.note = ""
-        """What else there is to say."""
+        """Further information."""
         self.report = Report(Progress.UNKNOWN)
-        """The last that was said of the recording."""
+        """The last report about the recording."""
         self.lost_stop = False
         """Whether the stop was given up."""
         self._since = now
@@ -78,68 +78,68 @@ class Course:
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to ask."""
-        return self.step is Step.FINISHED
+        """Whether no request is left."""
+        return self.step is CourseStep.FINISHED
 
     def end(self, now: float, ended: float) -> None:
-        """The episode has `ended`, or nobody wants the recording any more."""
+        """The episode has `ended`, or the recording is no longer wanted."""
         if self.ended is None:
             self.ended = ended
-            if self.step is Step.HOLD:
-                self._to(Step.STOP, now)
+            if self.step is CourseStep.HOLD:
+                self._to(CourseStep.STOP, now)
 
-    def look(self, now: float) -> Step | None:
-        """What is to be asked now; None: nothing yet."""
-        if self.step is Step.HOLD and now >= self._limit:
-            self.note = "ended by its maximumDuration, before the episode did" if self.ended is None else self.note
-            self._to(Step.STOP, now)
+    def look(self, now: float) -> CourseStep | None:
+        """The request to send now; None: none yet."""
+        if self.step is CourseStep.HOLD and now >= self._limit:
+            self.note = "its maximumDuration ended it before the episode ended" if self.ended is None else self.note
+            self._to(CourseStep.STOP, now)
         return self.step if now >= self.due and not self.finished else None
 
     def next_look(self) -> float:
         """When `look` may have something, if nothing happens before."""
         if self.finished:
             return FOREVER
-        return min(self.due, self._limit) if self.step is Step.HOLD else self.due
+        return min(self.due, self._limit) if self.step is CourseStep.HOLD else self.due
 
     def failed(self, now: float, why: str, *, silent: bool) -> None:
-        """The request was not confirmed; `silent`: nobody answered, so it may have arrived nevertheless."""
+        """The request was not confirmed; `silent`: there was no answer, so it may have arrived nevertheless."""
         self.failures += 1
         self.unanswered = self.unanswered or silent
         self.due = now + min(_FIRST_WAIT * 2 ** min(self.failures - 1, 10), _LONGEST_WAIT)
-        if now - self._since < self._limits.give_up or self.step is Step.HOLD:
+        if now - self._since < self._limits.give_up or self.step is CourseStep.HOLD:
             return
-        if self.step is Step.START:
-            self.problem = f"not started, and given up: {why}"
+        if self.step is CourseStep.START:
+            self.problem = f"gave up starting it: {why}"
             if self.unanswered:
-                self._to(Step.STOP, now)  # else it might record what nobody waits for
+                self._to(CourseStep.STOP, now)  # else it might record for nothing
             else:
-                self.step = Step.FINISHED
-        elif self.step is Step.STOP:
+                self.step = CourseStep.FINISHED
+        elif self.step is CourseStep.STOP:
             self.lost_stop = True
-            self.problem = self.problem or f"the stop was not confirmed, and is given up: {why}"
-            self.step = Step.FINISHED
+            self.problem = self.problem or f"gave up waiting for the confirmation of the stop: {why}"
+            self.step = CourseStep.FINISHED
         else:
-            self.note = self.note or f"what became of it is not known: {why}"
-            self.step = Step.FINISHED
+            self.note = self.note or f"its result is unknown: {why}"
+            self.step = CourseStep.FINISHED
 
     def answered(self, now: float, report: Report) -> None:
-        """The other system answered what `look` said to ask."""
-        if report.progress is Progress.REFUSED and self.step in (Step.START, Step.STOP):
+        """The other system answered the request that `look` returned."""
+        if report.progress is Progress.REFUSED and self.step in (CourseStep.START, CourseStep.STOP):
             self.failed(now, report.message, silent=False)
             return
         before = self.report
         if report.progress is not Progress.UNKNOWN:
             self.report = report
-        if self.step in (Step.START, Step.HOLD):
+        if self.step in (CourseStep.START, CourseStep.HOLD):
             self._started(now, report)
         elif report.progress is Progress.UNKNOWN:
             if self.confirmed and not self.problem:
-                self.problem = "the other system knows nothing of it any more: it was restarted, its recording is cut"
-            self.step = Step.FINISHED
+                self.problem = "the other system no longer knows the recording: it restarted, and the recording is cut"
+            self.step = CourseStep.FINISHED
         elif report.progress.over:
             self._over(report)
-        elif self.step is Step.STOP:
-            self._to(Step.AWAIT, now)
+        elif self.step is CourseStep.STOP:
+            self._to(CourseStep.AWAIT, now)
             self.due = now + _POLL
         else:
             if (report.samples, report.progress) != (before.samples, before.progress):
@@ -147,7 +147,7 @@ class Course:
             self.failures = 0
             self.due = now + _POLL
             if now - self._since >= self._limits.give_up:
-                self.failed(now, "it does not come to an end", silent=False)
+                self.failed(now, "it does not finish", silent=False)
 
     def _started(self, now: float, report: Report) -> None:
         if report.progress.over:
@@ -156,20 +156,20 @@ class Course:
         self.failures, self._since = 0, now
         self.confirmed, self.unanswered = True, False
         if self.ended is not None:
-            self._to(Step.STOP, now)
+            self._to(CourseStep.STOP, now)
         else:
-            self.step = Step.HOLD
+            self.step = CourseStep.HOLD
             self.due = FOREVER if self._limits.renew is None else now + self._limits.renew
 
     def _over(self, report: Report) -> None:
         """It has ended there."""
         if report.progress is not Progress.DONE:
-            self.problem = self.problem or report.message or "it failed there"
-        elif self.step in (Step.START, Step.HOLD):
-            self.note = report.message or "it ended there before the episode did"
+            self.problem = self.problem or report.message or "it failed on the other system"
+        elif self.step in (CourseStep.START, CourseStep.HOLD):
+            self.note = report.message or "it ended on the other system before the episode ended"
         else:
             self.note = self.note or report.message
-        self.step = Step.FINISHED
+        self.step = CourseStep.FINISHED
 
-    def _to(self, step: Step, now: float) -> None:
+    def _to(self, step: CourseStep, now: float) -> None:
         self.step, self.due, self.failures, self._since = step, now, 0, now

@@ -1,4 +1,4 @@
-"""Another detector that records: it is told by queries of `wayside/detectors/<name>/recordings`."""
+"""Another detector that records: it receives queries of `wayside/detectors/<name>/recordings`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ class OtherDetector:
         """The other detector's holder."""
         name = member(order.rendered, "detector", "name")
         if not isinstance(name, str) or not _HOLDER.fullmatch(name):
-            raise ActionError(f"detector.name: {name!r} is no detector's name: it has letters, digits, _, . and - only")
+            raise ActionError(
+                f"detector.name: {name!r} is not a detector name: it may have letters, digits, _, . and - only"
+            )
         return name
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
@@ -65,21 +67,23 @@ class OtherDetector:
             maximum_duration=self._maximum,
             event=short(order.event),
         )
-        return self._ask(order, request)
+        return self._request(order, request)
 
     def stop(self, order: Order, ago: float) -> Report:
         """End it, `after` later."""
-        return self._ask(order, RecordingRequest(do="stop", id=order.id, after=self._wanted.after, ago=duration(ago)))
+        return self._request(
+            order, RecordingRequest(do="stop", id=order.id, after=self._wanted.after, ago=duration(ago))
+        )
 
     def status(self, order: Order) -> Report:
         """How far it is."""
-        return self._ask(order, RecordingRequest(id=order.id))
+        return self._request(order, RecordingRequest(id=order.id))
 
-    def _ask(self, order: Order, request: RecordingRequest) -> Report:
+    def _request(self, order: Order, request: RecordingRequest) -> Report:
         name = self.place(order)
-        answers = self._messenger.ask(status_key(name, RECORDINGS), write_request(request), self.timeout)
+        answers = self._messenger.query(status_key(name, RECORDINGS), write_request(request), self.timeout)
         try:
-            said = read_report(answers[0])
+            report = read_report(answers[0])
         except (IndexError, ValueError) as error:
-            raise ActionError(f"detector {name} answered something else: {error}") from error
-        return Report(said.state, said.message, said.samples, said.bytes, said.missing, tuple(said.files))
+            raise ActionError(f"detector {name} returned an unexpected response: {error}") from error
+        return Report(report.state, report.message, report.samples, report.bytes, report.missing, tuple(report.files))

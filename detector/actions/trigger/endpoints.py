@@ -1,6 +1,6 @@
-"""An HTTP endpoint that records: told by a request at the start and one at the end.
+"""An HTTP endpoint that records: it receives a request at the start and one at the end.
 
-It tells a request that is sent again by the header Idempotency-Key. What it answers counts: a start that it refuses for
+The header Idempotency-Key identifies a repeated request. The response counts: a start that it refuses for
 good is not sent again, and a stop of what is not there (404, 410) is as good as done.
 """
 
@@ -49,7 +49,7 @@ class HttpEndpoint:
         if self._wanted.start is None:
             return Report(Progress.RECORDING)
         try:
-            status, verdict, told = self._send("start", self._wanted.start, order)
+            status, verdict, message = self._send("start", self._wanted.start, order)
         except ActionError:
             self._unanswered.add(order.id)
             raise
@@ -57,23 +57,23 @@ class HttpEndpoint:
         self._unanswered.discard(order.id)
         if verdict is Verdict.DONE or (status == _CONFLICT and repeated):
             return Report(Progress.RECORDING)
-        return Report(Progress.FAILED, told)
+        return Report(Progress.FAILED, message)
 
     def stop(self, order: Order, ago: float) -> Report:
         """Send `stop`."""
         if self._wanted.stop is None:
             return Report(Progress.DONE)
-        status, verdict, told = self._send("stop", self._wanted.stop, order)
+        status, verdict, message = self._send("stop", self._wanted.stop, order)
         if verdict is Verdict.DONE:
             return Report(Progress.DONE)
-        return Report(Progress.DONE if status in _GONE else Progress.REFUSED, told)
+        return Report(Progress.DONE if status in _GONE else Progress.REFUSED, message)
 
     def status(self, order: Order) -> Report:
-        """Nothing more is to be known than what the requests said."""
+        """There is no more information than the responses gave."""
         return Report(Progress.DONE)
 
     def _send(self, name: str, call: HttpCall, order: Order) -> tuple[int, Verdict, str]:
-        """The status, what follows from it and what was said. Raises ActionError where it is worth another attempt."""
+        """The status, what follows from it and the message. Raises ActionError if a retry is worthwhile."""
         body = member(order.rendered, "http", name, "body")
         if body is None:
             body = {"id": order.id, "do": name, "maximumDuration": str(self._maximum), "event": order.event}
@@ -89,7 +89,7 @@ class HttpEndpoint:
             answer = self._client.send(call.method.value, url, headers, text, give_up=give_up)
         except (HttpError, ValueError) as error:
             raise ActionError(str(error)) from error
-        verdict, told = judge(answer)
+        verdict, message = judge(answer)
         if verdict is Verdict.AGAIN:
-            raise ActionError(f"{self.place(order)} {told}")
-        return answer.status, verdict, f"{self.place(order)} {told}"
+            raise ActionError(f"{self.place(order)} {message}")
+        return answer.status, verdict, f"{self.place(order)} {message}"

@@ -1,4 +1,5 @@
-"""Which recordings elsewhere have been asked for and not yet stopped: kept on the state volume, for the next start.
+"""The recordings on other systems that were requested and not yet stopped: kept on the state volume, for the next
+start.
 
 Without it, a recording whose episode ended just when the detector was killed would go on until its maximumDuration. The
 file is small and replaced in one step; it is written by the action's own thread.
@@ -20,11 +21,11 @@ _log = logging.getLogger(__name__)
 _VERSION = 1
 
 
-class Journal:
+class OrderJournal:
     """The orders of one action that are not finished."""
 
     def __init__(self, path: Path) -> None:
-        """Raises nothing: a journal that cannot be read or written is said, and done without."""
+        """Raises nothing: a journal that cannot be read or written is logged, and ignored."""
         self._path = path
         self._written: list[str] | None = None
         self.failures = 0
@@ -40,7 +41,7 @@ class Journal:
         except FileNotFoundError:
             return {}
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            _log.error("%s cannot be read, nothing is stopped because of it: %s", self._path, error)
+            _log.error("cannot read %s; not stopping any recordings listed in it: %s", self._path, error)
             return {}
 
     def save(self, orders: Iterable[Order]) -> None:
@@ -52,7 +53,7 @@ class Journal:
             self._write(wanted)
         except OSError as error:
             self.failures += 1
-            _log.error("%s cannot be written, a restart may not know what to stop: %s", self._path, error)
+            _log.error("cannot write %s; after a restart, recordings may not be stopped: %s", self._path, error)
         self._written = list(wanted)
 
     def _write(self, orders: Mapping[str, Order]) -> None:

@@ -1,4 +1,4 @@
-"""What is asked of another system about one recording, and what it says: the same words for every kind of system."""
+"""Requests to another system about one recording, and its reports: the same for every kind of system."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Progress(StrEnum):
     DONE = "Done"
     FAILED = "Failed"
     REFUSED = "Refused"
-    """It was not begun, and the message says why."""
+    """It was not started; the message gives the reason."""
     UNKNOWN = "Unknown"
     """Nothing is known of such a recording."""
 
@@ -31,7 +31,7 @@ class Progress(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What another system says of a recording."""
+    """The report of another system about a recording."""
 
     progress: Progress
     message: str = ""
@@ -43,10 +43,10 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """One recording in another system. All that is needed to ask for it again after a restart."""
+    """One recording in another system. All that is needed to request it again after a restart."""
 
     id: str
-    """`<holder>.<rule>.<action>.<episode>`: whoever is asked twice under it does it once."""
+    """`<holder>.<rule>.<action>.<episode>`: a repeated request with it has no further effect."""
     rendered: Mapping[str, JsonValue]
     """The action's templates."""
     event: Mapping[str, Any] = field(default_factory=dict)
@@ -54,23 +54,25 @@ class Order:
 
 
 class System(Protocol):
-    """Another system that records. Its methods wait for the network, and raise ActionError where nobody answers."""
+    """Another system that records. Its methods wait for the network, and raise ActionError if there is no answer."""
 
     renew: float | None
-    """Seconds after which a start is said again, so that a system that was restarted goes on; None: never."""
+    """Seconds after which a start is repeated, so that a restarted system continues; None: never."""
     timeout: float
     """Seconds to wait for an answer."""
     ends_by_itself: bool
-    """Whether it ends a recording after maximumDuration without being told."""
+    """Whether it ends a recording after maximumDuration by itself."""
 
     def place(self, order: Order) -> str:
-        """Who is asked: those of one place are silent together. Raises ActionError where the order does not say."""
+        """The system that receives it: all orders of one place are silent together. Raises ActionError if the order
+        names none.
+        """
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
-        """Record, from the onset, which was so many seconds ago; `again` where it has been confirmed before."""
+        """Record from the onset, `ago` seconds ago; `again` if it was confirmed before."""
 
     def stop(self, order: Order, ago: float) -> Report:
-        """End the recording; the episode ended so many seconds ago."""
+        """End the recording; the episode ended `ago` seconds ago."""
 
     def status(self, order: Order) -> Report:
         """How far it is."""

@@ -1,6 +1,6 @@
-"""What one detector asks of another about recordings, and what that answers, in JSON.
+"""Requests of one detector to another about recordings, and the responses, in JSON.
 
-A request is the payload of a query of `wayside/detectors/<name>/recordings`. Without one, the query asks for the status
+A request is the payload of a query of `wayside/detectors/<name>/recordings`. Without one, the query requests the status
 of all recordings.
 """
 
@@ -17,7 +17,7 @@ from wayside.api.base import ClientName, Duration, JsonValue, Model, ObjectName,
 from wayside.times import format_time
 
 RECORDINGS = "recordings"
-"""What is asked for, in the detector's key."""
+"""The request, in the key of the detector."""
 
 MAXIMUM_BYTES = 65_536
 """Of a request."""
@@ -33,7 +33,7 @@ class RecordingRequest(Model):
 
     do: Literal["start", "stop", "status"] = "status"
     id: RecordingId | None = None
-    """Whoever asks chooses it. What is asked twice under it is done once."""
+    """The requester chooses it. A repeated request with it has no further effect."""
     streams: list[ObjectName] | None = Field(default=None, max_length=128)
     """Start: default: all that the detector records on request."""
     clients: list[ClientName] | None = Field(default=None, max_length=MAXIMUM_CLIENTS)
@@ -51,7 +51,7 @@ class RecordingRequest(Model):
 
 
 class RecordingReport(msgspec.Struct, frozen=True, rename="camel"):
-    """What a detector says of one recording."""
+    """The report of a detector about one recording."""
 
     id: str
     state: Progress
@@ -77,11 +77,11 @@ def short(event: Mapping[str, Any]) -> dict[str, Any]:
     """The event as a request carries it: without its values where they make it too long, as a fleet's may."""
     if len(msgspec.json.encode(event)) <= MAXIMUM_BYTES // 2:
         return dict(event)
-    told: dict[str, Any] = {key: value for key, value in event.items() if key != "data"}
+    cause: dict[str, Any] = {key: value for key, value in event.items() if key != "data"}
     data = event.get("data")
     if isinstance(data, Mapping):
-        told["data"] = {key: value for key, value in data.items() if key not in ("values", "subjects")}
-    return told
+        cause["data"] = {key: value for key, value in data.items() if key not in ("values", "subjects")}
+    return cause
 
 
 def read_request(payload: bytes) -> RecordingRequest:
@@ -97,7 +97,7 @@ def read_request(payload: bytes) -> RecordingRequest:
         where = ".".join(map(str, first["loc"])) or "the request"
         raise ValueError(f"{where}: {first['msg']}") from None
     if request.do != "status" and request.id is None:
-        raise ValueError(f"{request.do} which recording? Give its id")
+        raise ValueError(f"{request.do}: give the id of the recording")
     return request
 
 

@@ -1,9 +1,9 @@
 """Services of ROS 2 over Zenoh, such as those of rosbag2's recorder.
 
 With rmw_zenoh (its docs/design.md) a service is a queryable on `<domain>/<service>/<type>/<type hash>`; a query carries
-the request as CDR and an attachment: its number and time (8 bytes each, little endian), and who asks (a length of one
-byte, then 16 bytes). The type hash is the service's, so a node whose service is made of something else is not reached.
-With zenoh-bridge-ros2dds it is a queryable on the service's name, and needs no attachment.
+the request as CDR and an attachment: its number and time (8 bytes each, little endian), and the id of the client (a
+length of one byte, then 16 bytes). The type hash is the service's, so a node whose service is made of something else
+is not reached. With zenoh-bridge-ros2dds it is a queryable on the service's name, and needs no attachment.
 
 A service knows nothing of episodes: where it is both started and stopped, all episodes of the action share one
 recording.
@@ -43,7 +43,7 @@ class Ros2Services:
         self.timeout = parameters.timeout.seconds
         self._messenger = messenger
         self._types = types
-        self._asker = os.urandom(16)
+        self._client_id = os.urandom(16)
         self._numbers = count(1)
         self._recording: set[str] = set()
         """The orders for which the recorder has been started."""
@@ -64,7 +64,7 @@ class Ros2Services:
             if report is not None:
                 return report
         self._recording.add(order.id)
-        return Report(Progress.RECORDING, "the recorder runs already, for another episode" if shared else "")
+        return Report(Progress.RECORDING, "the recorder already runs for another episode" if shared else "")
 
     def stop(self, order: Order, ago: float) -> Report:
         """Call `stop`, unless another episode goes on."""
@@ -74,10 +74,10 @@ class Ros2Services:
             if report is not None:
                 return report
         self._recording.discard(order.id)
-        return Report(Progress.DONE, "the recorder goes on, for another episode" if shared else "")
+        return Report(Progress.DONE, "the recorder keeps running for another episode" if shared else "")
 
     def status(self, order: Order) -> Report:
-        """Nothing more is to be known than what the calls said."""
+        """There is no more information than the responses gave."""
         return Report(Progress.RECORDING if order.id in self._recording else Progress.DONE)
 
     def _call(self, name: str, call: ServiceCall, order: Order) -> Report | None:
@@ -93,9 +93,11 @@ class Ros2Services:
         if self._wanted.layout is Layout.RMW_ZENOH:
             package, _, short = call.type.split("/")
             topic = f"{self._wanted.domain or 0}/{topic}/{package}::srv::dds_::{short}_/{of_type.type_hash}"
-            attachment = struct.pack("<qqB", next(self._numbers), time.time_ns(), len(self._asker)) + self._asker
+            attachment = (
+                struct.pack("<qqB", next(self._numbers), time.time_ns(), len(self._client_id)) + self._client_id
+            )
         try:
-            answers = self._messenger.ask(topic, request, self.timeout, attachment)
+            answers = self._messenger.query(topic, request, self.timeout, attachment)
             response = of_type.response(answers[0])
         except ActionError as error:
             self._unanswered.add(key)
@@ -106,7 +108,7 @@ class Ros2Services:
         repeated = key in self._unanswered
         self._unanswered.discard(key)
         if refusal is None or (repeated and "return_code" in response):
-            # rosbag2 says 1 as well where it is as wanted already: then the call before had arrived.
+            # rosbag2 also returns 1 if it is already in the wanted state: then the call before had arrived.
             return None
         return Report(Progress.REFUSED, f"{call.service} refused: {refusal}")
 
@@ -125,12 +127,12 @@ def _refusal(response: Mapping[str, Any]) -> str | None:
 
 
 def problems(parameters: Trigger, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
-    """What is wrong with the calls, as far as that can be told without an episode."""
+    """What is wrong with the calls, as far as that is known without an episode."""
     if parameters.ros2 is None:
         return
     try:
         types = types_with(tuple(Definition(each.name, each.definition) for each in detector.spec.messages))
-    except DefinitionsError:  # the Detector's problem, and told there
+    except DefinitionsError:  # a problem of the Detector, and reported there
         return
     for name, call in parameters.ros2.calls.items():
         field = "definition"

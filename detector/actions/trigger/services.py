@@ -69,14 +69,14 @@ class Service:
         except (SerdeError, OverflowError, ValueError, TypeError, AttributeError) as error:
             if isinstance(error, ServiceError):
                 raise
-            raise ServiceError(f"the request does not fit {self.name}: {error}") from error
+            raise ServiceError(f"the request does not match {self.name}: {error}") from error
 
     def response(self, payload: bytes) -> dict[str, Any]:
         """A response as a map. Raises ServiceError where the bytes are none."""
         try:
             decoded: dict[str, Any] = CdrDecoder(f"{self.name}_Response", RosTypes(lambda: self.store)).decode(payload)
         except DecodeError as error:
-            raise ServiceError(f"the answer is no response of {self.name}: {error}") from None
+            raise ServiceError(f"the response is not of type {self.name}: {error}") from None
         return decoded
 
 
@@ -88,7 +88,7 @@ def service(name: str, definition: str | None, types: RosTypes) -> Service:
     """
     text = KNOWN.get(name) if definition is None else definition
     if text is None:
-        raise ServiceError(f"the service type {name} is not known: give its .srv file as definition")
+        raise ServiceError(f"unknown service type {name}: give its .srv file as definition")
     made = _parsed(name, text)
     store = Typestore()
     store.fielddefs.update(types.store.fielddefs)
@@ -98,7 +98,7 @@ def service(name: str, definition: str | None, types: RosTypes) -> Service:
         for field, desc in fields:
             below = _named(desc)
             if below is not None and below not in made and below not in store.fielddefs:
-                raise ServiceError(f"{key}: {field} is of {below}, which is not known: define it in spec.messages")
+                raise ServiceError(f"{key}: {field} has the unknown type {below}: define it in spec.messages")
     made |= _event(name)
     try:
         with REGISTERING:
@@ -106,7 +106,7 @@ def service(name: str, definition: str | None, types: RosTypes) -> Service:
             store.types.pop(_EVENT_INFO, None)
             store.register(made)
     except _PARSER as error:
-        raise ServiceError(f"the definition of {name} cannot be used: {error}") from error
+        raise ServiceError(f"cannot use the definition of {name}: {error}") from error
     return Service(name, store)
 
 
@@ -117,7 +117,8 @@ def _parsed(name: str, text: str) -> Typesdict:
     borders = [number for number, line in enumerate(lines) if line.strip() == "---"]
     if len(borders) != 1:
         raise ServiceError(
-            f"the definition of {name} has {len(borders)} lines of ---: one stands between request and response"
+            f"the definition of {name} has {len(borders)} lines of ---: there must be exactly one, between "
+            "request and response"
         )
     parts = {"Request": lines[: borders[0]], "Response": lines[borders[0] + 1 :]}
     types: Typesdict = {}
@@ -126,8 +127,8 @@ def _parsed(name: str, text: str) -> Typesdict:
             parsed = get_types_from_msg("\n".join(its_lines) + "\n", f"{package}/msg/{short}_{part}")
         except _PARSER as error:
             raise ServiceError(
-                f"the {part.lower()} in the definition of {name} cannot be read: write a type and a name on each line, "
-                f"as float64 x ({str(error)[:120]})"
+                f"cannot read the {part.lower()} in the definition of {name}: write a type and a name on "
+                f"each line, as float64 x ({str(error)[:120]})"
             ) from error
         for key, value in parsed.items():
             types[f"{name}_{part}" if key == f"{package}/msg/{short}_{part}" else key] = value

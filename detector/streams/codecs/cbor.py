@@ -23,7 +23,7 @@ stack."""
 
 
 class CborDecoder:
-    """Reads CBOR of any shape; it carries no stamp that could be known without asking the user."""
+    """Reads CBOR of any shape; only the stream knows which field is its stamp."""
 
     def decode(self, payload: bytes) -> Any:
         """The value. Raises DecodeError for anything but one CBOR data item, nested at most MAX_DEPTH deep."""
@@ -31,15 +31,15 @@ class CborDecoder:
         try:
             value = _plain(decoder.decode())
         except (cbor2.CBORDecodeError, _ReferenceError) as error:
-            raise DecodeError(f"no CBOR: {error.__cause__ or error}") from None
+            raise DecodeError(f"not CBOR: {error.__cause__ or error}") from None
         try:
             decoder.read(1)
         except cbor2.CBORDecodeEOF:
             return value
-        raise DecodeError("no CBOR: something follows the data item")
+        raise DecodeError("not CBOR: there are bytes after the data item")
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: which field is the stamp is for the stream to say."""
+        """None: the stream defines which field is the stamp."""
         return None
 
 
@@ -64,7 +64,7 @@ def _plain(value: Any) -> Any:
 def _key(key: Any) -> str:
     if type(key) is int:
         return str(number(key)).removesuffix(".0")
-    raise DecodeError(f"no CBOR that can be read: {type(key).__name__} as a key of a map; give text or integers")
+    raise DecodeError(f"unsupported CBOR: {type(key).__name__} as a key of a map; use text or integers")
 
 
 def _untagged(tag: cbor2.CBORTag, immutable: bool) -> Any:
@@ -76,7 +76,7 @@ def _content(value: Any, immutable: bool) -> Any:
 
 
 def _reference(value: Any, immutable: bool) -> Any:
-    raise _ReferenceError("parts that refer to each other (tags 28 and 29) are not read")
+    raise _ReferenceError("unsupported CBOR: shared values (tags 28 and 29)")
 
 
 def _decimal(value: Any, immutable: bool) -> Any:
@@ -94,7 +94,7 @@ def _fraction(value: Any) -> tuple[int, int]:
     match value:
         case [int(exponent), int(mantissa)] if max(abs(exponent), abs(mantissa)) < 2**64:
             return exponent, mantissa
-    raise ValueError("a fraction is written as exponent and mantissa, two integers")
+    raise ValueError("a decimal fraction must be two integers, exponent and mantissa")
 
 
 def _bounded(compute: Callable[[], float]) -> float:

@@ -51,7 +51,7 @@ class CdrDecoder:
         try:
             message = self._read(payload if len(payload) < _LARGE else memoryview(payload), self.type_name)
         except SerdeError as error:
-            raise DecodeError(f"no CDR of {self.type_name} ({len(payload)} bytes): {error}") from None
+            raise DecodeError(f"not CDR of {self.type_name} ({len(payload)} bytes): {error}") from None
         return self._convert(message)
 
     def stamp(self, payload: bytes) -> int | None:
@@ -63,7 +63,7 @@ class CdrDecoder:
             return self._stamp_inside(payload) if self._has_header else None
         unpack = _STAMPS.get(payload[:2])
         if unpack is None or len(payload) < 12:
-            raise DecodeError(f"no CDR of {self.type_name} ({len(payload)} bytes): no header")
+            raise DecodeError(f"not CDR of {self.type_name} ({len(payload)} bytes): no header")
         return self._time(*unpack(payload, 4))
 
     def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
@@ -77,7 +77,7 @@ class CdrDecoder:
 
     def _time(self, seconds: int, nanoseconds: int) -> int:
         if seconds < 0 or nanoseconds >= 1_000_000_000:
-            raise DecodeError(f"header.stamp of {self.type_name} is no time: {seconds} s, {nanoseconds} ns")
+            raise DecodeError(f"header.stamp of {self.type_name} is not a time: {seconds} s, {nanoseconds} ns")
         return seconds * 1_000_000_000 + nanoseconds
 
 

@@ -1,7 +1,7 @@
 """CDR: reads a few fields, by a function whose source is generated for the type and the paths (see `cdr_walk`).
 
 It finds what rosbags finds, and makes every check that rosbags makes, also of what it skips. A payload that fails one
-is decoded whole, so that the decoder says what is wrong.
+is decoded whole, so that the decoder reports what is wrong.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from detector.engine.samples.sample import MISSING, FieldReader, Fields
-from detector.streams.codecs.cdr_source import Source, UnwalkableError
+from detector.streams.codecs.cdr_source import CdrSource, UnwalkableError
 from detector.streams.codecs.cdr_values import PADDING
 from detector.streams.codecs.cdr_walk import Tree, Walk
 from detector.streams.codecs.paths import Path, complete, shortest, spread
@@ -29,7 +29,7 @@ None for a path that leads to nothing."""
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """A byte order: how an encapsulation says it, and how struct and numpy do."""
+    """A byte order: in an encapsulation, in struct and in numpy."""
 
     representation: bytes
     mark: int
@@ -96,7 +96,7 @@ def _readable(types: RosTypes, type_name: str, path: Path) -> Path:
 
 def _walker(types: RosTypes, type_name: str, paths: Sequence[Path], order: _Order) -> _Walker:
     """A function that reads the paths, none of which lies below another one. Raises UnwalkableError."""
-    code = Source(order.sign)
+    code = CdrSource(order.sign)
     walk = Walk(types, code)
     mark = code.encapsulation()
     walk.message(type_name, _tree(paths))

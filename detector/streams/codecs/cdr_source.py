@@ -21,7 +21,7 @@ class UnwalkableError(ValueError):
 
 
 @dataclass
-class Source:
+class CdrSource:
     """Lines that read a payload `p`; the position is `base + constant`, of which `base` is a variable."""
 
     sign: str
@@ -46,7 +46,7 @@ class Source:
         return str(constant) if not self.base else f"{self.base} + {constant}" if constant else self.base
 
     def encapsulation(self) -> str:
-        """Reads what says the byte order; the name of the number."""
+        """Reads the byte order; returns the name of the number."""
         mark = self.read("H", 2)
         self.constant, self.remainder = 4, 0
         return mark

@@ -16,7 +16,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
-from detector.streams.codecs.cdr_source import Source, UnwalkableError
+from detector.streams.codecs.cdr_source import CdrSource, UnwalkableError
 from detector.streams.codecs.cdr_values import PADDING, array, scalar
 from detector.streams.codecs.paths import Path
 from detector.streams.codecs.ros import RosTypes
@@ -60,7 +60,7 @@ class Walk:
     """Adds to the source what walks through messages. It refers to `texts`, which checks and reads texts."""
 
     types: RosTypes
-    source: Source
+    source: CdrSource
     found: dict[Path, Value] = field(default_factory=dict)
     """What was wanted, by its path."""
     fields: int = 0
@@ -231,7 +231,7 @@ class Walk:
 
     def _fixed_size(self, type_name: str, alignment: int) -> int | None:
         """The size of messages of the type where it is always the same, given how they are aligned; else None."""
-        source = Source(self.source.sign, modulus=alignment)
+        source = CdrSource(self.source.sign, modulus=alignment)
         alone = Walk(self.types, source, fields=self.fields)
         alone.message(type_name, False)
         self.fields = alone.fields
@@ -274,5 +274,5 @@ class Walk:
 def _size(kind: str) -> int:
     """Of a number, in bytes."""
     if kind not in _FORMATS:
-        raise UnwalkableError(f"{kind} is not read")
+        raise UnwalkableError(f"{kind} is not supported")
     return struct.calcsize("<" + _FORMATS[kind])

@@ -23,10 +23,10 @@ _HEADLINE = re.compile(r"MSG: [A-Za-z0-9/_]+[ \t]*")
 _PARSER = (TypesysError, ValueError, TypeError, KeyError, IndexError, AssertionError, AttributeError, RecursionError)
 """What rosbags raises where a text is no definition: its own error, and what a strange text makes its parts raise."""
 
-_UNSUPPORTED = {"wstring": "a text of wide characters is not read", "float128": "a number of 16 bytes is not read"}
+_UNSUPPORTED = {"wstring": "wide strings are not supported", "float128": "numbers of 16 bytes are not supported"}
 
 
-_MISPLACED = "a line of `=` stands before each further type and its `MSG: <type>`, and nowhere else"
+_MISPLACED = "a line of `=` must stand before each further type and its `MSG: <type>`, and nowhere else"
 
 _LONGEST = 2**31
 """So many elements has no array."""
@@ -55,7 +55,7 @@ class DefinitionsError(ValueError):
 
 @lru_cache(maxsize=512)
 def parsed(definition: Definition) -> Typesdict:
-    """The type, and those that the text holds beside it. Raises DefinitionsError, which tells the line."""
+    """The type, and those that the text holds beside it. Raises DefinitionsError, which gives the line."""
     text = _SEPARATOR.sub("=" * 80, definition.text.replace("\r\n", "\n")).rstrip() + "\n"
     try:
         return get_types_from_msg(text, definition.name)
@@ -68,7 +68,7 @@ def from_idl(text: str) -> Typesdict:
     try:
         return get_types_from_idl(text)
     except _PARSER as error:
-        raise ValueError(f"it is no IDL that can be read: {str(error)[:200]}") from None
+        raise ValueError(f"not valid IDL: {str(error)[:200]}") from None
 
 
 def merged(definitions: Sequence[Definition]) -> Typesdict:
@@ -85,7 +85,9 @@ def merged(definitions: Sequence[Definition]) -> Typesdict:
         for name, parts in inside.items():
             if name in types and types[name][1] != parts[1]:
                 other = given_in[name]
-                problems.append((definition.name, f"defines {name} otherwise than that of {other} does: correct one"))
+                problems.append(
+                    (definition.name, f"defines {name} differently than the definition of {other}: correct one")
+                )
             else:
                 types[name] = parts
                 given_in.setdefault(name, definition.name)
@@ -97,7 +99,7 @@ def merged(definitions: Sequence[Definition]) -> Typesdict:
 def check(definitions: Sequence[Definition], new: Typesdict, known: Mapping[str, Any]) -> None:
     """That fields are there once, of types that are new or known, and that no type holds itself.
 
-    Raises DefinitionsError, which tells the field.
+    Raises DefinitionsError, which gives the field.
     """
     problems = [
         (definition.name, f"{_place(definition, name, field)} {problem}")
@@ -125,7 +127,7 @@ def _wrong_fields(fields: Iterable[tuple[str, FieldDesc]], known: Collection[str
         seen.add(field)
         kind, detail = desc
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and not 0 <= int(detail[1]) < _LONGEST:
-            yield field, f"has {detail[1]} elements, which no message can"
+            yield field, f"has {detail[1]} elements, which no message can have"
         below = _named(desc)
         if below is not None and below not in known:
             yield field, f"is of {_missing(below)}"
@@ -139,7 +141,7 @@ def _depth(name: str, types: Typesdict, seen: dict[str, int], above: tuple[str, 
     """How deep the type is nested, not counting what is known beforehand. Raises _EndlessError."""
     if name in above:
         circle = " → ".join((*above[above.index(name) :], name))
-        raise _EndlessError(f"it holds itself ({circle}), which no message can")
+        raise _EndlessError(f"it contains itself ({circle}), which no message can")
     if name not in types:
         return 0
     if name not in seen:
@@ -162,7 +164,7 @@ def _named(desc: FieldDesc) -> str | None:
 
 def _missing(name: str) -> str:
     reason = _UNSUPPORTED.get(name.rsplit("/", 1)[-1])
-    return f"{name}: {reason}" if reason else f"{name}, which is not known: give its definition as well"
+    return f"{name}: {reason}" if reason else f"{name}, which is unknown: give its definition as well"
 
 
 def _place(definition: Definition, type_name: str, field: str) -> str:
@@ -195,6 +197,7 @@ def _wrong_line(text: str) -> str | None:
             get_types_from_msg(line, "a/msg/A")
         except _PARSER:
             return (
-                f"line {number}: {line.strip()[:80]!r} is no line of a .msg file: write a type and a name, as float64 x"
+                f"line {number}: {line.strip()[:80]!r} is not a line of a .msg file: write a type and a "
+                "name, as float64 x"
             )
     return None

@@ -22,21 +22,21 @@ _read = msgspec.json.Decoder().decode
 
 
 class JsonDecoder:
-    """Reads JSON of any shape; it carries no stamp that could be known without asking the user."""
+    """Reads JSON of any shape; only the stream knows which field is its stamp."""
 
     def decode(self, payload: bytes) -> Any:
         """The value. Raises DecodeError for anything but one JSON value in UTF-8, nested at most MAX_DEPTH deep."""
         try:
             value = _read(payload)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise DecodeError(f"no JSON: {error}") from None
+            raise DecodeError(f"not JSON: {error}") from None
         except RecursionError:
             # msgspec counts its depth, so the stack is sound: this is its way of saying that the nesting is too deep.
             raise _too_deep() from None
         return _with_doubles(value, MAX_DEPTH)
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: which field is the stamp is for the stream to say."""
+        """None: the stream defines which field is the stamp."""
         return None
 
     def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
@@ -69,4 +69,4 @@ _DONE = frozenset((float, str, bool, type(None)))
 
 
 def _too_deep() -> DecodeError:
-    return DecodeError(f"JSON nested more than {MAX_DEPTH} deep")
+    return DecodeError(f"JSON nested more than {MAX_DEPTH} levels deep")

@@ -2,7 +2,7 @@
 
 msgspec skips what a struct does not have, and looks at it less closely than when it decodes it: neither at UTF-8, nor
 at how large a number is, nor at our bound on the depth. What may fail there is decoded whole, and so is every message
-that does not fit the structs, so that the decoder says what is read and what is refused.
+that does not fit the structs, so that the decoder decides what is read and what is refused.
 """
 
 from __future__ import annotations

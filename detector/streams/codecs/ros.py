@@ -27,7 +27,7 @@ class UnknownTypeError(ValueError):
     def __init__(self, name: str, types: RosTypes, field: str | None = None) -> None:
         """`field` is where the name was given."""
         close = difflib.get_close_matches(name, types.store.fielddefs, n=3, cutoff=0.8)
-        remedy = f"did you mean {' or '.join(close)}? Else give" if close else "give"
+        remedy = f"did you mean {' or '.join(close)}? Otherwise give" if close else "give"
         where = f"{field}: " if field else ""
         super().__init__(f"{where}unknown message type {name!r}: {remedy} its definition in spec.messages")
 
@@ -36,7 +36,7 @@ class RosTypes:
     """Message types by their names, e.g. geometry_msgs/msg/PoseStamped."""
 
     def __init__(self, load: Callable[[], Typestore]) -> None:
-        """`load` gives the types when they are first asked for: the classes of a release take 0.1 s to make."""
+        """`load` gives the types at their first use: the classes of a release take 0.1 s to make."""
         self._load = load
 
     @cached_property
@@ -100,5 +100,5 @@ def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
         with REGISTERING:
             store.register(new)
     except (TypesysError, SyntaxError, ValueError) as error:
-        raise DefinitionsError([(definitions[0].name, f"the definitions cannot be used: {error}")]) from error
+        raise DefinitionsError([(definitions[0].name, f"cannot use the definitions: {error}")]) from error
     return RosTypes(lambda: store)

@@ -38,11 +38,11 @@ def image(payload: bytes) -> NDArray[np.float32]:
     """The pixels of a sensor_msgs/msg/Image as (height, width, 3) in the order R, G, B, or (height, width, 1) if gray.
 
     Raises:
-        DecodeError: no such message, an encoding that is not known, or fewer bytes than it says.
+        DecodeError: no such message, an encoding that is not known, or fewer bytes than it declares.
     """
     message = _message(payload, IMAGE)
     if message.encoding not in _PIXELS:
-        raise DecodeError(f"image encoding {message.encoding!r}: one of {', '.join(_PIXELS)} is needed")
+        raise DecodeError(f"image encoding {message.encoding!r} is not supported; use one of {', '.join(_PIXELS)}")
     kind, channels = _PIXELS[message.encoding]
     height, width, depth = int(message.height), int(message.width), len(channels)
     number = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
@@ -64,13 +64,13 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
     """The points of a sensor_msgs/msg/PointCloud2 as (points, fields), without those that have a NaN there or no place.
 
     Raises:
-        DecodeError: no such message, a field that it does not have, or fewer bytes than it says.
+        DecodeError: no such message, a field that it does not have, or fewer bytes than it declares.
     """
     message = _message(payload, POINT_CLOUD)
     described = {field.name: field for field in message.fields}
     missing = [name for name in fields if name not in described]
     if missing:
-        raise DecodeError(f"the points have no field {missing[0]}: they have {', '.join(described) or 'none'}")
+        raise DecodeError(f"the points have no field {missing[0]}; their fields are {', '.join(described) or 'none'}")
     height, width, step, row = (
         int(each) for each in (message.height, message.width, message.point_step, message.row_step)
     )
@@ -80,7 +80,7 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
     for name in read:
         field = described[name]
         if field.datatype not in _POINT_TYPES:
-            raise DecodeError(f"field {name} of the points has datatype {field.datatype}: 1 to 8 are known")
+            raise DecodeError(f"field {name} of the points has the unknown datatype {field.datatype}; 1 to 8 are known")
         kind = np.dtype(order + _POINT_TYPES[field.datatype])
         columns.append((kind, int(field.offset)))
     if height * width == 0:
@@ -99,4 +99,4 @@ def _message(payload: bytes, kind: str) -> Any:
     try:
         return standard().store.deserialize_cdr(payload, kind)
     except Exception as error:  # rosbags raises what its generated code meets: struct's, numpy's, assertions
-        raise DecodeError(f"no {kind}: {error}") from error
+        raise DecodeError(f"not a valid {kind}: {error}") from error

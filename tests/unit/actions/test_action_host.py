@@ -23,7 +23,7 @@ from detector.actions import (
     registry,
 )
 from detector.actions.host import ActionHost
-from detector.actions.outcomes import Tally, Which
+from detector.actions.outcomes import ActionTally, Which
 from detector.actions.worker import SILENT
 from detector.assembly import inlets
 from detector.engine.engine import Engine
@@ -143,20 +143,20 @@ class Site:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         self.published.append((key, payload))
 
-    def ask(self, *_: Any) -> list[bytes]:
+    def query(self, *_: Any) -> list[bytes]:
         raise ActionError("nobody")
 
     def follow(self, *rules: EventRule) -> None:
         entries = inlets(DETECTOR)
         self.host.follow(rules, Surroundings(DETECTOR, entries.decoders, entries.types))
         self.engine.set_rules(compiled(DETECTOR, *rules))
-        self.host.tell(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.take(self.engine.now))
 
     def take(self, *speeds: tuple[float, str, float], until: float) -> None:
         self.engine.advance([arrival(seconds, client, {"v": v}) for seconds, client, v in speeds], at(until))
-        self.host.tell(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.take(self.engine.now))
 
-    def tally(self, action: str) -> Tally:
+    def tally(self, action: str) -> ActionTally:
         return self.host.outcomes.tallies()[Which("fast", action)]
 
     def when(self, true: Callable[[], bool]) -> None:
@@ -213,7 +213,7 @@ def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
     site = Site(fast(a="impossible", b="recorded"))
     one_episode(site)
     site.host.close()
-    assert site.tally("a").last_failure == "the action cannot be had: OSError: no paper"
+    assert site.tally("a").last_failure == "cannot create the action: OSError: no paper"
     assert site.tally("b").done == 1
 
 
@@ -227,7 +227,7 @@ def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted
     SLOW.set()
     site.when(lambda: site.tally("a").done == 1)
     [lost] = [each for each in site.host.outcomes.lost() if each.which.action == "a"]
-    assert lost.what == "samples left out, the action being too slow"
+    assert lost.what == "samples left out because the action is too slow"
     counted = sum(int(text.split()[1]) for text in Recorded.told if text.startswith("a ") and "samples" in text)
     assert site.tally("a").missing == lost.count == 42 - counted > 0
     site.host.close()
@@ -237,7 +237,9 @@ def test_one_that_hangs_at_the_end_is_left_behind() -> None:
     site = Site(fast(a="hangs"))
     one_episode(site)
     site.host.close(grace=0.05)
-    assert [each.what for each in site.host.outcomes.lost()] == ["times the action did not end and was left behind"]
+    assert [each.what for each in site.host.outcomes.lost()] == [
+        "times the action did not stop in time and was abandoned"
+    ]
 
 
 def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_goes_on() -> None:

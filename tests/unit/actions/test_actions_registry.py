@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from detector import entrypoints
 from detector.actions import Action
-from detector.actions.registry import OFFERS, action_problems, prepare
-from detector.assembly import RuleBook, inlets
+from detector.actions.registry import OFFERS, action_problems, prepare_action
+from detector.assembly import RuleIndex, inlets
 from detector.checking import check_documents
 from tests.driving import a_detector, a_rule
 from wayside.api.documents import load_documents
@@ -52,18 +52,22 @@ def rule(name: str, **parameters: Any) -> Any:
 
 def test_an_action_gets_its_parameters_as_its_model() -> None:
     (action,) = rule("lamp", colour="red").spec.actions
-    assert prepare(action) == (Lamp, LampParameters(colour="red"))
+    assert prepare_action(action) == (Lamp, LampParameters(colour="red"))
 
 
 @pytest.mark.parametrize(
     ("name", "parameters", "problem"),
     [
-        ("lamb", {}, "plugin.name: no action lamb is installed here; did you mean lamp? (docs/actions.md)"),
-        ("xyz", {}, "plugin.name: no action xyz is installed here; there are bare, lamp, lost, parameters"),
-        ("lost", {}, "plugin.name: action lost cannot be loaded: AttributeError"),
-        ("parameters", {}, "which is no complete detector.actions.base.Action (docs/actions.md)"),
+        ("lamb", {}, "plugin.name: no action lamb is installed; did you mean lamp? (docs/actions.md)"),
+        ("xyz", {}, "plugin.name: no action xyz is installed; there are bare, lamp, lost, parameters"),
+        ("lost", {}, "plugin.name: cannot load action lost: AttributeError"),
+        ("parameters", {}, "which is not a complete detector.actions.base.Action (docs/actions.md)"),
         ("bare", {}, "plugin.name: action bare: give tests.unit.actions.test_actions_registry:Bare a class Parameters"),
-        ("deploy", {}, "plugin.name: deploy is no plugin: write deploy: {…} in place of plugin: {…}"),
+        (
+            "deploy",
+            {},
+            "plugin.name: deploy is a built-in action, not a plugin: write deploy: {…} instead of plugin: {…}",
+        ),
         ("lamp", {}, "plugin.parameters.colour: is missing: add it"),
         ("lamp", {"colour": "red", "seconds": 0}, "plugin.parameters.seconds: must be greater than 0; given: 0"),
         ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: unknown field"),
@@ -88,9 +92,9 @@ def test_check_tells_line_and_column(tmp_path: Path) -> None:
 
 
 def test_a_rule_whose_action_is_refused_goes_on_as_it_last_was() -> None:
-    book, detector = RuleBook(), a_detector()
-    book.compile([rule("lamp", colour="red")], detector, inlets(detector).fields)
-    (kept,), (refusal,) = book.compile([rule("lamp")], detector, inlets(detector).fields)
+    index, detector = RuleIndex(), a_detector()
+    index.compile([rule("lamp", colour="red")], detector, inlets(detector).fields)
+    (kept,), (refusal,) = index.compile([rule("lamp")], detector, inlets(detector).fields)
     assert kept.name == "r"
     assert refusal.kept
     assert "plugin.parameters.colour" in str(refusal)

@@ -77,7 +77,7 @@ def test_a_payload_that_cannot_be_decoded_is_kept_as_it_came() -> None:
     document = bson.decode(made.document)
     assert made.undecoded
     assert document["payload"] == b"no json"
-    assert "no JSON" in document["error"]
+    assert "not JSON" in document["error"]
     assert "msg" not in document
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 
 from detector.actions.notify.grouping import Groups
 from detector.actions.notify.notice import GROUP_TYPE, Notice, Texts, event_of_group
-from detector.actions.notify.outbox import LONGEST, LONGEST_ASKED, Budget, Delivery, Fate, Message, Outbox
+from detector.actions.notify.outbox import LONGEST, LONGEST_RETRY_AFTER, Budget, Delivery, Fate, Message, Outbox
 from tests.notifying import an_episode
 
 DELIVERED, AGAIN, REFUSED = Delivery(Fate.DELIVERED), Delivery(Fate.AGAIN), Delivery(Fate.REFUSED)
@@ -89,13 +89,13 @@ def test_a_message_that_is_not_liked_holds_up_no_other() -> None:
     assert second is not first
 
 
-@pytest.mark.parametrize(("asked", "waited"), [(100.0, 100.0), (1e9, LONGEST_ASKED)])
-def test_what_an_endpoint_asks_for_is_heeded_within_reason(asked: float, waited: float) -> None:
+@pytest.mark.parametrize(("retry_after", "waited"), [(100.0, 100.0), (1e9, LONGEST_RETRY_AFTER)])
+def test_what_an_endpoint_asks_for_is_heeded_within_reason(retry_after: float, waited: float) -> None:
     box = Outbox(10, 1e9)
     box.add(message("a"))
     taken = box.take(0.0)
     assert taken is not None
-    box.settle(taken, Delivery(Fate.AGAIN, asked=asked, whole=True), 0.0, wall=0.0)
+    box.settle(taken, Delivery(Fate.AGAIN, retry_after=retry_after, whole=True), 0.0, wall=0.0)
     assert box.wait(0.0) == waited
 
 

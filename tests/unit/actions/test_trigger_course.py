@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.actions.trigger.course import FOREVER, Course, Limits, Step
+from detector.actions.trigger.course import FOREVER, Course, CourseStep, Limits
 from detector.actions.trigger.orders import Order, Progress, Report
 
 RECORDING, DONE = Report(Progress.RECORDING), Report(Progress.DONE, files=("a",))
@@ -20,16 +20,16 @@ def a_course(
 
 def test_a_recording_is_started_said_again_stopped_and_awaited() -> None:
     course = a_course()
-    assert course.look(0) is Step.START
+    assert course.look(0) is CourseStep.START
     course.answered(0, RECORDING)
     assert course.look(9) is None
-    assert course.look(10) is Step.HOLD
+    assert course.look(10) is CourseStep.HOLD
     course.answered(10, RECORDING)
     course.end(15, 14)
-    assert course.look(15) is Step.STOP
+    assert course.look(15) is CourseStep.STOP
     course.answered(15, ENDING)
     assert course.look(15) is None
-    assert course.look(16) is Step.AWAIT
+    assert course.look(16) is CourseStep.AWAIT
     course.answered(16, DONE)
     assert course.finished
     assert course.problem == ""
@@ -41,9 +41,9 @@ def test_an_episode_that_is_over_before_the_start_is_confirmed_is_recorded_never
     course.failed(0, "silence", silent=True)
     course.end(0.1, 0.1)
     assert course.look(0.2) is None
-    assert course.look(0.5) is Step.START
+    assert course.look(0.5) is CourseStep.START
     course.answered(0.5, RECORDING)
-    assert course.look(0.5) is Step.STOP
+    assert course.look(0.5) is CourseStep.STOP
 
 
 def test_what_is_not_confirmed_is_asked_later_and_later_and_given_up() -> None:
@@ -51,13 +51,13 @@ def test_what_is_not_confirmed_is_asked_later_and_later_and_given_up() -> None:
     times = []
     for tenth in range(2000):
         step = course.look(tenth / 10)
-        if step is Step.START:
+        if step is CourseStep.START:
             times.append(tenth / 10)
             course.failed(tenth / 10, "silence", silent=True)
-        if step is Step.STOP:
+        if step is CourseStep.STOP:
             break
     assert times == [0, 0.5, 1.5, 3.5, 7.5, 15.5, 30.5, 45.5, 60.5]
-    assert course.problem == "not started, and given up: silence"
+    assert course.problem == "gave up starting it: silence"
     assert not course.lost_stop
 
 
@@ -66,20 +66,20 @@ def test_a_stop_that_is_given_up_is_told() -> None:
     course.answered(0, RECORDING)
     course.end(1, 1)
     for second in range(1, 20):
-        if course.look(second) is Step.STOP:
+        if course.look(second) is CourseStep.STOP:
             course.failed(second, "silence", silent=True)
     assert course.finished
     assert course.lost_stop
-    assert course.problem == "the stop was not confirmed, and is given up: silence"
+    assert course.problem == "gave up waiting for the confirmation of the stop: silence"
 
 
 def test_what_is_refused_is_asked_again_and_then_needs_no_stop() -> None:
     course = a_course(give_up=1)
     for now in (0.0, 0.5, 1.5):
-        assert course.look(now) is Step.START
+        assert course.look(now) is CourseStep.START
         course.answered(now, Report(Progress.REFUSED, "too many"))
     assert course.finished
-    assert course.problem == "not started, and given up: too many"
+    assert course.problem == "gave up starting it: too many"
 
 
 def test_a_system_that_was_restarted_goes_on_with_the_next_start() -> None:
@@ -87,14 +87,14 @@ def test_a_system_that_was_restarted_goes_on_with_the_next_start() -> None:
     course.answered(0, RECORDING)
     assert course.confirmed
     for now in (10, 10.5, 11.5, 200):  # it is away for long: as long as the episode lasts, nothing is given up
-        assert course.look(now) is Step.HOLD
+        assert course.look(now) is CourseStep.HOLD
         course.failed(now, "silence", silent=True)
-    assert course.look(300) is Step.HOLD
+    assert course.look(300) is CourseStep.HOLD
     course.answered(300, RECORDING)
     course.end(301, 301)
     course.answered(301, UNKNOWN)  # restarted once more, just now
     assert course.finished
-    assert "restarted, its recording is cut" in course.problem
+    assert "restarted, and the recording is cut" in course.problem
 
 
 def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
@@ -102,9 +102,9 @@ def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
     course.answered(0, RECORDING)
     assert course.next_look() == 30
     assert course.look(29.9) is None
-    assert course.look(30) is Step.STOP
+    assert course.look(30) is CourseStep.STOP
     course.answered(30, DONE)
-    assert course.note == "ended by its maximumDuration, before the episode did"
+    assert course.note == "its maximumDuration ended it before the episode ended"
 
 
 def test_a_system_that_counts_the_time_itself_says_so() -> None:

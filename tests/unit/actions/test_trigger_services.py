@@ -50,15 +50,15 @@ def test_a_definition_may_use_messages_of_the_detector() -> None:
     ("definition", "request_", "told"),
     [
         ("int8 x\n---\n", {"x": 300}, "request.x is 300, but int8 goes from -128 to 127"),
-        ("int8 x\n---\n", {"y": 3}, "request.y is no field of a/srv/B_Request: it has x"),
+        ("int8 x\n---\n", {"y": 3}, "request.y is not a field of a/srv/B_Request: its fields are x"),
         ("int8 x\n---\n", {"x": 0.5}, "request.x is 0.5, but must be of type int8"),
         ("string s\n---\n", {"s": 4}, "request.s is 4, but must be of type string"),
         ("uint8[2] s\n---\n", {"s": [4]}, r"request.s is \[4\], but must be a list of 2"),
         ("builtin_interfaces/Time t\n---\n", {"t": 4}, "request.t is 4, but builtin_interfaces/msg/Time is a map"),
-        ("int8 x\n", {}, "has 0 lines of ---: one stands between request and response"),
-        ("int8\n---\n", {}, "the request in the definition of a/srv/B cannot be read: write a type and a name"),
-        ("foo/Bar x\n---\n", {}, "x is of foo/msg/Bar, which is not known: define it in spec.messages"),
-        (None, {}, "service type a/srv/B is not known: give its .srv file as definition"),
+        ("int8 x\n", {}, "has 0 lines of ---: there must be exactly one, between request and response"),
+        ("int8\n---\n", {}, "cannot read the request in the definition of a/srv/B: write a type and a name"),
+        ("foo/Bar x\n---\n", {}, "x has the unknown type foo/msg/Bar: define it in spec.messages"),
+        (None, {}, "unknown service type a/srv/B: give its .srv file as definition"),
     ],
 )
 def test_what_does_not_fit_is_told_with_its_place(definition: str | None, request_: dict[str, Any], told: str) -> None:
@@ -67,5 +67,5 @@ def test_what_does_not_fit_is_told_with_its_place(definition: str | None, reques
 
 
 def test_bytes_that_are_no_response_are_told() -> None:
-    with pytest.raises(ServiceError, match="the answer is no response of std_srvs/srv/Trigger"):
+    with pytest.raises(ServiceError, match="the response is not of type std_srvs/srv/Trigger"):
         service("std_srvs/srv/Trigger", None, standard()).response(b"\x00\x01\x00\x00\x01\xff\xff")

@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.catalog.catalog import Catalog, ChoiceError, Entry, catalog, choose
+from detector.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
 from detector.catalog.markdown import markdown_view
 from detector.catalog.page import page
 from detector.cli import app
@@ -25,11 +25,11 @@ HOSTILE = "</script><b>x</b> | `a` **b** \"'&\n## heading"
 ACTIONS = next(dimension for dimension in SCHEME if dimension.name == "typeOfAction")
 
 
-def an_entry(name: str, place: str = "rules.yaml:1", description: str = "", **values: list[str]) -> Entry:
-    return Entry(name, place, description, Classification.model_validate(values))
+def an_entry(name: str, place: str = "rules.yaml:1", description: str = "", **values: list[str]) -> CatalogEntry:
+    return CatalogEntry(name, place, description, Classification.model_validate(values))
 
 
-def names(entries: tuple[Entry, ...]) -> list[str]:
+def names(entries: tuple[CatalogEntry, ...]) -> list[str]:
     return [each.name for each in entries]
 
 
@@ -83,9 +83,9 @@ def test_of_one_dimension_either_value_will_do_and_of_several_all_must() -> None
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("purpose=Safety", "there is no dimension 'purpose'; there are overarchingPurpose, typeOfParticipants"),
-        ("incidence=Often", "incidence has no value 'Often'; it has Frequent, Common, Rare, Unexpected"),
-        ("incidence", "incidence has no value ''; it has Frequent"),
+        ("purpose=Safety", "unknown dimension 'purpose'; the dimensions are overarchingPurpose, typeOfParticipants"),
+        ("incidence=Often", "incidence has no value 'Often'; its values are Frequent, Common, Rare, Unexpected"),
+        ("incidence", "incidence has no value ''; its values are Frequent"),
     ],
 )
 def test_what_the_scheme_does_not_have_is_refused_with_what_it_has(text: str, says: str) -> None:
@@ -149,7 +149,7 @@ def test_the_markdown_has_the_scheme_and_a_table_for_each_classified_rule() -> N
     lines = markdown_view(catalog(ALL)).splitlines()
     assert [line for line in lines if line.startswith("## ")] == ["## battery", "## both", "## shadow"]
     assert "| **Type of Action** | data collection | both, shadow |" in lines
-    assert "| | *not said* | both |" in lines
+    assert "| | *not given* | both |" in lines
     assert "Without classification: plain." in lines
     assert "| Type of Action | data collection, notification |" in lines
 
@@ -204,7 +204,7 @@ def test_the_command_writes_json_for_other_programs(rules: Path, tmp_path: Path)
     [
         ([], "give files or folders with EventRules, or --cluster"),
         (["x.yaml", "--cluster"], "give files or folders with EventRules, or --cluster"),
-        (["x.yaml", "--namespace", "n"], "--namespace goes with --cluster"),
+        (["x.yaml", "--namespace", "n"], "--namespace requires --cluster"),
         (["x.yaml"], "x.yaml: there is no such file"),
         (["x.yaml", "--only", "incidence=Often"], "--only incidence=Often: incidence has no value 'Often'"),
         (["x.yaml", "--format", "pdf"], "'pdf' is not one of"),
@@ -224,5 +224,5 @@ def test_without_an_api_server_it_is_said_what_else_this_command_can_do(
     assert run("--cluster") == 2
     told = capsys.readouterr().err
     assert "no API server" in told
-    assert "give files or folders with EventRules instead of --cluster" in told
+    assert "give either files or folders with EventRules, or --cluster" in told
     assert "--detector" not in told

@@ -149,13 +149,13 @@ def test_json_reads_back_with_doubles(value: Any) -> None:
 
 @pytest.mark.parametrize("payload", [b"", b"NaN", b"[Infinity]", b"{'a': 1}", b"[1,]", b"\xff", b"1 2"])
 def test_what_json_does_not_know_is_refused(payload: bytes) -> None:
-    with pytest.raises(DecodeError, match="no JSON"):
+    with pytest.raises(DecodeError, match="not JSON"):
         JsonDecoder().decode(payload)
 
 
 def test_nesting_is_bounded() -> None:
     assert JsonDecoder().decode(b"[" * MAX_DEPTH + b"]" * MAX_DEPTH)
-    with pytest.raises(DecodeError, match=f"more than {MAX_DEPTH} deep"):
+    with pytest.raises(DecodeError, match=f"more than {MAX_DEPTH} levels deep"):
         JsonDecoder().decode(b"[" * (MAX_DEPTH + 1) + b"]" * (MAX_DEPTH + 1))
 
 
@@ -207,4 +207,4 @@ def test_a_detector_counts_what_it_cannot_read_and_goes_on(encoding: str) -> Non
     samples = [Arrival(at(number / 1000), "s", "car", raw) for number, raw in enumerate(hostile_ones)]
     assert drive.take(*samples, until=1) == ["r car started 1"]
     assert drive.engine.counters.undecodable["s"] == refused > 100
-    assert drive.engine.counters.last_undecodable["s"].startswith("car: no ")
+    assert drive.engine.counters.last_undecodable["s"].startswith("car: not ")

@@ -69,7 +69,7 @@ CYCLE = b"\xd8\x1c\x81\xd8\x1d\x00"  # tag 28: a list of one item, tag 29: that 
     [
         (b"", "premature end"),
         (cbor2.dumps([1, 2])[:-1], "premature end"),
-        (b"\x01\x02", "something follows"),
+        (b"\x01\x02", "there are bytes after"),
         (b"\xff", "break"),
         (b"\x62\xff\xff", "utf-8"),
         (b"\x9b" + b"\xff" * 8, "premature end"),
@@ -77,7 +77,7 @@ CYCLE = b"\xd8\x1c\x81\xd8\x1d\x00"  # tag 28: a list of one item, tag 29: that 
         (b"\xc2\x01", "byte string"),
         (b"\xc4\x01", "exponent and mantissa"),
         (cbor2.dumps(cbor2.CBORTag(5, [2**64, 1])), "exponent and mantissa"),
-        (CYCLE, "refer to each other"),
+        (CYCLE, "shared values"),
         (cbor2.dumps({(1, 2): 3}), "tuple as a key"),
         (cbor2.dumps({True: 3}), "bool as a key"),
         (b"\x81" * (MAX_DEPTH + 1) + b"\x01", "depth"),
@@ -129,4 +129,4 @@ def test_rules_see_cbor_values_and_the_size_of_raw_samples() -> None:
     ]
     drive.take(arrival(1.5, "car", b"\xff"), until=2)
     assert drive.engine.counters.undecodable == {"speed": 1}
-    assert "no CBOR" in drive.engine.counters.last_undecodable["speed"]
+    assert "not CBOR" in drive.engine.counters.last_undecodable["speed"]

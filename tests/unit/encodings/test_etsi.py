@@ -60,12 +60,12 @@ def test_whatever_pycrate_encodes_is_read_alike(name: str) -> None:
 def test_a_stream_without_type_takes_messages_of_all_kinds_and_one_with_type_no_others() -> None:
     denm, _ = random_message("denm", random.Random(1))
     assert "denm" in EtsiDecoder().decode(denm)
-    with pytest.raises(DecodeError, match=r"message 1 \(etsi/denm\), the stream is of etsi/cam"):
+    with pytest.raises(DecodeError, match=r"message 1 \(etsi/denm\), but the stream is of etsi/cam"):
         EtsiDecoder("etsi/cam").decode(denm)
 
 
 def test_an_unknown_type_is_refused_with_those_that_are_known() -> None:
-    with pytest.raises(DefinitionError, match=r"'etsi/camm': etsi/denm, etsi/cam, .* are known"):
+    with pytest.raises(DefinitionError, match=r"'etsi/camm': the known types are etsi/denm, etsi/cam, "):
         EtsiDecoder("etsi/camm")
 
 

@@ -64,4 +64,4 @@ def test_what_cannot_be_read_is_counted_and_the_rest_goes_on() -> None:
     )
     assert events == ["r b started 1"]
     assert drive.engine.counters.undecodable["cam"] == 2
-    assert drive.engine.counters.last_undecodable["cam"].startswith("its/c/cam: message 1 (etsi/denm), the stream")
+    assert drive.engine.counters.last_undecodable["cam"].startswith("its/c/cam: message 1 (etsi/denm), but the stream")

@@ -107,9 +107,9 @@ ENCRYPTED = {
 @pytest.mark.parametrize(
     ("raw", "problem"),
     [
-        (packet(secured(("encryptedData", ENCRYPTED)), following=2), "encrypted: only its receiver can read it"),
-        (packet(b"\x02" + signed(CAM)[1:], following=2), "secured packet of version 2: only 3"),
-        (packet(secured(("signedCertificateRequest", b"abcd")), following=2), "holds no data"),
+        (packet(secured(("encryptedData", ENCRYPTED)), following=2), "encrypted for its receiver"),
+        (packet(b"\x02" + signed(CAM)[1:], following=2), "secured packet of version 2; only 3"),
+        (packet(secured(("signedCertificateRequest", b"abcd")), following=2), "without data"),
         (packet(signed(single_hop())[:9], following=2), "claims|ends"),
         (packet(common(b"", 1, 0, LONG_POSITION, following=0)), "a beacon of GeoNetworking, which carries no message"),
         (packet(common(b"", 6, 0, bytes(36), following=0)), "a location service packet"),
@@ -122,7 +122,7 @@ ENCRYPTED = {
         (packet(common(btp(CAM), *EXTENDED["a single hop (SHB)"], length=2)), "claims 2 bytes of payload"),
         (packet(b"\x20\x50"), "ends in its headers"),
         (b"\x02\x02", "2 bytes: an ITS message has more than 6"),
-        (bytes(70_000), "70000 bytes: an ITS packet has at most 65535"),
+        (bytes(70_000), "70000 bytes; an ITS packet has at most 65535"),
     ],
 )
 def test_what_carries_no_readable_message_says_why(raw: bytes, problem: str) -> None:

@@ -163,15 +163,15 @@ A, B = "a_msgs/msg/A", "a_msgs/msg/B"
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("int32 x\nfloat64\n", "line 2: 'float64' is no line"),
-        ("int32 x\n\n# ok\nint32 ü", "line 4: 'int32 ü' is no line"),
+        ("int32 x\nfloat64\n", "line 2: 'float64' is not a line"),
+        ("int32 x\n\n# ok\nint32 ü", "line 4: 'int32 ü' is not a line"),
         ("int32 x\nint64 x", "line 1: x is given twice"),
-        ("int32 x\nB b", "line 2: b is of a_msgs/msg/B, which is not known"),
-        ("other/B[] b", "line 1: b is of other/msg/B, which is not known"),
-        ("int32 x\n===\nMSG: other/B\nint8 y\nC c", "line 5: c is of other/msg/C, which is not known"),
-        ("wstring w", "wide characters"),
+        ("int32 x\nB b", "line 2: b is of a_msgs/msg/B, which is unknown"),
+        ("other/B[] b", "line 1: b is of other/msg/B, which is unknown"),
+        ("int32 x\n===\nMSG: other/B\nint8 y\nC c", "line 5: c is of other/msg/C, which is unknown"),
+        ("wstring w", "wide strings"),
         ("int32[99999999999] x", "x has 99999999999 elements"),
-        ("A a", r"holds itself (a_msgs/msg/A → a_msgs/msg/A)"),
+        ("A a", r"contains itself (a_msgs/msg/A → a_msgs/msg/A)"),
         ("MSG: other/B\nint8 y", "a line of `=`"),
         (f"int32 X={'9' * 5000}", "line 1: 'int32 X=999"),
     ],
@@ -182,7 +182,7 @@ def test_what_is_wrong_with_a_definition_is_said_with_its_line(text: str, words:
 
 def test_what_is_wrong_between_definitions_is_said() -> None:
     assert "a_msgs/msg/A → a_msgs/msg/B → a_msgs/msg/A" in wrong((A, "B b"), (B, "A a"))[A]
-    assert "defines a_msgs/msg/A otherwise" in wrong((A, "int32 x"), (B, "A a\n===\nMSG: a_msgs/A\nint64 x"))[B]
+    assert "defines a_msgs/msg/A differently" in wrong((A, "int32 x"), (B, "A a\n===\nMSG: a_msgs/A\nint64 x"))[B]
     chain = [(f"a_msgs/msg/N{n}", f"N{n + 1} one\nN{n + 1} two") for n in range(70)]
     assert any("nested more than 64 deep" in text for text in wrong(*chain, ("a_msgs/msg/N70", "int8 x")).values())
 

@@ -14,7 +14,7 @@ from detector.engine.samples.sample import Arrival
 from detector.entrypoints import PluginError
 from detector.plugins.assignment import assigned
 from detector.plugins.instances import LocalHost
-from detector.plugins.registry import prepare
+from detector.plugins.registry import prepare_plugin
 from detector.plugins.tracking import Tracks
 from tests.driving import a_detector, a_rule, a_stream, arrival, at
 from tests.plugins.rules import PluginDrive
@@ -160,11 +160,11 @@ def test_while_a_stream_is_stale_nothing_is_known() -> None:
     [
         ({}, "is missing"),
         ({"objects": {"stream": "radar"}}, "no stream radar"),
-        ({"objects": {"stream": "camera", "frame": "m", "pose": {"stream": "camera"}}}, "give frame"),
+        ({"objects": {"stream": "camera", "frame": "m", "pose": {"stream": "camera"}}}, "give either frame"),
         ({"objects": {"stream": "camera"}, "within": 0}, "greater than 0"),
         ({"objects": {"stream": "camera"}, "of": "c"}, "'a' or 'b'"),
     ],
 )
 def test_parameters_that_make_no_sense_are_refused(parameters: dict[str, Any], told: str) -> None:
     with pytest.raises(PluginError, match=told):
-        prepare("unmatched-objects", parameters, ["camera", "lidar"])
+        prepare_plugin("unmatched-objects", parameters, ["camera", "lidar"])

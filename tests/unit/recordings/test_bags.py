@@ -183,7 +183,7 @@ def test_a_bag_is_played_again_and_again_until_it_is_stopped(bag: Path) -> None:
     arrivals = Arrivals()
     thread = playing(arrivals, Tally(), paths=[str(bag)], rate=1000, loop=True)
     arrivals.wait_for(lambda seen: len(seen) > 25)
-    thread.tell_to_stop()
+    thread.request_stop()
     thread.join(PATIENCE)
     assert thread.state is State.STOPPED
 
@@ -196,7 +196,7 @@ def test_stopping_does_not_wait_for_a_pause_in_the_recording(tmp_path: Path) -> 
     arrivals = Arrivals()
     thread = playing(arrivals, Tally(), of=stream(source="recording"), paths=[str(path)])
     arrivals.wait_for(lambda seen: len(seen) == 1)
-    thread.tell_to_stop()
+    thread.request_stop()
     thread.join(PATIENCE)  # far less than the pause
     assert thread.state is State.STOPPED
 

@@ -90,7 +90,7 @@ def test_a_recording_in_progress_is_never_dropped(tmp_path: Path) -> None:
     bench.record(an_episode(2), THREE)  # finds room for one sample beside it
     bench.action.completed(an_episode(1), Completion())
     assert bench.outcome(an_episode(1)).state is OutcomeState.DONE
-    assert "no finished recording left to drop" in bench.outcome(an_episode(2)).message
+    assert "no finished recording left to delete" in bench.outcome(an_episode(2)).message
 
 
 def test_samples_after_the_end_of_a_recording_are_counted(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_samples_after_the_end_of_a_recording_are_counted(tmp_path: Path) -> Non
     bench.action.samples(an_episode(), THREE)
     bench.action.samples(an_episode(), THREE)
     bench.action.completed(an_episode(), Completion())
-    assert bench.lost == [("samples to record", 3, "their recording ended early")]
+    assert bench.lost == [("samples to record", 3, "the recording ended early")]
     assert [outcome.state for _, outcome in bench.reports] == [OutcomeState.RUNNING, OutcomeState.FAILED]
 
 
@@ -131,7 +131,7 @@ def test_what_is_too_old_is_deleted(tmp_path: Path) -> None:
 def test_the_reserve_of_the_disk_is_not_touched(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.limit(reserve="999999G")
-    with pytest.raises(ActionError, match=r"less than 999999G left free \(spec\.recordings\.reserve\)"):
+    with pytest.raises(ActionError, match=r"less than 999999G of the disk would be free \(spec\.recordings\.reserve\)"):
         bench.action.started(an_episode())
     assert taken(tmp_path) == 0
 

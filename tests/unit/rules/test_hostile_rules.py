@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from detector.actions.secrets import secret_problems
-from detector.assembly import RuleBook, inlets
+from detector.assembly import RuleIndex, inlets
 from tests.driving import Drive, a_detector, a_rule, arrival
 from wayside.expressions import Environment, ExpressionError, Kind
 from wayside.rules import RuleError
@@ -92,10 +92,12 @@ URL = "https://e.org/"
 def test_a_rule_cannot_have_the_detectors_own_secret_sent_anywhere(http: dict[str, Any], place: str) -> None:
     rule = a_rule(when="true", actions=[{"name": "send", "notify": {"http": http}}])
     (problem,) = secret_problems(rule, a_detector(**OWN))
-    assert str(problem).startswith(f"spec.actions[0].notify.http.{place}: the Secret own is the Detector's own")
+    assert str(problem).startswith(
+        f"spec.actions[0].notify.http.{place}: the Secret own holds the network access of the Detector"
+    )
     assert [*secret_problems(rule, a_detector(**OWN, mode="Standalone", pod={"secrets": ["own"]}))] == []
     assert [*secret_problems(rule, a_detector())] == []
     detector = a_detector(**OWN)
-    evaluated, (refusal,) = RuleBook().compile([rule], detector, inlets(detector).fields)
+    evaluated, (refusal,) = RuleIndex().compile([rule], detector, inlets(detector).fields)
     assert evaluated == []
-    assert "the Secret own is the Detector's own" in str(refusal)
+    assert "the Secret own holds the network access of the Detector" in str(refusal)

@@ -71,12 +71,12 @@ def test_a_rule_of_another_namespace_is_left_out_and_said(write: Write) -> None:
     elsewhere["metadata"]["namespace"] = "elsewhere"
     loaded = load_rules(write("d.yaml", detector()), [write("r.yaml", elsewhere)])
     assert loaded.rule_set.rules == ()
-    assert "own namespace only" in loaded.warnings[0]
+    assert "of its own namespace" in loaded.warnings[0]
 
 
 def test_no_detector_and_two_detectors_are_refused(write: Write) -> None:
     rules = [write("r.yaml", rule("a"))]
-    with pytest.raises(DocumentError, match="holds no Detector: give one"):
+    with pytest.raises(DocumentError, match="contains no Detector: give one"):
         load_rules(write("none.yaml", rule("a")), rules)
     with pytest.raises(DocumentError, match=r"two\.yaml:\d+:\d+: metadata\.name: is a second Detector"):
         load_rules(write("two.yaml", detector("d"), detector("e")), rules)

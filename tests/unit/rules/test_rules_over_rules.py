@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from detector.assembly import RuleBook
+from detector.assembly import RuleIndex
 from tests.driving import POSITION, SPEED, Drive, a_detector, a_rule, arrival, at, compiled
 from wayside.rules import dependency_problems, in_order
 
@@ -186,7 +186,7 @@ def test_a_circle_is_told_with_its_way_and_an_unknown_rule_with_the_nearest() ->
 
 
 def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None:
-    book, top = RuleBook(), a_rule("top", signals=[count("braking", "1s")], when="it > 0")
+    book, top = RuleIndex(), a_rule("top", signals=[count("braking", "1s")], when="it > 0")
     good, refused = book.compile([top], a_detector(), {})
     assert (good, len(refused)) == ([], 1)
     good, refused = book.compile([top, braking()], a_detector(), {})
@@ -210,5 +210,5 @@ def test_what_a_signal_over_a_rule_cannot_be(fields: Any, message: str) -> None:
 
 def test_a_start_has_no_other_fields() -> None:
     top = a_rule("top", signals=[over("braking", value="msg.vales.speed")], when="it > 0.0")
-    (refusal,) = RuleBook().compile([top, braking()], a_detector(), {})[1]
+    (refusal,) = RuleIndex().compile([top, braking()], a_detector(), {})[1]
     assert "spec.signals[0].value: msg has no field vales; did you mean values?" in str(refusal)

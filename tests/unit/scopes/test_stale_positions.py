@@ -214,7 +214,7 @@ def test_check_and_replay_warn_of_old_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     detector, rules, drive, out = left_behind(tmp_path, stay=5.0, staleAfter="20s")
-    warning = "warning: EventRule fast used old samples of stream speed: they come every 0.1 s, and "
+    warning = "warning: EventRule fast used old samples of stream speed: they arrive every 0.1 s, and "
     remedy = "lower streams[speed].staleAfter\n"
     for arguments, code in (
         (["replay", drive, "--detector", detector, "--rules", rules, "--output", out], 0),
@@ -237,7 +237,7 @@ def test_a_stream_that_goes_stale_between_its_samples_is_named(
     lines = [{"t": at(8.0 * n), "key": "vehicles/car/speed", "value": {"v": 3}} for n in range(10)]
     Path(drive).write_text("".join(json.dumps(line) + "\n" for line in lines))
     ran(monkeypatch, "check", detector, rules, "--recording", drive)
-    said = "samples of stream speed come every 8 s and go stale after 5 s: EventRule fast finds them unknown in between"
+    said = "samples of stream speed arrive every 8 s and go stale after 5 s, so EventRule fast finds them unknown"
     assert said in capsys.readouterr().err
 
 

@@ -13,7 +13,7 @@ import yaml
 from onnx import helper
 from rosbags.typesys import Stores, get_typestore
 
-from detector.assembly import RuleBook, inlets, make_engine
+from detector.assembly import RuleIndex, inlets, make_engine
 from detector.checking import check_documents
 from detector.engine.samples.sample import Arrival
 from tests import onnx_models
@@ -40,7 +40,7 @@ class Driven(Drive):
     def __init__(self, detector: Detector, *rules: EventRule) -> None:
         super().__init__(detector)
         entries = inlets(detector)
-        compiled, refused = RuleBook().compile(rules, detector, entries.fields)
+        compiled, refused = RuleIndex().compile(rules, detector, entries.fields)
         assert not refused, [str(each) for each in refused]
         self.engine = make_engine(detector, entries, holder="h", start=at(0))
         self.engine.set_rules(compiled)
@@ -233,9 +233,9 @@ def test_of_too_many_points_every_so_many_th_is_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("payload", "said"),
     [
-        (an_image(np.uint8([[[1, 2, 3]]]), "yuv422"), "image encoding 'yuv422': one of mono8"),
+        (an_image(np.uint8([[[1, 2, 3]]]), "yuv422"), "image encoding 'yuv422' is not supported; use one of mono8"),
         (an_image(np.uint8([[[1, 2, 3]]]), height=9), "image of 1 x 9 rgb8 with step 3: 3 bytes"),
-        (b"\0\1\0\0nonsense", "no sensor_msgs/msg/Image"),
+        (b"\0\1\0\0nonsense", "not a valid sensor_msgs/msg/Image"),
     ],
 )
 def test_what_is_no_image_is_unknown_and_counted_as_an_error(tmp_path: Path, payload: bytes, said: str) -> None:
@@ -274,12 +274,16 @@ def problems(tmp_path: Path, signal: dict[str, Any], detector: Detector | None =
 @pytest.mark.parametrize(
     ("change", "where", "said"),
     [
-        ({"file": "/nowhere/m.onnx"}, "model.file", "/nowhere/m.onnx cannot be read: No such file"),
-        ({"file": __file__}, "model.file", "is no ONNX model that can be run"),
-        ({"sha256": "0" * 64}, "model.sha256", "the file's is"),
-        ({"inputs": [{"name": "y", "signals": ["speed", "gap"]}]}, "inputs[0].name", "no input y; it has x [any, 2]"),
-        ({"inputs": [{"name": "y", "signals": ["speed", "gap"]}]}, "model.inputs", "the model needs x as well"),
-        ({"inputs": [x(signals=["speed"])]}, "inputs[0]", "a client's input has shape [1], but x takes [2]"),
+        ({"file": "/nowhere/m.onnx"}, "model.file", "cannot read /nowhere/m.onnx: No such file"),
+        ({"file": __file__}, "model.file", "is not a valid ONNX model"),
+        ({"sha256": "0" * 64}, "model.sha256", "of the file is"),
+        (
+            {"inputs": [{"name": "y", "signals": ["speed", "gap"]}]},
+            "inputs[0].name",
+            "no input y; its inputs are x [any, 2]",
+        ),
+        ({"inputs": [{"name": "y", "signals": ["speed", "gap"]}]}, "model.inputs", "the model also needs the inputs x"),
+        ({"inputs": [x(signals=["speed"])]}, "inputs[0]", "the input of a client has shape [1], but x requires [2]"),
         ({"inputs": [x(signals=["speed", "gab"])]}, "signals[1]", "the rule has no signal gab; it has speed, gap"),
         ({"inputs": [x(signals=["speed", "risk"])]}, "signals[1]", "risk is computed by a model"),
         (
@@ -289,7 +293,7 @@ def problems(tmp_path: Path, signal: dict[str, Any], detector: Detector | None =
         ),
         ({"inputs": [x(points={"stream": "speed", "count": 1})]}, "points.stream", "stream speed has type None"),
         ({"inputs": [x(image={"stream": "none", "width": 1, "height": 1})]}, "image.stream", "has no stream none"),
-        ({"output": "riks"}, "model.output", "the model has no output riks; it has risk [any, 1]"),
+        ({"output": "riks"}, "model.output", "the model has no output riks; its outputs are risk [any, 1]"),
     ],
 )
 def test_what_does_not_fit_is_found_by_a_check_with_its_place(
@@ -305,18 +309,18 @@ def test_what_does_not_fit_is_found_by_a_check_with_its_place(
 def test_a_fixed_first_axis_a_text_input_and_an_output_that_is_not_by_client_are_refused(tmp_path: Path) -> None:
     fixed = onnx_models.weighted(tmp_path / "fixed.onnx", [1.0, 1.0], clients=4)
     (problem,) = problems(tmp_path, risk(fixed, x(signals=["speed", "gap"])))
-    assert "for exactly 4 clients: export the model with a first axis of any length" in problem
+    assert "for exactly 4 clients: export the model with a first axis of variable length" in problem
     nodes = [helper.make_node("ReduceSum", ["x"], ["y"], keepdims=0)]
     total = onnx_models.saved(tmp_path / "total.onnx", {"x": ["n", 2]}, {"y": []}, nodes)
     (problem,) = problems(tmp_path, risk(total, x(signals=["speed", "gap"])))
-    assert "output y has shape [] for two clients: its first axis must be theirs" in problem
+    assert "output y has shape [] for two clients: its first axis must be the clients" in problem
 
 
 def test_a_rule_with_another_model_is_another_rule(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0])
     detector = a_detector()
     rule = always(SPEED, risk(file, x(signals=["speed"])))
-    book, fields = RuleBook(), inlets(detector).fields
+    book, fields = RuleIndex(), inlets(detector).fields
     drive = Driven(detector, rule)
     drive.take(arrival(0.5, "car", {"v": 1}), until=1)
     assert drive.note(drive.engine.set_rules(book.compile([rule], detector, fields)[0])) == []

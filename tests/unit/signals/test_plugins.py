@@ -53,7 +53,7 @@ def test_what_is_installed_and_what_is_shipped_is_there() -> None:
 
 def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None:
     (problem,) = problems(tmp_path, "countin", "{stream: speed}")
-    assert problem.startswith("r.yaml:8:15: spec.signals[0].plugin.name: no plugin countin is installed here")
+    assert problem.startswith("r.yaml:8:15: spec.signals[0].plugin.name: no plugin countin is installed")
     assert "did you mean counting?" in problem
     (problem,) = problems(tmp_path, "xyz", "{}")
     assert "there are broken, counting, not-a-plugin, strange, unmatched-objects" in problem
@@ -67,7 +67,7 @@ def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None
         ("counting", "{stream: speed, limit: x}", "parameters.limit: must be a valid number"),
         ("counting", "{stream: speed, raisAt: 3}", "parameters.raisAt: unknown field"),
         ("not-a-plugin", "{}", "plugin.name: plugin not-a-plugin is tests.plugins.signals:CountingParameters"),
-        ("broken", "{}", "plugin.name: plugin broken cannot be loaded: ModuleNotFoundError"),
+        ("broken", "{}", "plugin.name: cannot load plugin broken: ModuleNotFoundError"),
     ],
 )
 def test_what_a_plugin_refuses_is_told_where_it_stands(tmp_path: Path, plugin: str, parameters: str, told: str) -> None:
@@ -178,7 +178,7 @@ def test_no_value_is_unknown_and_no_error() -> None:
 def test_a_value_that_is_no_plain_data_is_an_error() -> None:
     driven = drive(plugin_rule(plugin="strange", when="size(p) > 0"))
     driven.take(arrival(0.5, "a", {"v": 1}), until=1)
-    assert "the value is a set: give None, a boolean" in driven.engine.counters.rule("r").last_error
+    assert "the value is a set: return None, a boolean" in driven.engine.counters.rule("r").last_error
 
 
 def test_when_time_jumps_all_state_goes() -> None:

@@ -19,20 +19,20 @@ def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
     now = [0.0]
     drive = Drive(a_detector(), PAIRS)
     losses = Losses(drive.engine, Intake(lambda: 0), monotonic=lambda: now[0])
-    losses.say()
+    losses.log_new()
     assert caplog.messages == []
     for second in (0, 20, 40, 60):
         now[0] = second
         drive.take(arrival(second / 20 + 0.5, "car", b"{", "pose"), until=second / 20 + 1)
-        losses.say()
+        losses.log_new()
     said = [message for message in caplog.messages if "could not be read" in message]
     assert len(said) == 2
-    assert said[0].startswith("once a sample of stream pose could not be read; the last: vehicles/car/pose: no JSON")
+    assert said[0].startswith("once a sample of stream pose could not be read; the last: vehicles/car/pose: not JSON")
     assert said[1].startswith("3 times a sample of stream pose could not be read")
     caplog.clear()
     losses.sum_up()
     assert any(
-        message.startswith("in all, 4 times a sample of stream pose could not be read") for message in caplog.messages
+        message.startswith("in total, 4 times a sample of stream pose could not be read") for message in caplog.messages
     )
 
 
@@ -49,7 +49,7 @@ def test_a_sample_without_a_position_is_told_with_client_and_axis(
 ) -> None:
     drive = Drive(a_detector(), PAIRS)
     drive.take(arrival(0.5, "car", payload, "pose"), until=1)
-    Losses(drive.engine, Intake(lambda: 0)).say()
+    Losses(drive.engine, Intake(lambda: 0)).log_new()
     assert f"once a sample had no position for EventRule near; the last: {said}" in caplog.messages
 
 
@@ -60,8 +60,8 @@ def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCap
     for client in ("a", "b", "a", "b"):
         drive.take(arrival(0.5, client, {"t": next(stamps)}, "pose"), until=1)
     drive.take(arrival(1.5, "c", {"t": next(stamps) + 3600}, "pose"), until=2)
-    Losses(drive.engine, Intake(lambda: 0)).say()
-    (message,) = [each for each in caplog.messages if "stamps being ahead" in each]
+    Losses(drive.engine, Intake(lambda: 0)).log_new()
+    (message,) = [each for each in caplog.messages if "because their stamps are ahead" in each]
     assert "the last: c is 3601 s ahead of the rest" in message
 
 
@@ -74,6 +74,6 @@ def test_unknown_values_are_told_by_their_reasons_with_samples_that_are_not_ther
     drive.take(arrival(0.5, "car", {}, "speed"), until=4)
     Losses(drive.engine).sum_up()
     assert (
-        "in all, 9 unknown values in 4 evaluations of EventRule fast: 4 times no sample or an old one; "
+        "in total, 9 unknown values in 4 evaluations of EventRule fast: 4 times no sample or an old one; "
         '4 times no value for `v`; once no key "v" in the map'
     ) in caplog.messages

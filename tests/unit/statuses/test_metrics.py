@@ -78,7 +78,7 @@ def test_pages_are_served_and_what_is_not_well_is_503(server: StatusServer) -> N
 
     assert get("/metrics?x=1") == (200, "some 1\n")
     assert get("/readyz") == (503, "not yet\n")
-    assert get("/") == (404, "ask for one of /metrics, /readyz\n")
+    assert get("/") == (404, "unknown page; the pages are /metrics, /readyz\n")
 
 
 def test_a_port_that_is_taken_is_told_with_the_option(server: StatusServer) -> None:

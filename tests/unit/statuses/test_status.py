@@ -21,7 +21,7 @@ from detector.status.keeping import StatusKeeper
 from detector.status.model import CertificateStatus, Explanation, RuleState, Status, read_status, to_json
 from detector.status.table import status_view
 from detector.streams.answering import Answering
-from detector.streams.asking import NoAnswerError, ask
+from detector.streams.querying import NoAnswerError, query_detectors
 from detector.streams.zenoh import Network
 from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.ports import free_endpoint
@@ -192,13 +192,13 @@ def answering(endpoint: str) -> Iterator[None]:
 def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoint: str) -> None:
     config = Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])
     for holder in ("d", "*"):
-        (answer,) = ask(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 30)
+        (answer,) = query_detectors(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 30)
         assert answer.key == "wayside/detectors/d/status"
         assert b"'rule': 'r', 'subject': 'a+b~c'" in answer.payload
     with pytest.raises(NoAnswerError, match="does not answer 'nonsense'"):
-        ask(config, "d", "nonsense", {}, 30)
-    with pytest.raises(NoAnswerError, match=r"no detector other answers at tcp/.* within 0.5 s: is it running"):
-        ask(config, "other", "status", {}, 0.5)
+        query_detectors(config, "d", "nonsense", {}, 30)
+    with pytest.raises(NoAnswerError, match=r"no response from detector other at tcp/.* within 0.5 s: is it running"):
+        query_detectors(config, "other", "status", {}, 0.5)
 
 
 @pytest.mark.usefixtures("answering")
@@ -232,12 +232,12 @@ def test_an_evaluation_tells_what_it_saw_and_why_a_signal_is_unknown() -> None:
         {"v": 20.0, "gap": 1.0},
     )
     assert found["b"].when is None
-    assert found["b"].unknown == {"gap": "no sample of stream pose has come from b"}
+    assert found["b"].unknown == {"gap": "no sample of stream pose has arrived from b"}
     drive.take(until=2)
     (later,) = explained(drive, "r", "a", until=3).subjects
     assert later.unknown == {"gap": "stream pose of a is stale: its newest sample is 2.8 s old, more than staleAfter"}
     (third,) = explained(drive, "r", "b", until=4, sent=[arrival(3.5, "b", {"other": 1}, "pose")]).subjects
-    assert third.unknown == {"gap": "what came of stream pose from b has no such value in its window"}
+    assert third.unknown == {"gap": "the samples of stream pose from b have no such value in the window"}
     assert drive.engine.rules["r"].witness is None
 
 
@@ -255,8 +255,8 @@ def test_what_expressions_missed_or_failed_on_is_told() -> None:
 @pytest.mark.parametrize(
     ("subject", "why"),
     [
-        ("a+b", "the pair is not within 100 m, or a place is unknown, or a role does not fit"),
-        ("a+nobody", "client nobody is not known: nothing came from it within clientTimeout"),
+        ("a+b", "the pair is not within 100 m, or a position is unknown, or a role does not match"),
+        ("a+nobody", "unknown client nobody: no sample arrived from it within clientTimeout"),
         ("a", "the rule is about pairs: write car1+car2"),
     ],
 )
@@ -274,13 +274,13 @@ def test_of_a_pair_each_ones_signals_are_told() -> None:
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 9, "y": 0}, "pose")]
     (told,) = explained(drive, "near", "a+b", until=1, sent=[*sent, arrival(0.3, "b", {"v": 3})]).subjects
     assert told.near is True
-    assert told.unknown == {"a.v": "no sample of stream speed has come from a"}
+    assert told.unknown == {"a.v": "no sample of stream speed has arrived from a"}
 
 
 def test_a_rule_that_is_gone_is_watched_no_more_and_one_at_a_time() -> None:
     drive = Drive(a_detector(), FAST)
     watching = Watching(drive.engine, "fast", None)
-    with pytest.raises(ValueError, match="somebody else asks about rule fast"):
+    with pytest.raises(ValueError, match="another request about rule fast"):
         Watching(drive.engine, "fast", None)
     drive.engine.set_rules([])
     assert watching.is_over()
@@ -306,6 +306,6 @@ def test_the_status_names_what_is_demanded_and_who_is_missing() -> None:
     shown.print(status_view(told))
     text = shown.export_text()
     assert "certificate expires in 90.0 days, renewed 2 times" in text
-    assert "new certificates are not used: expired" in text
+    assert "new certificates not in use: expired" in text
     assert "demands: fast-a, fast-b" in text
     assert "missing: rsu-2" in text

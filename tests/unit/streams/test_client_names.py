@@ -63,7 +63,7 @@ def test_messages_without_a_valid_name_are_dropped_and_counted_with_the_reason(c
     assert counters.samples["speed"] == 0
     drive.take(sent(9, "no json"), until=10)
     assert counters.undecodable["speed"] == 1
-    assert counters.last_undecodable["speed"].startswith("all/speeds: no JSON")
+    assert counters.last_undecodable["speed"].startswith("all/speeds: not JSON")
     assert len(drive.engine.clients) == 0
 
 

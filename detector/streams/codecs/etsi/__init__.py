@@ -44,7 +44,7 @@ class EtsiDecoder:
         return self._read(payload)[1]
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: most messages tell their time only together with the receive time."""
+        """None: most messages give their time only together with the receive time."""
         return None
 
     def stamp_near(self, payload: bytes, received: int) -> int | None:
@@ -66,15 +66,15 @@ class EtsiDecoder:
         version, number = data[0], data[1]
         kind = BY_NUMBER.get(number)
         if kind is None or number not in self._readers:
-            wanted = "" if self._only is None else f", the stream is of {PREFIX}{self._only.name}"
+            wanted = "" if self._only is None else f", but the stream is of {PREFIX}{self._only.name}"
             raise DecodeError(f"message {number} ({'unknown' if kind is None else PREFIX + kind.name}){wanted}")
         read = self._readers[number].get(version)
         if read is None:
-            raise DecodeError(f"{PREFIX}{kind.name} of protocol version {version}, for which there is no definition")
+            raise DecodeError(f"{PREFIX}{kind.name} of protocol version {version}, which has no definition")
         try:
             message = read(Bits(data))
         except DecodeError as error:
-            raise DecodeError(f"no {PREFIX}{kind.name} ({len(payload)} bytes): {error}") from None
+            raise DecodeError(f"not a valid {PREFIX}{kind.name} ({len(payload)} bytes): {error}") from None
         message["header"] = {
             "protocolVersion": float(version),
             "messageId": float(number),
@@ -91,5 +91,5 @@ def _kind(type_name: str) -> Kind:
     kind = BY_NAME.get(type_name.removeprefix(PREFIX))
     if kind is None or not type_name.startswith(PREFIX):
         known = ", ".join(PREFIX + name for name in BY_NAME)
-        raise DefinitionError(f"unknown message type {type_name!r}: {known} are known")
+        raise DefinitionError(f"unknown message type {type_name!r}: the known types are {known}")
     return kind

@@ -1,4 +1,5 @@
-"""ASN.1 types as their definitions say, whichever tool read those: what is needed to read UPER, and nothing else.
+"""ASN.1 types as defined, independent of the tool that read the definitions: what is needed to read UPER, and nothing
+else.
 
 Bounds are those that PER sees: `None` is no bound. `name` is the type's name in its module ("" for one written in
 place); the units of numbers hang on it (see `quantities`).
@@ -12,7 +13,7 @@ from typing import Any
 
 
 class DefinitionError(ValueError):
-    """ASN.1 definitions that cannot be used; the text says why and what to do."""
+    """ASN.1 definitions that cannot be used; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +67,7 @@ class BitString:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OctetString:
-    """OCTET STRING; `containing` is the type that its octets hold, where the definition says so."""
+    """OCTET STRING; `containing` is the type that its octets hold, if the definition gives it."""
 
     size: Size
     containing: Type | None = None

@@ -1,5 +1,5 @@
-"""The bits of a message in unaligned PER (ITU-T X.691): numbers of so many bits, and the lengths that come in several
-forms.
+"""The bits of a message in unaligned PER (ITU-T X.691): numbers of given numbers of bits, and the lengths that come in
+several forms.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ class Bits:
         return self.take(8 * count).to_bytes(count, "big")
 
     def elements(self, count: int) -> int:
-        """The same number, once it is certain that a message of this length can hold so many elements."""
+        """The same number, once it is certain that a message of this length can hold that number of elements."""
         self._elements -= count
         if self._elements < 0:
-            raise DecodeError("it claims more elements than it can hold")
+            raise DecodeError("it claims more elements than its length allows")
         return count
 
     def lengths(self) -> Iterator[int]:
-        """An unbounded length, piece by piece; read what a piece announces before asking for the next (11.9)."""
+        """An unbounded length, piece by piece; read what a piece announces before reading the next (11.9)."""
         while True:
             if not self.take(1):
                 yield self.take(7)
@@ -61,7 +61,7 @@ class Bits:
                 return
             pieces = self.take(6)
             if not 1 <= pieces <= 4:
-                raise DecodeError(f"a length in {pieces} pieces: there can be 1 to 4")
+                raise DecodeError(f"a length in {pieces} pieces; 1 to 4 are allowed")
             yield pieces * _FRAGMENT
 
     def blob(self) -> bytes:
@@ -79,7 +79,7 @@ class Bits:
     def _number(self) -> bytes:
         octets = self.blob()
         if len(octets) > _LONGEST:
-            raise DecodeError(f"a number of {len(octets)} bytes: none has more than {_LONGEST}")
+            raise DecodeError(f"a number of {len(octets)} bytes; the maximum is {_LONGEST}")
         return octets
 
     def small(self) -> int:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 _MARKER = None
-"""How asn1tools says `...`."""
+"""How asn1tools represents `...`."""
 
 
 def span_constraints(trees: Mapping[str, Any]) -> None:

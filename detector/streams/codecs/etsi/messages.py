@@ -105,7 +105,7 @@ def definitions(kind: Kind, own: OwnDefinitions | None) -> Mapping[int, Type]:
     if found is None:
         if not kind.packaged:
             raise DefinitionError(
-                f"no package has the ASN.1 definition of {PREFIX}{kind.name}: name the files with it in spec.asn1"
+                f"no package provides the ASN.1 definition of {PREFIX}{kind.name}: name the files with it in spec.asn1"
             )
         return packaged_definitions(kind)
     return {**dict.fromkeys(range(1, 256), found), **({1: packaged_definitions(kind)[1]} if 1 in kind.packaged else {})}

@@ -1,7 +1,7 @@
 """ASN.1 definitions from files that the user brings: read and resolved by asn1tools (MIT).
 
-asn1tools says what types there are. What it leaves out is looked up in the text itself: which type an open type holds,
-as `{Type IDENTIFIED BY value}` of an information object set tells it.
+asn1tools gives the types. What it leaves out is looked up in the text itself: which type an open type holds,
+as `{Type IDENTIFIED BY value}` of an information object set gives it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class OwnDefinitions:
         return None
 
     def _walk(self, found: Any, name: str = "") -> asn1.Type:
-        """`name` is the type's, where the compiled type itself does not say it."""
+        """`name` is the type's, where the compiled type itself does not give it."""
         made = self._done.get(id(found))
         if made is None:
             made = self._done[id(found)] = (found, self._convert(found, name or found.type_name))
@@ -151,9 +151,9 @@ def parsed(text: str) -> dict[str, Any]:
     try:
         return dict(tools.parse_string(_SUCCESSORS.sub(lambda found: " " * len(found[0]), text)))
     except tools.ParseError as error:
-        raise asn1.DefinitionError(f"no ASN.1: {error}") from None
+        raise asn1.DefinitionError(f"not valid ASN.1: {error}") from None
     except RecursionError:
-        raise asn1.DefinitionError("no ASN.1: it is nested too deeply") from None
+        raise asn1.DefinitionError("not valid ASN.1: it is nested too deeply") from None
 
 
 def read_module(module: Asn1Module) -> str:
@@ -163,7 +163,7 @@ def read_module(module: Asn1Module) -> str:
         try:
             text = Path(module.file or "").read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise asn1.DefinitionError(f"{module.file} cannot be read: {error}") from error
+            raise asn1.DefinitionError(f"cannot read {module.file}: {error}") from error
     parsed(text)
     return text
 
@@ -181,10 +181,10 @@ def _compiled(trees: Mapping[str, _Tree]) -> dict[str, dict[str, Any]]:
         specification = tools.compile_dict(copy.deepcopy(dict(trees)), "uper")
     except tools.CompileError as error:
         raise asn1.DefinitionError(
-            f"the ASN.1 modules do not fit together: {str(error).rstrip('.')}: give all that they import"
+            f"the ASN.1 modules are incomplete: {str(error).rstrip('.')}: give all modules that they import"
         ) from None
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise asn1.DefinitionError(f"the ASN.1 modules cannot be resolved: {error!r}") from None
+        raise asn1.DefinitionError(f"cannot resolve the ASN.1 modules: {error!r}") from None
     return {
         module: {name: _inner(kind) for name, kind in types.items()} for module, types in specification.modules.items()
     }
@@ -200,7 +200,7 @@ def _asn1tools() -> Any:
     try:
         import asn1tools  # noqa: PLC0415  it takes a while, and only those who bring ASN.1 need it
     except ImportError as error:
-        raise asn1.DefinitionError(f"what reads ASN.1 is not installed: {REMEDY}") from error
+        raise asn1.DefinitionError(f"the ASN.1 reader is not installed: {REMEDY}") from error
     return asn1tools
 
 

@@ -105,7 +105,7 @@ class _Walk:
         return asn1.Field(name, self.type(found), bool(found._opt) or found._def is not None, found._def)
 
     def _open(self, found: Any) -> asn1.Open:
-        """An open type of the only kind that ITS messages have: a regional extension, told by its regionId."""
+        """An open type of the only kind that ITS messages have: a regional extension, identified by its regionId."""
         table = found._const_tab
         entries = [] if table is None else [row for row in table._val.root if "Type" in row]
         return asn1.Open("regionId", {row["id"]: self.type(row["Type"]) for row in entries})

@@ -1,6 +1,6 @@
 """What is around an ITS message on the air: GeoNetworking, the security envelope, BTP. It is taken off, not checked.
 
-Which of them are there is told by the bytes. A message begins with its protocol version and a message number that is
+The bytes show which of them are present. A message begins with its protocol version and a message number that is
 not zero, GeoNetworking's basic header has a zero in that place, and BTP begins with a port from 2001 on. Signatures
 are not verified: a rule that must rely on who sent a message needs a receiver that verifies before it forwards.
 
@@ -43,16 +43,16 @@ _UNSECURED, _SIGNED, _ENCRYPTED = 0x80, 0x81, 0x82
 
 
 _DATA_PRESENT = 0x40
-"""The bit in the preamble of a SignedDataPayload that says it holds the data."""
+"""The bit in the preamble of a SignedDataPayload for the presence of the data."""
 
 _NESTED = 4
-"""A secured packet may hold another; so many and no more."""
+"""Maximum nesting of secured packets."""
 
 
 def message_in(payload: bytes) -> bytes:
     """The message without what is around it. Raises DecodeError where there is none, or none that can be read."""
     if len(payload) > MAXIMUM:
-        raise DecodeError(f"{len(payload)} bytes: an ITS packet has at most {MAXIMUM}")
+        raise DecodeError(f"{len(payload)} bytes; an ITS packet has at most {MAXIMUM}")
     for _ in range(_NESTED):
         if len(payload) < 6:
             raise DecodeError(f"{len(payload)} bytes: an ITS message has more than 6")
@@ -63,7 +63,7 @@ def message_in(payload: bytes) -> bytes:
         if not _is_secured(payload):
             return payload
         payload = _from_secured(payload)
-    raise DecodeError(f"a message in {_NESTED} envelopes: none needs so many")
+    raise DecodeError(f"a message in {_NESTED} nested envelopes; fewer are allowed")
 
 
 def _is_geonetworking(packet: bytes) -> bool:
@@ -89,7 +89,7 @@ def _from_geonetworking(packet: bytes) -> bytes:
         raise DecodeError(f"{_WITHOUT_MESSAGE[kind]} of GeoNetworking, which carries no message")
     extended = _EXTENDED.get(kind)
     if extended is None:
-        raise DecodeError(f"a GeoNetworking packet of header type {kind}, which is not known")
+        raise DecodeError(f"a GeoNetworking packet of the unknown header type {kind}")
     transport = inner[0] >> 4
     if transport not in (_BTP_A, _BTP_B):
         raise DecodeError(f"a GeoNetworking packet with next header {transport}: only BTP carries ITS messages")
@@ -108,20 +108,20 @@ def _from_secured(data: bytes) -> bytes:
             raise DecodeError("a secured packet that ends in its headers")
         if data[0] != _SECURITY:
             raise DecodeError(
-                f"a secured packet of version {data[0]}: only {_SECURITY} (TS 103 097 from v1.3 on) is read"
+                f"a secured packet of version {data[0]}; only {_SECURITY} (TS 103 097 v1.3 and later) is supported"
             )
         tag = data[1]
         if tag == _UNSECURED:
             return _octets(data, 2)
         if tag == _ENCRYPTED:
-            raise DecodeError("the packet is encrypted: only its receiver can read it")
+            raise DecodeError("the packet is encrypted for its receiver")
         if tag != _SIGNED:
-            raise DecodeError(f"a secured packet that holds no data (alternative {tag & 0x3F})")
+            raise DecodeError(f"a secured packet without data (alternative {tag & 63})")
         preamble = data[3]  # behind the hash algorithm
         if not preamble & _DATA_PRESENT:
-            raise DecodeError("a signed packet that holds only the hash of its data")
+            raise DecodeError("a signed packet with only the hash of its data")
         data = data[4:]
-    raise DecodeError(f"a secured packet in {_NESTED} envelopes: none needs so many")
+    raise DecodeError(f"a secured packet in {_NESTED} nested envelopes; fewer are allowed")
 
 
 def _octets(data: bytes, start: int) -> bytes:

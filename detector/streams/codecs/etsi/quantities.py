@@ -17,7 +17,7 @@ from detector.streams.codecs.etsi.asn1 import Integer
 from detector.streams.codecs.etsi.times import unix_ns
 
 UNAVAILABLE = frozenset({"unavailable", "outOfRange"})
-"""The names of numbers and enumeration values that say there is no value."""
+"""The names of numbers and enumeration values that mean "no value"."""
 
 Plain = Callable[[int], float | int | None]
 """Makes a number as it is sent one as expressions see it."""
@@ -31,7 +31,7 @@ class Unit:
     """The unit that expressions see, for the documentation."""
     step: Fraction
     null: frozenset[int] = frozenset()
-    """Numbers that say there is no value, where the definition gives them no name."""
+    """Numbers that mean "no value", where the definition gives them no name."""
 
 
 def _units(symbol: str, step: str, *names: str, null: int | None = None) -> dict[str, Unit]:

@@ -1,7 +1,7 @@
 """From ASN.1 types to functions that read UPER (ITU-T X.691) into plain maps, lists, strings and doubles.
 
 A function is made once for each type. It makes values plain on the way: CHOICE → {name: value}, BIT STRING → list of
-names, ENUMERATED → name, numbers as `quantities` says. Names of components have `_` for `-`, so that expressions can
+names, ENUMERATED → name, numbers as `quantities` defines. Names of components have `_` for `-`, so that expressions can
 write them behind a point. What is not sent is not in the map.
 """
 
@@ -46,7 +46,7 @@ class Readers:
             case asn1.Boolean():
                 return lambda bits: bits.take(1) == 1
             case asn1.Null():
-                return lambda bits: True  # in a CHOICE, that it is there is all it says; null would read as unknown
+                return lambda bits: True  # in a CHOICE its presence is its value; null would read as unknown
             case asn1.Integer():
                 return _integer(kind)
             case asn1.Enumerated():
@@ -66,7 +66,7 @@ class Readers:
             case asn1.Open():
                 return Bits.blob
             case asn1.Unreadable(name):
-                return _refusal(f"it holds ASN.1 {name}, which is not read")
+                return _refusal(f"it contains the unsupported ASN.1 type {name}")
 
     def _octet_string(self, kind: asn1.OctetString) -> Read:
         octets = _counted(kind.size, Bits.octets, b"".join)
@@ -160,7 +160,7 @@ class Readers:
                 return {name: reader(inner)}
             index = bits.take(width)
             if index >= len(root):
-                raise DecodeError(f"alternative {index} of a CHOICE that has {len(root)}")
+                raise DecodeError(f"alternative {index} of a CHOICE with {len(root)} alternatives")
             name, reader = root[index]
             return {name: reader(bits)}
 
@@ -201,7 +201,7 @@ def _enumerated(kind: asn1.Enumerated) -> Read:
             return additions[index] if index < len(additions) else None  # None: of a later version of the definition
         index = bits.take(width)
         if index >= len(root):
-            raise DecodeError(f"value {index} of an ENUMERATED that has {len(root)}")
+            raise DecodeError(f"value {index} of an ENUMERATED with {len(root)} values")
         return root[index]
 
     return read
@@ -232,14 +232,14 @@ def _text(kind: asn1.Text) -> Read:
         if identity:
             return "".join(map(chr, codes))
         if codes and max(codes) >= len(alphabet):
-            raise DecodeError(f"a character that is not of the {len(alphabet)} possible ones")
+            raise DecodeError(f"a character outside the alphabet of {len(alphabet)}")
         return "".join(alphabet[code] for code in codes)
 
     return _counted(kind.size, characters, "".join)
 
 
 def _counted(size: asn1.Size, take: Callable[[Bits, int], Any], join: Callable[[list[Any]], Any]) -> Read:
-    """Reads a length as `size` says, then so many things."""
+    """Reads a length as `size` defines, then that number of items."""
 
     def unbounded(bits: Bits) -> Any:
         return join([take(bits, length) for length in bits.lengths()])

@@ -1,7 +1,7 @@
 """ITS time: milliseconds of TAI since 2004-01-01T00:00:00Z (ETSI TS 102 894-2, TimestampIts), and what is left of it
 in fields that hold only a remainder.
 
-All times here are nanoseconds since the Unix epoch unless a name says otherwise.
+All times here are nanoseconds since the Unix epoch unless a name states otherwise.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Asks running detectors over Zenoh; the other side of `answering`."""
+"""Queries running detectors over Zenoh; the other side of `answering`."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from wayside.api.zenoh import Zenoh
 from wayside.inputerror import InputError
 
 _PATIENCE = 0.2
-"""Seconds between two attempts to find somebody who answers."""
+"""Seconds between two attempts to find a detector."""
 
 
 class NoAnswerError(InputError, ValueError):
-    """Nobody answered, or the answer is a refusal; the text says which."""
+    """There was no answer, or it was a refusal; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class Reply:
     """One detector's answer, as JSON."""
 
     key: str
     payload: bytes
 
 
-def ask(
+def query_detectors(
     config: Zenoh, holder: str, what: str, given: Mapping[str, str], timeout: float, payload: bytes | None = None
-) -> list[Asked]:
-    """The answers of all detectors of that name (`*`: of any), within so many seconds.
+) -> list[Reply]:
+    """The answers of all detectors of that name (`*`: of any), within `timeout` seconds.
 
     Raises:
         NetworkError: no session.
-        NoAnswerError: nobody answered, or every answer was a refusal.
+        NoAnswerError: there was no answer, or every answer was a refusal.
     """
     selector = status_key(holder, what) + "".join(
         f"{'?' if number == 0 else ';'}{name}={value}" for number, (name, value) in enumerate(given.items())
@@ -44,26 +44,26 @@ def ask(
     end = time.monotonic() + timeout
     with open_session(config) as session:
         while True:
-            answers: list[Asked] = []
+            answers: list[Reply] = []
             refusals: list[str] = []
             left = max(0.1, end - time.monotonic())
             for reply in session.get(selector, payload=payload, timeout=left, target=zenoh.QueryTarget.ALL):
                 if (ok := reply.ok) is not None:
-                    answers.append(Asked(str(ok.key_expr), ok.payload.to_bytes()))
+                    answers.append(Reply(str(ok.key_expr), ok.payload.to_bytes()))
                 elif (error := reply.err) is not None:
                     refusals.append(error.payload.to_string())
             if answers:
                 return sorted(answers, key=lambda answer: answer.key)
             if any("Timeout" not in text for text in refusals):
                 raise NoAnswerError("; ".join(sorted({text for text in refusals if "Timeout" not in text})))
-            # A peer has just connected, and may not know yet who answers what.
+            # A peer has just connected, and may not know the queryables yet.
             if time.monotonic() + _PATIENCE >= end:
                 where = ", ".join(config.connect) or "the local network"
                 raise NoAnswerError(
-                    f"no detector {holder} answers at {where} within {timeout:g} s: is it running, and is this its "
-                    "Zenoh network? Give --connect ENDPOINT, e.g. tcp/127.0.0.1:7447"
+                    f"no response from detector {holder} at {where} within {timeout:g} s: is it running, "
+                    "and is this its Zenoh network? Give --connect ENDPOINT, e.g. tcp/127.0.0.1:7447"
                 )
             time.sleep(_PATIENCE)
 
 
-__all__ = ["Asked", "NetworkError", "NoAnswerError", "ask"]
+__all__ = ["NetworkError", "NoAnswerError", "Reply", "query_detectors"]

@@ -1,8 +1,8 @@
-"""What is known of the recordings that others asked for: what a request leads to, and what is answered. Pure.
+"""The index of requested recordings: what a request leads to, and its response. Pure.
 
-A recording is known by the id that its requester chose, so that a request that is sent twice does nothing twice. Those
-that are over stay known for a while: who comes back is told what became of them, and a start that arrives after its own
-stop begins nothing.
+A recording is known by the id that its requester chose, so that a request that is sent twice does nothing twice.
+Recordings that are over stay in the index for a while: a later request returns their result, and a start that arrives
+after its own stop begins nothing.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from detector.actions.trigger.requests import RecordingReport, RecordingRequest,
 from wayside.api.recordings import OnRequest
 
 _REMEMBERED = 1000
-"""So many recordings that are over are known."""
+"""Maximum number of finished recordings in the index."""
 
 BY_ITSELF = "ended by its maximumDuration"
 
 
 @dataclass(slots=True)
-class Entry:
+class RequestedRecording:
     """One recording. Times are nanoseconds since the epoch, of the detector's time axis."""
 
     id: str
@@ -31,39 +31,39 @@ class Entry:
     since: int | None = None
     until: int | None = None
     stopped: bool = False
-    """Whether somebody asked for its end."""
+    """Whether its end was requested."""
     message: str = ""
     outcome: Outcome = field(default_factory=lambda: Outcome(OutcomeState.RUNNING))
 
     def report(self) -> RecordingReport:
-        """What is told of it."""
-        said = self.outcome
+        """The report about it."""
+        outcome = self.outcome
         return RecordingReport(
             id=self.id,
             state=self.state,
-            message=self.message or said.message,
+            message=self.message or outcome.message,
             streams=list(self.streams),
             since=time_text(self.since),
             until=time_text(self.until),
-            samples=said.samples,
-            bytes=said.bytes,
-            missing=said.missing,
-            files=list(said.files),
+            samples=outcome.samples,
+            bytes=outcome.bytes,
+            missing=outcome.missing,
+            files=list(outcome.files),
         )
 
 
-class Book:
+class RecordingIndex:
     """The recordings by id. For one thread at a time."""
 
     def __init__(self) -> None:
-        self._entries: dict[str, Entry] = {}
+        self._entries: dict[str, RequestedRecording] = {}
 
     def start(
         self, request: RecordingRequest, allowed: OnRequest | None, streams: Collection[str], now: int
-    ) -> tuple[RecordingReport, Entry | None]:
+    ) -> tuple[RecordingReport, RequestedRecording | None]:
         """What to answer; and the recording that is to begin, if one is.
 
-        `allowed` is None where nobody may ask; `streams` are those that the detector has.
+        `allowed` is None if requests are not permitted; `streams` are those that the detector has.
         """
         identity = request.id or ""
         known = self._entries.get(identity)
@@ -75,20 +75,20 @@ class Book:
         chosen = request.streams or allowed.streams or sorted(streams)
         longest = min(request.maximum_duration.ns, allowed.maximum_duration.ns)
         since = now - request.ago.ns - request.before.ns
-        entry = Entry(identity, Progress.RECORDING, tuple(chosen), since, now + longest)
+        entry = RequestedRecording(identity, Progress.RECORDING, tuple(chosen), since, now + longest)
         self._entries[identity] = entry
         self._forget()
         return entry.report(), entry
 
-    def stop(self, request: RecordingRequest, now: int) -> tuple[RecordingReport, Entry | None]:
+    def stop(self, request: RecordingRequest, now: int) -> tuple[RecordingReport, RequestedRecording | None]:
         """What to answer; and the recording whose `until` has come closer, if one has."""
         identity = request.id or ""
         entry = self._entries.get(identity)
         if entry is None:
             message = "it was stopped before it was started"
-            self._entries[identity] = Entry(identity, Progress.UNKNOWN, stopped=True, message=message)
+            self._entries[identity] = RequestedRecording(identity, Progress.UNKNOWN, stopped=True, message=message)
             self._forget()
-            return RecordingReport(identity, Progress.UNKNOWN, "nothing is known of it here"), None
+            return RecordingReport(identity, Progress.UNKNOWN, "this detector does not know the recording"), None
         if entry.state is not Progress.RECORDING:
             return entry.report(), None
         entry.state, entry.stopped = Progress.ENDING, True
@@ -103,8 +103,8 @@ class Book:
         entry = self._entries.get(identity)
         return RecordingReport(identity, Progress.UNKNOWN) if entry is None else entry.report()
 
-    def heard(self, identity: str, outcome: Outcome) -> None:
-        """What is said of the recording."""
+    def update(self, identity: str, outcome: Outcome) -> None:
+        """Apply an outcome of the recording."""
         entry = self._entries.get(identity)
         if entry is None or entry.state.over:
             return
@@ -121,14 +121,14 @@ class Book:
 
     def _refusal(self, request: RecordingRequest, allowed: OnRequest | None, streams: Collection[str]) -> str:
         if allowed is None:
-            return "this detector records nothing on request: its spec.recordings.onRequest says who may ask for what"
+            return "this detector accepts no recording requests: allow them in its spec.recordings.onRequest"
         open_ones = sum(not entry.state.over for entry in self._entries.values())
         if open_ones >= allowed.maximum_recordings:
-            return f"{open_ones} recordings are under way, as many as recordings.onRequest.maximumRecordings allows"
+            return f"{open_ones} recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
         may = streams if allowed.streams is None else allowed.streams
         for name in request.streams or ():
             if name not in may:
-                return f"stream {name} is none that may be recorded here: there is {', '.join(sorted(may))}"
+                return f"stream {name} may not be recorded here; permitted are {', '.join(sorted(may))}"
         return ""
 
     def _forget(self) -> None:

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from detector.assembly import RuleBook
+from detector.assembly import RuleIndex
 from tests.driving import a_detector, a_rule
 
 GOOD = {"signals": [{"name": "fast", "stream": "speed", "value": "msg.v"}], "when": "fast > 10"}
 
 
 def test_a_refused_version_leaves_the_last_good_one_in_place_and_says_so() -> None:
-    book, detector = RuleBook(), a_detector()
-    (first,), refused = book.compile([a_rule("r", **GOOD)], detector, {})
+    index, detector = RuleIndex(), a_detector()
+    (first,), refused = index.compile([a_rule("r", **GOOD)], detector, {})
     assert refused == []
-    (kept, other), (refusal,) = book.compile(
+    (kept, other), (refusal,) = index.compile(
         [a_rule("r", **GOOD | {"when": "fst > 10"}), a_rule("s", **GOOD)], detector, {}
     )
     assert (kept.name, kept.digest, other.name) == ("r", first.digest, "s")
-    assert "EventRule r is refused, and goes on as it last was: spec.when" in str(refusal)
+    assert "EventRule r is refused; keeping its last good version: spec.when" in str(refusal)
     assert "did you mean `fast`?" in str(refusal)
-    (mended, _), refused = book.compile(
+    (mended, _), refused = index.compile(
         [a_rule("r", **GOOD | {"when": "fast > 20"}), a_rule("s", **GOOD)], detector, {}
     )
     assert mended.digest != first.digest
@@ -26,14 +26,14 @@ def test_a_refused_version_leaves_the_last_good_one_in_place_and_says_so() -> No
 
 
 def test_a_rule_that_was_never_good_is_not_evaluated() -> None:
-    compiled, (refusal,) = RuleBook().compile([a_rule("r", **GOOD | {"when": "fst > 10"})], a_detector(), {})
+    compiled, (refusal,) = RuleIndex().compile([a_rule("r", **GOOD | {"when": "fst > 10"})], a_detector(), {})
     assert compiled == []
     assert str(refusal).startswith("EventRule r is refused: spec.when")
 
 
 def test_a_rule_that_is_gone_is_not_remembered() -> None:
-    book, detector = RuleBook(), a_detector()
-    book.compile([a_rule("r", **GOOD)], detector, {})
-    book.compile([], detector, {})
-    compiled, _ = book.compile([a_rule("r", **GOOD | {"when": "fst > 10"})], detector, {})
+    index, detector = RuleIndex(), a_detector()
+    index.compile([a_rule("r", **GOOD)], detector, {})
+    index.compile([], detector, {})
+    compiled, _ = index.compile([a_rule("r", **GOOD | {"when": "fst > 10"})], detector, {})
     assert compiled == []

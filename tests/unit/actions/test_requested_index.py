@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from detector.actions.episode import Outcome, OutcomeState
 from detector.actions.trigger.orders import Progress
 from detector.actions.trigger.requests import MAXIMUM_BYTES, RecordingRequest, read_request, short, write_request
-from detector.requested.book import Book
+from detector.requested.index import RecordingIndex
 from wayside.api.base import Duration, PositiveDuration
 from wayside.api.recordings import OnRequest
 
@@ -27,14 +27,16 @@ def stop(identity: str, **fields: object) -> RecordingRequest:
 
 
 def test_times_are_relative_to_ones_own_clock() -> None:
-    _, entry = Book().start(start("x", before="5s", ago="2s", maximumDuration="1m"), OnRequest(), STREAMS, NOW)
+    _, entry = RecordingIndex().start(
+        start("x", before="5s", ago="2s", maximumDuration="1m"), OnRequest(), STREAMS, NOW
+    )
     assert entry is not None
     assert (entry.since, entry.until) == (NOW - 7 * SECOND, NOW + 60 * SECOND)
 
 
 def test_a_request_gets_no_more_time_than_is_allowed() -> None:
     allowed = OnRequest(maximum_duration=PositiveDuration("10s"))
-    _, entry = Book().start(start("x", maximumDuration="1h"), allowed, STREAMS, NOW)
+    _, entry = RecordingIndex().start(start("x", maximumDuration="1h"), allowed, STREAMS, NOW)
     assert entry is not None
     assert entry.until == NOW + 10 * SECOND
 
@@ -46,22 +48,22 @@ def test_a_stop_counts_from_the_end_of_its_cause_and_never_prolongs() -> None:
         ({"after": "1h"}, 60),
         ({"ago": "1h"}, -10),
     ):
-        book = Book()
-        book.start(start("x", before="10s", maximumDuration="1m"), OnRequest(), STREAMS, NOW)
-        report, entry = book.stop(stop("x", **fields), NOW)
+        index = RecordingIndex()
+        index.start(start("x", before="10s", maximumDuration="1m"), OnRequest(), STREAMS, NOW)
+        report, entry = index.stop(stop("x", **fields), NOW)
         assert entry is not None
         assert entry.until == NOW + until * SECOND
         assert report.state is Progress.ENDING
-        assert book.stop(stop("x"), NOW) == (report, None)
+        assert index.stop(stop("x"), NOW) == (report, None)
 
 
 @given(st.lists(st.tuples(st.sampled_from(["start", "stop", "done", "failed", "running"]), st.integers(0, 4))))
 def test_an_id_is_begun_once_and_never_more_at_a_time_than_are_allowed(happenings: list[tuple[str, int]]) -> None:
-    book, allowed, open_ones, begun = Book(), OnRequest(maximum_recordings=2), set[str](), set[str]()
+    index, allowed, open_ones, begun = RecordingIndex(), OnRequest(maximum_recordings=2), set[str](), set[str]()
     for what, number in happenings:
         identity = f"x{number}"
         if what == "start":
-            report, entry = book.start(start(identity), allowed, STREAMS, NOW)
+            report, entry = index.start(start(identity), allowed, STREAMS, NOW)
             if entry is not None:
                 assert identity not in begun
                 open_ones.add(identity)
@@ -69,28 +71,28 @@ def test_an_id_is_begun_once_and_never_more_at_a_time_than_are_allowed(happening
             if identity in open_ones:
                 assert report.state in (Progress.RECORDING, Progress.ENDING)
         elif what == "stop":
-            report, _ = book.stop(stop(identity), NOW)
+            report, _ = index.stop(stop(identity), NOW)
             begun.add(identity)  # it can no longer be
             assert report.state is not Progress.RECORDING
         else:
-            book.heard(identity, Outcome(OutcomeState(what.capitalize())))
+            index.update(identity, Outcome(OutcomeState(what.capitalize())))
             if what != "running":
                 open_ones.discard(identity)
         assert len(open_ones) <= 2
-        states = {report.id: report.state for report in msgspec.convert(book.status(None), list)}
+        states = {report.id: report.state for report in msgspec.convert(index.status(None), list)}
         assert all(states[each] in (Progress.RECORDING, Progress.ENDING) for each in open_ones)
 
 
 def test_what_is_over_is_forgotten_at_last() -> None:
-    book = Book()
+    index = RecordingIndex()
     for number in range(600):
-        book.start(start(f"x{number}"), OnRequest(), STREAMS, NOW)
-        book.heard(f"x{number}", Outcome(OutcomeState.DONE))
-        book.stop(stop(f"y{number}"), NOW)
-    known = book.status(None)
+        index.start(start(f"x{number}"), OnRequest(), STREAMS, NOW)
+        index.update(f"x{number}", Outcome(OutcomeState.DONE))
+        index.stop(stop(f"y{number}"), NOW)
+    known = index.status(None)
     assert isinstance(known, list)
     assert len(known) <= 1000
-    assert book.status("x0") == msgspec.structs.replace(book.status("x1"), id="x0")  # type: ignore[arg-type]
+    assert index.status("x0") == msgspec.structs.replace(index.status("x1"), id="x0")  # type: ignore[arg-type]
 
 
 def test_the_event_of_a_large_fleet_fits_into_a_request() -> None:

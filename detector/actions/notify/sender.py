@@ -1,7 +1,7 @@
-"""The thread that sends: it asks its desk what to send now, sends it, and tells the desk what came of it.
+"""The thread that sends: it takes from its queue what to send now, sends it, and reports the result to the queue.
 
-The desk is everything that is to be decided; it does no I/O over the network and is only ever used under the courier's
-lock. Sending takes as long as it takes, without the lock: whoever has something to tell never waits for it.
+The queue makes all decisions; it does no I/O over the network and is only used under the lock of the
+sender. Sending does not hold the lock, so a producer never waits for it.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from detector.actions.notify.outbox import Delivery, Fate
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-"""What a desk gives to send."""
+"""An item of a queue."""
 
 GRACE = 3.0
 """Seconds that remain for last attempts when the detector ends."""
 _LONGEST_WAIT = 60.0
 
 
-class Desk(Protocol[T]):
+class SendQueue(Protocol[T]):
     """Decides what is sent, and when. `now` is in seconds of a monotonic clock."""
 
     def take(self, now: float) -> T | None:
@@ -38,31 +38,31 @@ class Desk(Protocol[T]):
         """What came of it."""
 
     def hurry(self) -> None:
-        """The end is near: all that waits is given once more."""
+        """The end is near: give everything that waits once more."""
 
 
-class Courier(Generic[T]):
-    """Works from its start to `finish`. `send` is given what to send, and what says whether to give up on it."""
+class Sender(Generic[T]):
+    """Runs from its start to `finish`. `send` receives the item, and a function that returns whether to give up."""
 
-    def __init__(self, name: str, desk: Desk[T], send: Callable[[T, Callable[[], bool]], Delivery]) -> None:
-        self._desk, self._send = desk, send
+    def __init__(self, name: str, queue: SendQueue[T], send: Callable[[T, Callable[[], bool]], Delivery]) -> None:
+        self._queue, self._send = queue, send
         self._changed = threading.Condition()
         self._deadline: float | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     @contextmanager
-    def at_desk(self) -> Iterator[None]:
-        """Use the desk meanwhile; what waits there then is seen to."""
+    def changing(self) -> Iterator[None]:
+        """Hold the lock to change the queue, then wake the thread."""
         with self._changed:
             yield
             self._changed.notify()
 
     def finish(self, grace: float = GRACE) -> None:
-        """Try all once more, for at most so many seconds, and end; then the desk is the caller's."""
+        """Try everything once more, for at most `grace` seconds, and end; afterwards the caller owns the queue."""
         with self._changed:
             self._deadline = time.monotonic() + grace
-            self._desk.hurry()
+            self._queue.hurry()
             self._changed.notify()
         self._thread.join()
 
@@ -74,21 +74,21 @@ class Courier(Generic[T]):
             try:
                 delivery = self._send(parcel, self._over)
             except Exception as error:  # noqa: BLE001  a message that cannot be sent ends no thread
-                _log.error("a notification could not be sent", exc_info=error)
+                _log.error("cannot send a notification", exc_info=error)
                 delivery = Delivery(Fate.AGAIN, f"{type(error).__name__}: {error}")
             with self._changed:
-                self._desk.settle(parcel, delivery, time.monotonic())
+                self._queue.settle(parcel, delivery, time.monotonic())
 
     def _next(self) -> T | None:
-        """Waits for it; None: that was all."""
+        """The next item, after waiting for it; None: there are no more."""
         with self._changed:
             while not self._over():
                 now = time.monotonic()
-                parcel = self._desk.take(now)
+                parcel = self._queue.take(now)
                 if parcel is not None:
                     return parcel
                 if self._deadline is not None:
                     return None
-                wait = self._desk.wait(now)
+                wait = self._queue.wait(now)
                 self._changed.wait(_LONGEST_WAIT if wait is None else min(wait, _LONGEST_WAIT))
             return None

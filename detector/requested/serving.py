@@ -1,4 +1,4 @@
-"""Answers those who ask for recordings: the book says what is to be done, the evaluation's thread does it."""
+"""Answers recording requests: the index decides, the thread of the evaluation carries it out."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from detector.actions.episode import Outcome, OutcomeState
 from detector.actions.outcomes import Which
 from detector.actions.trigger.requests import RecordingReport, RecordingRequest, read_request, write_reports
 from detector.engine.engine import Engine
-from detector.requested.book import Book, Entry
+from detector.requested.index import RecordingIndex, RequestedRecording
 from detector.requested.running import REQUESTED, begin, run_of
 
 _log = logging.getLogger(__name__)
 
 _PATIENCE = 5.0
-"""Seconds in which the evaluation should have time."""
+"""Seconds to wait for the evaluation."""
 
 Call = Callable[[Callable[[], None]], Future[Any]]
-"""Has something done on the evaluation's thread."""
+"""Runs a function on the thread of the evaluation."""
 
 
 class Requested:
-    """The recordings that others asked for. Thread-safe."""
+    """Recordings requested by others. Thread-safe."""
 
     def __init__(self, engine: Engine, call: Call) -> None:
         self._engine = engine
         self._call = call
         self._lock = threading.Lock()
-        self._book = Book()
+        self._index = RecordingIndex()
         self._runs: dict[str, str] = {}
         """The ids by episode, of those that are not over."""
 
     def answer(self, payload: bytes) -> bytes:
-        """What is answered to a request, as JSON. Raises ValueError, with a text for the one who asks."""
+        """The response to a request, as JSON. Raises ValueError, with a message for the requester."""
         request = read_request(payload)
         if request.do == "status":
             with self._lock:
-                return write_reports(self._book.status(request.id))
+                return write_reports(self._index.status(request.id))
         return write_reports(self._start(request) if request.do == "start" else self._stop(request))
 
-    def heard(self, which: Which, episode: str, outcome: Outcome) -> None:
-        """An action said something; only what is recorded on request matters here."""
+    def on_outcome(self, which: Which, episode: str, outcome: Outcome) -> None:
+        """Handle an outcome of an action; only recordings on request matter here."""
         if which != REQUESTED:
             return
         with self._lock:
             identity = self._runs.get(episode)
             if identity is None:
                 return
-            self._book.heard(identity, outcome)
+            self._index.update(identity, outcome)
             if outcome.state is OutcomeState.RUNNING:
                 return
             del self._runs[episode]
@@ -64,30 +64,30 @@ class Requested:
         allowed = None if recordings is None else recordings.on_request
         names = [stream.name for stream in detector.spec.streams]
         with self._lock:
-            report, entry = self._book.start(request, allowed, names, self._engine.now)
+            report, entry = self._index.start(request, allowed, names, self._engine.now)
             if entry is None:
                 return report
             self._runs[run_of(entry.id).episode] = entry.id
-        _log.info("recording %s begins on request", entry.id)
+        _log.info("starting recording %s on request", entry.id)
         try:
             self._in_time(self._call(lambda: self._begin(entry, request)))
         except Exception:
             with self._lock:
-                self._book.withdraw(entry.id)
+                self._index.withdraw(entry.id)
                 self._runs.pop(run_of(entry.id).episode, None)
             raise
         return report
 
     def _stop(self, request: RecordingRequest) -> RecordingReport:
         with self._lock:
-            report, entry = self._book.stop(request, self._engine.now)
+            report, entry = self._index.stop(request, self._engine.now)
         if entry is not None and entry.until is not None:
             until = entry.until
-            _log.info("recording %s ends on request", entry.id)
+            _log.info("stopping recording %s on request", entry.id)
             self._in_time(self._call(lambda: self._release(entry.id, until)))
         return report
 
-    def _begin(self, entry: Entry, request: RecordingRequest) -> None:
+    def _begin(self, entry: RequestedRecording, request: RecordingRequest) -> None:
         """On the evaluation's thread. One that was stopped in the meantime is so short that its end is known."""
         engine = self._engine
         begin(
@@ -108,5 +108,5 @@ class Requested:
         try:
             future.result(_PATIENCE)
         except TimeoutError:
-            # It is done as soon as there is time: who asks again under the same id is told so.
-            _log.warning("the evaluation did not get to a request for a recording within %g s", _PATIENCE)
+            # It is carried out later: a repeated request with the same id returns its state.
+            _log.warning("the evaluation did not process a recording request within %g s", _PATIENCE)
