@@ -207,13 +207,13 @@ class TestKubectl:
         ("path", "teaches"),
         [
             ("eventrule", "An event to detect in the data of vehicles and stations"),
-            ("eventrule.spec.scope", "Whom the rule is about"),
-            ("eventrule.spec.scope.pairs.within", "Metres."),
-            ("eventrule.spec.when", "an episode starts when it holds"),
-            ("detector.spec.streams.key", "captures the client's name"),
+            ("eventrule.spec.scope", "The subjects of the rule"),
+            ("eventrule.spec.scope.pairs.within", "The maximum distance in metres"),
+            ("eventrule.spec.when", "the condition that starts an episode"),
+            ("detector.spec.streams.key", "captures the name of the client"),
             ("applicationtemplate.spec.parameters.merge", "Union, Intersection: the items"),
             ("applicationtask.spec.endTime", "Absent while the demand holds"),
-            ("applicationinstance.status.releaseTime", "the end of its linger"),
+            ("applicationinstance.status.releaseTime", "The end of the linger time"),
         ],
     )
     def test_explain_teaches(self, path: str, teaches: str, control_plane: ControlPlane) -> None:
