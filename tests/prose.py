@@ -15,6 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 CLEAN = (
+    "CONTRIBUTING.md",
     "charts/wayside/files/crds",
     "crds",
     "docs/actions.md",
@@ -22,9 +23,11 @@ CLEAN = (
     "docs/classification.md",
     "docs/concepts.md",
     "docs/database.md",
+    "docs/decisions",
     "docs/encodings.md",
     "docs/etsi.md",
     "docs/evaluation.md",
+    "docs/findings.md",
     "docs/models.md",
     "docs/notify.md",
     "docs/placement.md",
@@ -34,6 +37,7 @@ CLEAN = (
     "docs/scopes.md",
     "docs/templates.md",
     "docs/trigger.md",
+    "docs/troubleshooting.md",
     "wayside",
 )
 """Files, and folders with all files below them, as git lists them. A new place is added once it is clean."""

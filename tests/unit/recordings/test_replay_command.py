@@ -177,6 +177,7 @@ def test_with_clock_data_a_header_that_is_seconds_behind_is_named_with_its_strea
     assert warning in desk.replay(path).said
     ran = desk.run("check", "--strict", "detector.yaml", "rules.yaml", "--recording", str(path))
     assert (ran.code, warning in ran.said) == (1, True)
+    assert " [diverging-stamps]" in ran.said
 
 
 def test_with_clock_data_a_stream_whose_stamps_are_ahead_of_its_receipt_is_named_and_no_other(desk: Desk) -> None:
@@ -192,7 +193,10 @@ def test_with_clock_data_stamps_of_0_are_named_as_such(desk: Desk) -> None:
     streams = [a_stream(name, stamp="msg.time") for name in ("pose", "speed")]
     desk.write(a_detector(*streams, clock="Data"), a_rule("fast", **FAST))
     unfilled = [{**line, "value": {"time": 0, "v": 1}} for line in stamped("speed", 0)]
-    ran = desk.replay(write_lines(desk.folder / "drive.jsonl", *recorded(stamped("pose", 0), unfilled)))
+    path = write_lines(desk.folder / "drive.jsonl", *recorded(stamped("pose", 0), unfilled))
+    checked = desk.run("check", "detector.yaml", "rules.yaml", "--recording", str(path))
+    assert " [zero-stamps]" in checked.said
+    ran = desk.replay(path)
     assert "warning: 40 samples of stream speed have no time: their stamps are 0; " in ran.said
     assert "behind the receive times" not in ran.said
 

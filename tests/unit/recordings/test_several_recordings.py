@@ -141,6 +141,8 @@ def test_a_cut_recording_is_replayed_with_a_warning_and_a_count(desk: Desk) -> N
     assert (ran.code, len(ran.events)) == (0, 1)
     cut = "drive.jsonl: the recording is cut (line 3 has no end): 2 messages are read up to there\n"
     assert f"warning: {path.parent}/{cut}" in ran.said
+    checked = desk.run("check", "detector.yaml", "rules.yaml", "--recording", str(path))
+    assert f"{cut.rstrip()} [cut-recording]" in checked.said
     desk.drive("other.jsonl", (0.5, {"v": 20}))
     assert f"\nwarning: {cut}" in f"\n{desk.replay('drive.jsonl', 'other.jsonl').said}"
 
@@ -190,6 +192,7 @@ def test_what_cannot_be_read_is_an_error_and_the_others_are_replayed(desk: Desk)
     ran = desk.run("check", "detector.yaml", "rules.yaml", *(word for each in given for word in ("--recording", each)))
     assert ran.code == 1
     assert "error: empty.mcap: the file is empty" in ran.said
+    assert ran.said.count(" [unreadable-recording]") == 2
     ran = desk.replay("a_1.jsonl", "empty.mcap")
     assert ran.code == 2
     assert "detector: a_1.jsonl:1: " in ran.said

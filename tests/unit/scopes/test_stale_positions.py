@@ -238,7 +238,9 @@ def test_a_stream_that_goes_stale_between_its_samples_is_named(
     Path(drive).write_text("".join(json.dumps(line) + "\n" for line in lines))
     ran(monkeypatch, "check", detector, rules, "--recording", drive)
     said = "samples of stream speed arrive every 8 s and go stale after 5 s, so EventRule fast finds them unknown"
-    assert said in capsys.readouterr().err
+    warned = capsys.readouterr().err
+    assert said in warned
+    assert " [stale-between-samples]" in warned
 
 
 def test_a_rule_about_pairs_is_told_of_the_maximum_age_as_well(caplog: pytest.LogCaptureFixture) -> None:
