@@ -52,7 +52,7 @@ class BudgetBook:
         self._known: dict[Name, tuple[_Age, str | None]] = {}
 
     def enter(self, task: ApplicationTask) -> set[Name]:
-        """Note an unfinished task; the other tasks that are within or beyond a budget by that."""
+        """Note an unfinished task; returns the other tasks that may be within or beyond a budget by that."""
         name = (task.namespace, task.name)
         age, holder = (task.metadata.creation_timestamp, name), task.spec.requester.holder
         if self._known.get(name) == (age, holder):
@@ -68,7 +68,7 @@ class BudgetBook:
         return moved - {name}
 
     def leave(self, name: Name) -> set[Name]:
-        """Note that a task has ended; the other tasks that are within or beyond a budget by that."""
+        """Note that a task has ended; returns the other tasks that may be within or beyond a budget by that."""
         age, holder = self._known.pop(name, (None, None))
         if age is None:
             return set()
