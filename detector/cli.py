@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from detector import inquiry, recordings
 from detector.catalog.command import command as catalog_command
+from detector.commands import inquiry, recordings
 from detector.results.kinds import Kind, chosen
 from wayside import commandline
 from wayside.beginning import importing
@@ -22,7 +22,7 @@ from wayside.commandline import leave, refuse
 from wayside.inputerror import InputError
 
 if TYPE_CHECKING:
-    from detector.running import View
+    from detector.live.running import View
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -114,8 +114,8 @@ def run(
     with importing():
         import asyncio
 
-        from detector.service import Files, Named, Options
-        from detector.service import run as run_service
+        from detector.live.service import Files, Named, Options
+        from detector.live.service import run as run_service
 
     if name is not None:
         holder = _holder_in_pod(name) if as_pod else name

@@ -16,7 +16,13 @@ from detector.engine.counters import RuleCounters
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
 from detector.engine.timing.data import DataTimeline
-from detector.findings import DIVERGING_STAMPS, OLD_SAMPLES, STALE_BETWEEN_SAMPLES, STREAM_WITHOUT_STAMPS, ZERO_STAMPS
+from detector.findings import (
+    DIVERGING_STAMPS,
+    OLD_SAMPLES,
+    STALE_BETWEEN_SAMPLES,
+    STREAM_WITHOUT_STAMPS,
+    ZERO_STAMPS,
+)
 from detector.streams.tally import Tally
 from wayside.findings import Finding
 from wayside.rules import PairSubject

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import zenoh
 
-from detector.credentials import Material
+from detector.access.credentials import Material
 from detector.streams.answering import Answering
 from detector.streams.liveliness import subscribe_tokens
 from detector.streams.session import Connections

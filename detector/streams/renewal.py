@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from detector.credentials import Material
+from detector.access.credentials import Material
 from detector.streams.inlets import Inlet
 from detector.streams.liveliness import TokenWatch
 from detector.streams.membership import Membership

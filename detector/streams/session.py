@@ -10,8 +10,8 @@ import time
 
 import zenoh
 
-from detector.access import AccessError
-from detector.credentials import Material, read_material
+from detector.access.credentials import Material, read_material
+from detector.access.mounted import AccessError
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.inputerror import InputError
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from detector.credentials import Material
+from detector.access.credentials import Material
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.streams.answering import Answering
 from detector.streams.bursts import Put

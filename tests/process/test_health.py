@@ -20,12 +20,12 @@ ALWAYS = a_rule("r", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}
 
 FAULTS = """
 import asyncio, os, sys, threading, time
-import detector.answers
+import detector.live.answers
 from detector import cli
 from detector.engine.engine import Engine
-from detector.running import Running
+from detector.live.running import Running
 
-detector.answers._SILENT = 1.0
+detector.live.answers._SILENT = 1.0
 
 def until_gone(path):
     while os.path.exists(path):

@@ -13,11 +13,11 @@ from detector.assembly import DetectorError, inlets
 from detector.engine.samples import liveliness
 from detector.engine.samples.liveliness import LIVELINESS, Token
 from detector.engine.samples.sample import Arrival
+from detector.live.restoring import Restored
+from detector.live.running import Running
 from detector.replay.intake_file import read_intake
 from detector.replay.replaying import replay_intake
-from detector.restoring import Restored
 from detector.rules.selection import RuleSet
-from detector.running import Running
 from detector.streams.zenoh import Network
 from tests.driving import SECOND, START, Drive, a_detector, a_rule, a_stream, arrival, at, lines
 from tests.networks import Arrivals, router, session, stream, wait_for

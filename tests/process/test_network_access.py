@@ -12,13 +12,13 @@ import pytest
 import zenoh
 from pydantic import ValidationError
 
-from detector.access import AccessError, Login, login, tls_files
+from detector.access.mounted import AccessError, Login, login, tls_files
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.engine.samples.liveliness import LIVELINESS, Token
-from detector.restoring import Restored
+from detector.live.restoring import Restored
+from detector.live.running import Running
 from detector.rules.selection import RuleSet
-from detector.running import Running
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
 from tests.certificates import Authority

@@ -18,13 +18,13 @@ from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.samples.intake import Intake
-from detector.evaluator import Evaluator
+from detector.live.evaluator import Evaluator
+from detector.live.restoring import Restored
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.replaying import replay_intake
-from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from tests.driving import a_detector
 from tests.plugins.rules import plugin_rule, plugins

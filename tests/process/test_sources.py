@@ -16,9 +16,9 @@ from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
 from detector.engine.samples.intake import Intake
-from detector.restoring import Restored
+from detector.live.restoring import Restored
+from detector.live.running import Running
 from detector.rules.selection import RuleSet
-from detector.running import Running
 from detector.sources import Feed, Source
 from detector.sources.registry import OFFERS, source_problems
 from detector.sources.supervision import Sources, SourceThread, State

@@ -65,7 +65,7 @@ def test_an_episode_has_one_trace_and_its_tasks_a_span_each(one: str, other: str
 
 def test_without_an_endpoint_there_are_no_traces_and_nothing_is_imported() -> None:
     script = (
-        "import sys, detector.service, application_manager.service\n"
+        "import sys, detector.live.service, application_manager.service\n"
         "from wayside.tracing import tracing\n"
         "assert tracing('x') is None\n"
         "assert not [name for name in sys.modules if name.startswith('opentelemetry')]\n"

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from detector.access import AccessError, database_uri
+from detector.access.mounted import AccessError, database_uri
 from detector.actions.base import ActionError
 from detector.actions.database.server import Server
 from detector.actions.database.spool import Spool, SpoolError

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from detector.access import AccessError, TlsFiles, login, secret_text, tls_files
+from detector.access.mounted import AccessError, TlsFiles, login, secret_text, tls_files
 from wayside.api.actions.http import HttpAccess, HttpHeader
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import aiohttp
 from yarl import URL
 
-from detector.access import AccessError
+from detector.access.mounted import AccessError
 from detector.actions.http.access import Headers, TlsContexts, read_headers
 from detector.actions.http.answer import Answer
 from detector.actions.http.resolving import Resolver

@@ -84,5 +84,5 @@ def test_a_command_on_files_loads_neither_networks_nor_recordings(
 
 
 def test_a_detector_loads_what_its_detector_and_options_ask_for_and_no_more() -> None:
-    code = "import sys, detector.service; print(*sys.modules)"
+    code = "import sys, detector.live.service; print(*sys.modules)"
     assert loaded(code) & HEAVY == {"zenoh"}

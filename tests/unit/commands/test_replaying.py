@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from detector.engine.samples.intake import Intake
-from detector.evaluator import Evaluator
+from detector.live.evaluator import Evaluator
 from detector.replay.intake_file import Control
 from detector.replay.replaying import replay_arrivals, replay_intake
 from tests.driving import START, a_deploy, a_detector, a_rule, an_engine, arrival, at

@@ -9,9 +9,9 @@ from detector.assembly import inlets, make_engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
-from detector.evaluator import Evaluator
+from detector.live.evaluator import Evaluator
+from detector.live.restoring import Restored
 from detector.replay.intake_file import Control
-from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from tests.driving import START
 from wayside.api import Detector

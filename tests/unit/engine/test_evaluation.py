@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from detector.engine.engine import NoAnswerError
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.load import highest_level, thinning
-from detector.evaluator import Evaluator
-from detector.overload import CALM, LONG, Overload
+from detector.live.evaluator import Evaluator
+from detector.live.overload import CALM, LONG, Overload
 from detector.replay.intake_file import Control
 from detector.replay.replaying import replay_intake
 from tests.driving import (

@@ -11,10 +11,10 @@ import pytest
 from rich.console import Console
 
 from detector.assembly import Refusal
+from detector.commands.inquiry import inquire
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
-from detector.evaluator import Evaluator
-from detector.inquiry import inquire
+from detector.live.evaluator import Evaluator
 from detector.losses import Losses
 from detector.status.explaining import Watching
 from detector.status.keeping import StatusKeeper

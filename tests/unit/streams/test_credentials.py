@@ -14,9 +14,9 @@ from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector import credentials
-from detector.access import AccessError
-from detector.credentials import Material, expiry, read_material
+from detector.access import credentials
+from detector.access.credentials import Material, expiry, read_material
+from detector.access.mounted import AccessError
 from tests.certificates import Authority
 from wayside.api.access import Access
 

@@ -12,9 +12,9 @@ from detector.engine.consequences.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.event_log import EventLog
+from detector.live.event_log import EventLog
+from detector.live.state import StateFile
 from detector.requested import with_requested
-from detector.state import StateFile
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
 from detector.tracing import EpisodeTraces
 from wayside.api import EventRule

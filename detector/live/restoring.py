@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from detector.actions.deploy.stores import Snapshot, TaskStore, live_demands
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.state import StateFile
+from detector.live.state import StateFile
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,12 +16,12 @@ from pathlib import Path
 from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import detector_problems
+from detector.live.restoring import what_was_open
+from detector.live.running import Running, View
+from detector.live.state import state_file
 from detector.memory import tune_garbage_collection
-from detector.restoring import what_was_open
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files, hangups
-from detector.running import Running, View
-from detector.state import state_file
 from detector.tracing import EpisodeTraces, episode_traces
 
 _log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces 
             await _run_from_files(files, options, stopping, traces)
         case Named() as named:
             # Not at the top: the Kubernetes client takes half a second to import, which is only needed with a cluster.
-            from detector.in_cluster import run_in_cluster  # noqa: PLC0415
+            from detector.live.in_cluster import run_in_cluster  # noqa: PLC0415
 
             record, port = options.record_intake, options.metrics_port
             await run_in_cluster(

@@ -26,11 +26,11 @@ from detector.engine.observing import Observer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.timeline import ORDER
+from detector.live.overload import LONG, Overload
+from detector.live.restoring import Restored
 from detector.losses import Losses
 from detector.memory import Sweeper
-from detector.overload import LONG, Overload
 from detector.plugins.outages import Outages
-from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from detector.streams.codecs.ros import RosTypes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from detector.inquiry import Connect, DetectorFile, Name, Timeout, inquire
+from detector.commands.inquiry import Connect, DetectorFile, Name, Timeout, inquire
 from wayside.beginning import importing
 from wayside.commandline import refuse
 

@@ -11,7 +11,7 @@ import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from detector.access import AccessError, Login, TlsFiles, login, tls_files
+from detector.access.mounted import AccessError, Login, TlsFiles, login, tls_files
 from wayside.api.access import Access
 
 _ATTEMPTS = 5

@@ -15,10 +15,10 @@ from detector.actions.deploy.lease import HolderLease
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.stores import TaskStore
 from detector.cluster.connection import connect
-from detector.restoring import what_was_open
+from detector.live.restoring import what_was_open
+from detector.live.running import Running, View
+from detector.live.state import state_file
 from detector.rules.kubernetes import ClusterRules
-from detector.running import Running, View
-from detector.state import state_file
 from detector.tracing import EpisodeTraces
 
 Result = TypeVar("Result")

@@ -14,21 +14,21 @@ from typing import TYPE_CHECKING, Protocol
 
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.outcomes import Outcomes
-from detector.answers import Answers
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.liveliness import LIVELINESS
-from detector.evaluator import Evaluator, Onlooker
-from detector.event_log import EventLog
+from detector.live.answers import Answers
+from detector.live.evaluator import Evaluator, Onlooker
+from detector.live.event_log import EventLog
+from detector.live.outlet import LiveOutlet
+from detector.live.restoring import Restored
+from detector.live.state import StateFile
 from detector.losses import Loss
-from detector.outlet import LiveOutlet
 from detector.plugins.processes import ProcessHost
 from detector.requested import Requested
-from detector.restoring import Restored
 from detector.rules.selection import RuleSet
 from detector.sources.registry import source_problems
 from detector.sources.supervision import Sources
-from detector.state import StateFile
 from detector.status.pulse import Pulse
 from detector.status.server import StatusServer
 from detector.streams.answering import Answering

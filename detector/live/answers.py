@@ -16,8 +16,8 @@ import msgspec
 
 from detector.actions.trigger.requests import RECORDINGS
 from detector.engine.episodes.plain import plain
-from detector.evaluator import Evaluator
-from detector.outlet import LiveOutlet
+from detector.live.evaluator import Evaluator
+from detector.live.outlet import LiveOutlet
 from detector.requested import Requested
 from detector.sources.supervision import SourceThread
 from detector.status.model import ActionStatus, CertificateStatus, Drops, Explanation, SourceStatus, Status, to_json
