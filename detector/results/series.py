@@ -110,6 +110,35 @@ class Way:
     """Shape (2, n): x and y in metres, or latitude and longitude in degrees."""
 
 
+_AXES = {("x", "y"): False, ("latitude", "longitude"): True}
+"""Signals that are a position, and whether it is in degrees."""
+
+
+def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, Way], bool]:
+    """By client, its way, as the signals `x` and `y`, or `latitude` and `longitude`, of the first rule give it.
+
+    And whether the ways are in degrees. Empty where no rule about clients has these signals.
+    """
+    for axes, geographic in _AXES.items():
+        having = [each for each in subjects if len(each.clients) == 1 and _have(each, axes)]
+        if having:
+            ways: dict[str, Way] = {}
+            for subject in having:
+                if subject.rule == having[0].rule and subject.clients[0] not in ways:
+                    series = [subject.signals[axis] for axis in axes]
+                    times = np.unique(np.concatenate([each.times for each in series]))
+                    places = np.stack([each.at(times) for each in series])
+                    known = ~np.isnan(places).any(axis=0)
+                    if known.any():
+                        ways[subject.clients[0]] = Way(times[known], places[:, known])
+            return ways, geographic
+    return {}, False
+
+
+def _have(subject: SubjectTrace, axes: Sequence[str]) -> bool:
+    return all(axis in subject.signals and subject.signals[axis].kind is Kind.NUMBER for axis in axes)
+
+
 @dataclass(slots=True)
 class Trace:
     """All that a replay of one recording saw."""

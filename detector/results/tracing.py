@@ -34,6 +34,7 @@ from detector.results.series import (
     SubjectTrace,
     Trace,
     Wanted,
+    ways_of,
 )
 from detector.results.witnessing import Witnessed
 from wayside.expressions.columns.values import Tag
@@ -205,8 +206,10 @@ class Tracer:
                 found.setdefault((name, each.subject), each)
                 self._time(*witnessed.span)
         subjects = [found[key] for key in sorted(found)]
-        ways = self._ways.ways(self._names)
-        return Trace(subjects, ways, self._ways.geographic, self._begin or 0, self._end)
+        ways, geographic = self._ways.ways(self._names), self._ways.geographic
+        if not ways and self._with_ways:
+            ways, geographic = ways_of(subjects)
+        return Trace(subjects, ways, geographic, self._begin or 0, self._end)
 
     def _of_clients(self, found: dict[tuple[str, str], SubjectTrace], wanted: Wanted) -> None:
         subjects: dict[tuple[str, str | None, int], SubjectTrace] = {}

@@ -14,7 +14,8 @@ from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import Outcome, replay_arrivals
 from detector.results.series import AWAY, TRUE, UNKNOWN, SubjectTrace, Trace
 from detector.results.tracing import Tracer
-from tests.unit.results.drives import SECOND, SILENT, START, arrivals, documents
+from tests.driving import a_detector, a_rule, a_stream
+from tests.unit.results.drives import SECOND, SILENT, START, arrivals, documents, messages
 
 
 class OneByOne(Tracer):
@@ -144,3 +145,18 @@ def assert_alike(one: Trace, other: Trace) -> None:
             assert steps.codes.tolist() == theirs.conditions[field].codes.tolist()
             assert steps.reasons == theirs.conditions[field].reasons
     assert one.ways.keys() == other.ways.keys()
+
+
+def test_without_a_rule_about_pairs_the_signals_x_and_y_are_the_ways() -> None:
+    stream = a_stream("odom", staleAfter="2s")
+    signals = [{"name": axis, "stream": "odom", "value": f"msg.{axis}"} for axis in ("x", "y")]
+    rule = a_rule("far", signals=signals, when="x > 100", evaluation={"every": "100ms"})
+    tracer = Tracer()
+    replay_arrivals([arrivals()], a_detector(stream), [rule], onlooker=tracer)
+    trace = tracer.trace()
+    assert trace.ways.keys() == {"car0", "car1", "car2"}
+    assert not trace.geographic
+    sent = {(key.split("/")[1], message["x"], message["y"]) for _, key, message in messages()}
+    for client, way in trace.ways.items():
+        assert len(way.times) > 100
+        assert {(client, x, y) for x, y in way.axes.T.tolist()} <= sent
