@@ -1,7 +1,7 @@
-"""What is worked on: the queues, and the work behind each, wired together.
+"""Wires the queues to their work.
 
-News come in by the router, which asks queues for keys. The work of a queue writes, tells the world what it did, and
-asks others. What nobody asks for is not done.
+Events come in through the router, which enqueues keys. The work of a queue writes, notes in the cache what it did, and
+enqueues what depends on it.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 
+from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TEMPLATE, ClusterCache
+from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.chartdesk import ChartDesk
 from application_manager.cluster.apply import Applier
@@ -19,8 +21,6 @@ from application_manager.cluster.store import Name
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey
 from application_manager.headroom import Headroom
-from application_manager.knowledge.detectorbook import DetectorBook
-from application_manager.knowledge.world import DETECTOR, INSTANCE, TASK, TEMPLATE, World
 from application_manager.measures import Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.tracing import LostSpans, TaskTraces
@@ -56,7 +56,7 @@ class Assembly:
     """All queues of a manager.
 
     Attributes:
-        world: what is known.
+        cache: the objects of the cluster.
         book: what is known of Detectors that are run.
         recorder: posts Events.
         applier: applies manifests.
@@ -78,16 +78,16 @@ class Assembly:
     ) -> None:
         headroom = Headroom(options.memory_limit)
         measures.registry.register(headroom)
-        self.world = World(options.policy, options.max_instances, headroom.tight, options.tasks)
-        self._traces = None if traced is None else TaskTraces(traced, self.world)
+        self.cache = ClusterCache(options.policy, options.max_instances, headroom.tight, options.tasks)
+        self._traces = None if traced is None else TaskTraces(traced, self.cache)
         if traced is not None:
             measures.registry.register(LostSpans(traced))
         self.recorder = Recorder(client, measures)
-        applier = self.applier = Applier(client, self.world.store, resources)
+        applier = self.applier = Applier(client, self.cache.store, resources)
         self._instances: WorkQueue[Name] = WorkQueue(
             "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures, share=_INSTANCE_SHARE
         )
-        self.world.places.changed = self._instances.add
+        self.cache.places.changed = self._instances.add
         self._statuses: WorkQueue[Name] = WorkQueue(
             "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measures
         )
@@ -100,22 +100,22 @@ class Assembly:
         self._rules: WorkQueue[RuleKey] = WorkQueue(
             "rule", self._reconcile_rule, _JUDGING_WORKERS, self._instances, measures, share=1
         )
-        self.book = DetectorBook(options.detectors)
+        self.book = DetectorIndex(options.detectors)
         detectors = DetectorWork(
-            self.world,
+            self.cache,
             client,
             self.book,
             lambda name: self._rules.add((DETECTOR, name)),
-            SidecarNews(self.world, self.book, self.recorder),
+            SidecarNews(self.cache, self.book, self.recorder),
         )
         self._detector_work = detectors
         self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measures)
         queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
-        measures.registry.register(Overview(self.world, lambda: [(each.name, *each.depth) for each in queues]))
+        measures.registry.register(Overview(self.cache, lambda: [(each.name, *each.depth) for each in queues]))
         self.publisher = Publisher(options.zenoh)
         self._configurations: WorkQueue[Name] = WorkQueue(
             "configuration",
-            ConfigurationWork(self.world, client, applier, self.publisher).reconcile,
+            ConfigurationWork(self.cache, client, applier, self.publisher).reconcile,
             _CONFIGURATION_WORKERS,
             measures=measures,
         )
@@ -123,9 +123,9 @@ class Assembly:
         self.pool = Pool(measures, options.cpu_time)
         self._answers = AnswerCache(self.pool)
         self._claiming = Claiming(self._answers, self._claimed)
-        self.world.claims.claim_of = self._claiming
+        self.cache.claims.claim_of = self._claiming
         self.router = Router(
-            self.world,
+            self.cache,
             applier,
             self._instances.add,
             self._tasks.add,
@@ -133,12 +133,12 @@ class Assembly:
             self._judge,
             self._configurations.add,
         )
-        self.world.claims.settled = self.router.settled
-        self.world.claims.moved = self.router.claimed
-        self.world.overlap.every = options.resync
-        self.world.overlap.resumed = lambda _: self.router.everything()
+        self.cache.claims.settled = self.router.settled
+        self.cache.claims.moved = self.router.claimed
+        self.cache.overlap.every = options.resync
+        self.cache.overlap.resumed = lambda _: self.router.everything()
         self._status_work = InstanceStatusWork(
-            world=self.world,
+            cache=self.cache,
             client=client,
             applier=applier,
             recorder=self.recorder,
@@ -152,14 +152,14 @@ class Assembly:
         cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
         self.charts = ChartDesk(options.helm, cache, self._instances.add_at)
         self._renderings = Renderings(
-            self.world,
+            self.cache,
             self._answers,
             self.charts.outcome,
             lambda name, _: self._instances.add(name),
             self._templates.add,
         )
         self._instance_work = InstanceWork(
-            world=self.world,
+            cache=self.cache,
             client=client,
             applier=applier,
             recorder=self.recorder,
@@ -175,7 +175,7 @@ class Assembly:
             objects=self._renderings.objects,
         )
         self._task_work = TaskWork(
-            world=self.world,
+            cache=self.cache,
             client=client,
             recorder=self.recorder,
             tasks=resources[TASK],
@@ -187,7 +187,7 @@ class Assembly:
             traces=self._traces,
         )
         self._template_work = TemplateWork(
-            world=self.world,
+            cache=self.cache,
             client=client,
             recorder=self.recorder,
             templates=resources[TEMPLATE],
@@ -196,7 +196,7 @@ class Assembly:
             again=self._templates.add_at,
         )
         self._rule_work = RuleWork(
-            world=self.world,
+            cache=self.cache,
             client=client,
             recorder=self.recorder,
             resources=resources,
@@ -220,19 +220,19 @@ class Assembly:
 
     def begin_anew(self, children: Iterable[Resource]) -> None:
         """Forget what we did: others may have acted since. `children` are the kinds of what templates create."""
-        self.world.forget_work()
+        self.cache.forget_work()
         self.publisher.forget()
         self.applier.begin(
-            entry.raw for each in children for _, entry in self.world.store.all((each.api_version, each.kind))
+            entry.raw for each in children for _, entry in self.cache.store.all((each.api_version, each.kind))
         )
 
     def publish_all(self) -> None:
         """Ask for the configurations of all instances to be published."""
-        for name, _ in self.world.store.all(INSTANCE):
+        for name, _ in self.cache.store.all(INSTANCE):
             self._configurations.add(name)
 
     async def _reconcile_instance(self, name: Name) -> None:
-        if self.world.overlap.yields(name[0]):
+        if self.cache.overlap.yields(name[0]):
             return
         if self._traces is None:
             await self._instance_work.reconcile(name)
@@ -240,22 +240,22 @@ class Assembly:
             await self._traces.reconciling(name, self._instance_work.reconcile)
 
     async def _say_instance(self, name: Name) -> None:
-        if not self.world.overlap.yields(name[0]):
+        if not self.cache.overlap.yields(name[0]):
             await self._status_work.reconcile(name)
 
     async def _reconcile_task(self, name: Name) -> None:
-        if not self.world.overlap.yields(name[0]):
+        if not self.cache.overlap.yields(name[0]):
             await self._task_work.reconcile(name)
 
     async def _reconcile_template(self, name: Name) -> None:
         await self._template_work.reconcile(name)
 
     async def _reconcile_detector(self, name: Name) -> None:
-        if not self.world.overlap.yields(name[0]):
+        if not self.cache.overlap.yields(name[0]):
             await self._detector_work.reconcile(name)
 
     async def _reconcile_rule(self, key: RuleKey) -> None:
-        if not self.world.overlap.yields(key[1][0]):
+        if not self.cache.overlap.yields(key[1][0]):
             await self._rule_work.reconcile(key)
 
     def _judge(self, key: RuleKey) -> None:

@@ -1,4 +1,4 @@
-"""What the manager counts and times of itself, as Prometheus metrics. docs/manager.md describes each.
+"""Counters and timers of the manager, as Prometheus metrics. docs/manager.md describes each.
 
 Labels are queues, reasons, phases and codes, never names of objects: there may be too many.
 """
@@ -21,7 +21,7 @@ class Measures:
     """The counters and histograms; one of them for a manager, and only its event loop's thread writes them.
 
     Attributes:
-        registry: where collectors that look at the world are registered as well.
+        registry: where collectors that read the cache are registered as well.
         looked: when the last resync ended, well or not, on the monotonic clock; the start before that.
     """
 

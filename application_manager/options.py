@@ -1,4 +1,4 @@
-"""What a manager is told when it is started."""
+"""The options of a manager."""
 
 from __future__ import annotations
 

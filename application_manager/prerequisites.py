@@ -1,4 +1,4 @@
-"""What there must be before the manager can begin: the kinds that it knows, and the rights that it needs."""
+"""The checks before the manager starts: the kinds that it needs, and its rights."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from functools import partial
 
+from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
 from application_manager.cluster.client import ApiError, Client, Resource
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.entitlement import judge, lacking
@@ -14,7 +15,6 @@ from application_manager.cluster.leadership import LeaseKey
 from application_manager.cluster.starting import until_answered
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
 from application_manager.core.objects.rights import lease_rights, reading, rights
-from application_manager.knowledge.world import OWN_KINDS, POD, TASK
 
 log = logging.getLogger(__name__)
 

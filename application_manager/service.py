@@ -22,6 +22,7 @@ from application_manager.admission.injecting import Injecting
 from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import Desk, webhook
 from application_manager.assembly import Assembly
+from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
 from application_manager.cluster.client import ApiError, Client, Resource
 from application_manager.cluster.connection import ConfigurationError, load_configuration
 from application_manager.cluster.grants import Grants
@@ -29,7 +30,6 @@ from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
 from application_manager.cluster.starting import until_answered
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
 from application_manager.core.objects.policy import KindKey
-from application_manager.knowledge.world import DETECTOR, OWN_KINDS, POD
 from application_manager.measures import Measures
 from application_manager.observability.pages import pages, stalled
 from application_manager.options import Options
@@ -100,7 +100,7 @@ class Manager:
         # Pods always: those of workloads tell why they do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
         self._listing = Listing(
-            world=work.world,
+            cache=work.cache,
             client=client,
             router=work.router,
             own=own,
@@ -109,16 +109,16 @@ class Manager:
             every=options.resync,
             measures=measures,
         )
-        work.world.overlap.own = self._own_lease
-        self._pulse = Pulse(options.watch_timeout, lambda: work.world.healthy.elapsed)
+        work.cache.overlap.own = self._own_lease
+        self._pulse = Pulse(options.watch_timeout, lambda: work.cache.healthy.elapsed)
         measures.registry.register(self._pulse)
-        self._detector_watch = DetectorWatch(work.world, client, work.book, options.namespaces, work.detectors.add)
+        self._detector_watch = DetectorWatch(work.cache, client, work.book, options.namespaces, work.detectors.add)
         self._grants = Grants(client, work.router.everything)
         if not options.namespaces:
             client.may_write = self._grants.may_write
-        self._leases = LeaseWatch(work.world, client, own[0], options.namespaces, work.router.look_at)
+        self._leases = LeaseWatch(work.cache, client, own[0], options.namespaces, work.router.look_at)
         self._admission = Admission(
-            world=work.world,
+            cache=work.cache,
             client=client,
             resources=resources,
             observe=work.router.observe,
@@ -127,7 +127,7 @@ class Manager:
             namespaces=options.namespaces,
         )
         self._injecting = Injecting(
-            world=work.world,
+            cache=work.cache,
             client=client,
             detectors=resources[DETECTOR],
             observe=work.router.observe,
@@ -179,7 +179,7 @@ class Manager:
     def _lacks(self, watching: asyncio.Event) -> str | None:
         if not watching.is_set() or not self._pulse.begun("applicationtasks"):
             return "not everything is listed and watched yet"
-        return None if self._work.world.healthy.reached else "the API server does not answer"
+        return None if self._work.cache.healthy.reached else "the API server does not answer"
 
     async def _watch_and_act(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         tasks = [
@@ -217,7 +217,7 @@ class Manager:
             self._work.begin_anew(self._listing.children)
             await self._listing.first()
             self._work.publish_all()
-        self._work.world.claims.begin()
+        self._work.cache.claims.begin()
 
     async def _announce(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         await watching.wait()

@@ -1,1 +1,1 @@
-"""The API server's questions about templates, rules and detectors, answered over HTTPS."""
+"""The webhook: reviews of templates, rules and detectors over HTTPS."""

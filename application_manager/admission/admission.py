@@ -15,13 +15,13 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
+from application_manager.cache.surroundings import surroundings
 from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
 from application_manager.core.objects.policy import KindKey
-from application_manager.knowledge.surroundings import surroundings
-from application_manager.knowledge.world import DETECTOR, EVENT_RULE, TEMPLATE, World
 from application_manager.measures import Measures
 from application_manager.workers.jobs import DetectorJob, RuleJob, Surroundings, TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
@@ -53,7 +53,7 @@ class Admission:
         namespaces: those that the manager looks after; empty: all.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     resources: Mapping[KindKey, Resource]
     observe: Callable[[Object], None]
@@ -98,7 +98,7 @@ class Admission:
             return Findings((str(error),))
         match model:
             case ApplicationTemplate():
-                return await self._run(request.namespace, TemplateJob(model, self.world.policy))
+                return await self._run(request.namespace, TemplateJob(model, self.cache.policy))
             case EventRule():
                 return await self._of_rule(model)
             case Detector():
@@ -125,7 +125,7 @@ class Admission:
         return await self._judged(rule)
 
     async def _judged(self, rule: EventRule) -> Findings:
-        return await self._run(rule.namespace, RuleJob(rule, surroundings(self.world, rule)))
+        return await self._run(rule.namespace, RuleJob(rule, surroundings(self.cache, rule)))
 
     async def _run(self, namespace: str, job: Job[Findings]) -> Findings:
         """What a worker process finds; that it takes too much is a problem as well."""
@@ -144,7 +144,7 @@ class Admission:
         findings = await self._run(detector.namespace, DetectorJob(detector))
         remarks: list[Finding] = []
         until = time.monotonic() + LOOKING_AT_RULES
-        rules = self.world.models(EVENT_RULE, EventRule, detector.namespace)
+        rules = self.cache.models(EVENT_RULE, EventRule, detector.namespace)
         for first in range(0, len(rules), _RULES_AT_ONCE):
             some = rules[first : first + _RULES_AT_ONCE]
             remarks += (await self._run(detector.namespace, DetectorJob(detector, before, some))).remarks

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
 from application_manager.core.findings.injections import (
     Injection,
@@ -22,7 +23,6 @@ from application_manager.core.findings.injections import (
     read_pod,
 )
 from application_manager.core.objects.poddefaults import PodDefaults
-from application_manager.knowledge.world import DETECTOR, World
 from application_manager.measures import Measures
 from wayside.api import Detector
 
@@ -41,7 +41,7 @@ class Injecting:
         defaults: what holds for all detectors; None where the manager runs none.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     detectors: Resource
     observe: Callable[[Object], None]
@@ -62,7 +62,7 @@ class Injecting:
         return answer_pod(request, found)
 
     async def _found(self, request: PodRequest, name: str) -> Injection:
-        entry = self.world.store.get(DETECTOR, (request.namespace, name))
+        entry = self.cache.store.get(DETECTOR, (request.namespace, name))
         detector = entry.model if entry is not None and isinstance(entry.model, Detector) else None
         metadata, spec = request.pod["metadata"], request.pod["spec"]
         # Beside the event loop: whether the Detector is accepted is found by compiling its expressions.

@@ -1,1 +1,1 @@
-"""The API server: reached, read, written, and who of several managers may write."""
+"""The API server: connection, reads, writes, and leader election."""

@@ -1,1 +1,1 @@
-"""What should run, and what is to be said about it: pure functions of what is live. No I/O, no clock reading."""
+"""What should run, and the statuses that follow: pure functions of the live objects. No I/O, no clock."""

@@ -1,1 +1,1 @@
-"""What the manager tells of itself: health, metrics, traces."""
+"""Health, metrics and traces of the manager."""

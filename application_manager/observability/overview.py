@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from application_manager.knowledge.world import INSTANCE, TASK, TEMPLATE, World
+from application_manager.cache.cluster_cache import INSTANCE, TASK, TEMPLATE, ClusterCache
 from application_manager.measures import PREFIX
 from wayside.api.applicationinstance import InstancePhase
 from wayside.api.applicationtask import TaskPhase
@@ -18,14 +18,14 @@ NO_PHASE = "None"
 
 
 class Overview(Collector):
-    """Gauges over the world.
+    """Gauges over the cache.
 
     Args of the constructor:
         queues: by name, how many keys wait for a worker, and how many for their time.
     """
 
-    def __init__(self, world: World, queues: Callable[[], Iterable[tuple[str, int, int]]]) -> None:
-        self._world = world
+    def __init__(self, cache: ClusterCache, queues: Callable[[], Iterable[tuple[str, int, int]]]) -> None:
+        self._cache = cache
         self._queues = queues
 
     def collect(self) -> Iterator[Metric]:
@@ -45,19 +45,19 @@ class Overview(Collector):
         yield from (depth, later)
         yield self._leases()
         shed = GaugeMetricFamily(f"{PREFIX}tasks_shed", "ApplicationTasks that were not taken in for want of memory")
-        shed.add_metric((), len(self._world.store.shed))
+        shed.add_metric((), len(self._cache.store.shed))
         yield shed
         yielded = GaugeMetricFamily(f"{PREFIX}namespaces_yielded", "Namespaces in which an older manager acts")
-        yielded.add_metric((), self._world.overlap.count)
+        yielded.add_metric((), self._cache.overlap.count)
         yield yielded
         reached = GaugeMetricFamily(f"{PREFIX}api_reached", "1 while the API server answers")
-        reached.add_metric((), float(self._world.healthy.reached))
+        reached.add_metric((), float(self._cache.healthy.reached))
         yield reached
 
     def _phases(self, name: str, text: str, kind: tuple[str, str], phases: Sequence[str]) -> Metric:
         family = GaugeMetricFamily(f"{PREFIX}{name}", text, labels=("phase",))
         found = Counter(
-            (entry.raw.get("status") or {}).get("phase") or NO_PHASE for _, entry in self._world.store.all(kind)
+            (entry.raw.get("status") or {}).get("phase") or NO_PHASE for _, entry in self._cache.store.all(kind)
         )
         for phase in (*phases, NO_PHASE):
             family.add_metric((phase,), found[phase])
@@ -65,7 +65,7 @@ class Overview(Collector):
 
     def _templates(self) -> Metric:
         family = GaugeMetricFamily(f"{PREFIX}templates", "ApplicationTemplates by Accepted", labels=("accepted",))
-        found = Counter(_accepted(entry.raw) for _, entry in self._world.store.all(TEMPLATE))
+        found = Counter(_accepted(entry.raw) for _, entry in self._cache.store.all(TEMPLATE))
         for status in ("True", "False", "Unknown"):
             family.add_metric((status,), found[status])
         return family
@@ -74,8 +74,8 @@ class Overview(Collector):
         family = GaugeMetricFamily(
             f"{PREFIX}leases", "Holders of demands by the state of their Lease", labels=("state",)
         )
-        at = self._world.healthy.elapsed
-        views = [self._world.leases.view(key, at) for key in self._world.claims.holders()]
+        at = self._cache.healthy.elapsed
+        views = [self._cache.leases.view(key, at) for key in self._cache.claims.holders()]
         overdue = sum(view.unchanged >= view.duration for view in views)
         family.add_metric(("renewed",), len(views) - overdue)
         family.add_metric(("overdue",), overdue)

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from application_manager.cache.cluster_cache import ClusterCache, Record
 from application_manager.cluster.store import Name
 from application_manager.core.claims.operations import Standing
 from application_manager.core.conditions import changed, find, holds
-from application_manager.knowledge.world import Record, World
 from application_manager.measures import PREFIX
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import TRACEPARENT_ANNOTATION, ApplicationTaskStatus
@@ -47,19 +47,19 @@ class _Known:
 class TaskTraces:
     """Tells the spans of tasks. Only the event loop's thread."""
 
-    def __init__(self, told: Tracing, world: World) -> None:
+    def __init__(self, told: Tracing, cache: ClusterCache) -> None:
         self.tracing = told
-        self._world = world
+        self._cache = cache
         self._known: OrderedDict[str, _Known] = OrderedDict()
         self._said = False
 
     async def reconciling(self, name: Name, work: Callable[[Name], Awaitable[None]]) -> None:
         """Do the work on an instance, and tell what it did for tasks."""
-        began, before = time.time_ns(), self._world.records.get(name)
+        began, before = time.time_ns(), self._cache.records.get(name)
         try:
             await work(name)
         finally:
-            record = self._world.records.get(name)
+            record = self._cache.records.get(name)
             if record is not None and record is not before and not record.decision.withheld:
                 self._reconciled(name, began, record)
 
@@ -108,7 +108,7 @@ class TaskTraces:
         ended = time.time_ns()
         served: dict[str, tuple[ApplicationTask, TraceContext]] = {}
         for task_name, verdict in record.decision.verdicts.items():
-            task = self._world.task((name[0], task_name))
+            task = self._cache.task((name[0], task_name))
             if verdict.standing is Standing.COUNTS and task is not None and (context := _context(task)) is not None:
                 served[task_name] = (task, context)
         for task, context in served.values():

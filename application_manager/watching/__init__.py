@@ -1,1 +1,1 @@
-"""How news comes in: lists, watches and Leases that are looked at, and what each piece of news means."""
+"""Watches, periodic lists and Leases: each event enters the cache, and what it concerns is enqueued."""

@@ -10,12 +10,12 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
+from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
 from application_manager.cluster.store import Name
 from application_manager.core.objects.detectors import KINDS, SELECTOR
 from application_manager.core.objects.sidecars import SIDECAR_LABEL
-from application_manager.knowledge.detectorbook import DetectorBook
-from application_manager.knowledge.world import DETECTOR, World
 
 LOOK_EVERY = 3.0  # s
 _KINDS = tuple(Resource(*each) for each in KINDS)
@@ -33,9 +33,9 @@ class DetectorWatch:
         detector: asks for a Detector's objects to be looked after.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
-    book: DetectorBook
+    book: DetectorIndex
     namespaces: tuple[str, ...]
     detector: Callable[[Name], None]
 
@@ -63,7 +63,7 @@ class DetectorWatch:
         for name in {
             *before,
             *self.book.asking,
-            *(name for name, _ in self.world.store.all(DETECTOR)),
+            *(name for name, _ in self.cache.store.all(DETECTOR)),
         }:
             self.detector(name)
 

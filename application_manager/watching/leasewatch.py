@@ -8,10 +8,10 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import LEASES, ApiError, Client, Resource, Unreachable
 from application_manager.cluster.store import Name
 from application_manager.core.holders.leases import HolderKey
-from application_manager.knowledge.world import World
 from wayside.leases import lease_name
 
 LOOK_EVERY = 1.0  # s
@@ -30,7 +30,7 @@ class LeaseWatch:
         instance: asks for an instance to be reconciled.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     probe: Resource
     namespaces: tuple[str, ...]
@@ -46,7 +46,7 @@ class LeaseWatch:
         was_reached = True
         while True:
             reached = await self._reached()
-            self.world.healthy.look(time.monotonic(), succeeded=reached)
+            self.cache.healthy.look(time.monotonic(), succeeded=reached)
             if reached != was_reached:
                 log.warning("the API server answers again" if reached else "the API server does not answer")
                 was_reached = reached
@@ -54,7 +54,7 @@ class LeaseWatch:
 
     async def _read(self) -> None:
         while True:
-            if self.world.healthy.reached:
+            if self.cache.healthy.reached:
                 await self.read_due()
             await asyncio.sleep(LOOK_EVERY)
 
@@ -72,9 +72,9 @@ class LeaseWatch:
 
         One that cannot be read is left as it was seen last, and does not concern the others.
         """
-        at = self.world.healthy.elapsed
+        at = self.cache.healthy.elapsed
         gate = asyncio.Semaphore(_AT_ONCE)
-        due = [each for each in self.world.claims.holders().items() if self.world.leases.due(each[0], at)]
+        due = [each for each in self.cache.claims.holders().items() if self.cache.leases.due(each[0], at)]
         problems = [each for each in await asyncio.gather(*(self._look_at(*each, gate) for each in due)) if each]
         if problems:
             others = f", and {len(problems) - 1} more Leases cannot be read" if len(problems) > 1 else ""
@@ -87,7 +87,7 @@ class LeaseWatch:
                 raw = await self.client.get(LEASES, key[0], lease_name(key[1]))
             except (ApiError, Unreachable) as error:
                 return error
-        self.world.leases.observe(key, raw, self.world.healthy.elapsed)
+        self.cache.leases.observe(key, raw, self.cache.healthy.elapsed)
         for instance in instances:
             self.instance(instance)
         return None

@@ -8,11 +8,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import LEASES, ApiError, Client, Resource, Unreachable
 from application_manager.cluster.starting import until_answered
 from application_manager.cluster.store import Name, name_of
 from application_manager.core.objects.labelling import INSTANCE_LABEL
-from application_manager.knowledge.world import World
 from application_manager.measures import Measures
 from application_manager.watching.router import Router
 
@@ -31,7 +31,7 @@ class Listing:
         measures: told of each resync.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     router: Router
     own: Sequence[Resource]
@@ -61,7 +61,7 @@ class Listing:
                 self.measures.resynced(well=False)
             else:
                 self.measures.resynced(well=True)
-            self.world.leases.forget_except(self.world.claims.holders())
+            self.cache.leases.forget_except(self.cache.claims.holders())
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
     async def again(self, group: str, plural: str, namespace: str | None, labels: str) -> None:
@@ -88,5 +88,5 @@ class Listing:
                     present.add(name_of(raw))
                     self.router.observe(raw)
             kind = (resource.api_version, resource.kind)
-            for entry in self.world.store.missing(kind, present, version, namespace):
+            for entry in self.cache.store.missing(kind, present, version, namespace):
                 self.router.vanished(entry.raw)

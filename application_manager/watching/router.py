@@ -1,6 +1,6 @@
-"""What a piece of news means: it enters the world, and whatever depends on it is asked to be looked at again.
+"""Routes events: each object enters the cache, and the router enqueues what depends on it.
 
-News are watch events, answers to our own writes, and lists; all take the same way, and what is no news ends here.
+Watch events, answers to our own writes, and lists all come through here. An object that is known already ends here.
 """
 
 from __future__ import annotations
@@ -10,6 +10,16 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import (
+    DETECTOR,
+    EVENT_RULE,
+    INSTANCE,
+    LEASE,
+    POD,
+    TASK,
+    TEMPLATE,
+    ClusterCache,
+)
 from application_manager.cluster.apply import Applier
 from application_manager.cluster.client import Object
 from application_manager.cluster.store import Entry, Name, kind_of, name_of
@@ -17,13 +27,12 @@ from application_manager.core.health.readiness import not_ready
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.objects.suspension import pods_left
-from application_manager.knowledge.world import DETECTOR, EVENT_RULE, INSTANCE, LEASE, POD, TASK, TEMPLATE, World
 from application_manager.work.rulework import RuleKey
 from wayside.api import ApplicationInstance
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
 from wayside.leases import holder_of
 
-Ask = Callable[[Name], None]
+Enqueue = Callable[[Name], None]
 
 _RULES = (DETECTOR, EVENT_RULE)
 
@@ -32,20 +41,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Router:
-    """Takes news.
+    """Puts events into the cache and enqueues what they concern.
 
     Attributes:
-        instance, task, template, rule: ask for one of these to be reconciled; `rule` is for Detectors as well.
-        configuration: asks for an instance's configuration to be brought to those that follow it.
+        instance, task, template, rule: enqueue one of these; `rule` takes Detectors as well.
+        configuration: enqueues the configuration of an instance.
     """
 
-    world: World
+    cache: ClusterCache
     applier: Applier
-    instance: Ask
-    task: Ask
-    template: Ask
+    instance: Enqueue
+    task: Enqueue
+    template: Enqueue
     rule: Callable[[RuleKey], None]
-    configuration: Ask
+    configuration: Enqueue
 
     def observe(self, raw: Object) -> None:
         """Take an object as it was read."""
@@ -53,10 +62,10 @@ class Router:
         if kind == LEASE:
             self._lease(name, raw)
             return
-        old = self.world.store.get(kind, name)
-        entry = self.world.store.put(raw)
+        old = self.cache.store.get(kind, name)
+        entry = self.cache.store.put(raw)
         if entry is None:
-            if kind == TASK and name in self.world.store.shed:
+            if kind == TASK and name in self.cache.store.shed:
                 self.task(name)
             return
         if old is not None and old.uid != entry.uid:
@@ -74,19 +83,19 @@ class Router:
             self._child(raw, old, entry)
 
     def vanished(self, raw: Object) -> None:
-        """Take the news that an object is gone."""
+        """An object was deleted."""
         kind, name = kind_of(raw), name_of(raw)
         if kind == LEASE:
             self._lease(name, None)
             return
-        entry = self.world.store.remove(raw)
+        entry = self.cache.store.remove(raw)
         if entry is None:
             return
         if kind == TASK:
-            self._ask_all(self.world.claims.forget(name))
+            self._enqueue_all(self.cache.claims.forget(name))
         elif kind == TEMPLATE:
-            self.world.forget_template(name)
-            self.world.note_limits(name)
+            self.cache.forget_template(name)
+            self.cache.note_limits(name)
             self._claim_again(name)
             self._rules(name[0])
         elif kind == INSTANCE:
@@ -97,71 +106,71 @@ class Router:
         elif kind in _RULES:
             self._rules(name[0])
         elif kind == POD and _is_a_workloads(raw):
-            if self.world.pods.forget(raw):
-                self._ask_for_owner(raw)
+            if self.cache.pods.forget(raw):
+                self._enqueue_owner(raw)
         else:
-            self.world.pods.forget(raw)
+            self.cache.pods.forget(raw)
             self.applier.forget(raw)
-            self._ask_for_owner(raw)
-            self._ask_for_configuration(raw)
+            self._enqueue_owner(raw)
+            self._enqueue_configuration(raw)
 
     def everything(self) -> None:
-        """Ask for all that there is."""
-        for name, _ in self.world.store.all(TEMPLATE):
+        """Enqueue all objects."""
+        for name, _ in self.cache.store.all(TEMPLATE):
             self.template(name)
-        instances = {name for name, _ in self.world.store.all(INSTANCE)}
-        instances |= {name for name, _ in self.world.store.all(TEMPLATE)}  # for their baselines
-        self._ask_all(instances | set(self.world.claims.instances()))
-        for name, _ in self.world.store.all(TASK):
+        instances = {name for name, _ in self.cache.store.all(INSTANCE)}
+        instances |= {name for name, _ in self.cache.store.all(TEMPLATE)}  # for their baselines
+        self._enqueue_all(instances | set(self.cache.claims.instances()))
+        for name, _ in self.cache.store.all(TASK):
             self.task(name)
         for kind in _RULES:
-            for name, _ in self.world.store.all(kind):
+            for name, _ in self.cache.store.all(kind):
                 self.rule((kind, name))
 
     def _task(self, name: Name, entry: Entry) -> None:
         of = entry.raw["spec"].get("template", "")
-        before = self.world.claims.claim(name)
-        touched = self.world.claims.note(name, entry, self.world.template((name[0], of)))
-        after = self.world.claims.claim(name)
+        before = self.cache.claims.claim(name)
+        touched = self.cache.claims.note(name, entry, self.cache.template((name[0], of)))
+        after = self.cache.claims.claim(name)
         # A task whose status alone changed, which is mostly our own doing, concerns no instance.
         same = before is not None and after is not None and before.task.spec == after.task.spec
         if not same or before is None or before.task.metadata.uid != entry.uid:
-            self._ask_all(touched)
+            self._enqueue_all(touched)
         self.task(name)
 
     def claimed(self, name: Name) -> None:
-        """Take the news that it is known what a task claims."""
-        entry = self.world.store.get(TASK, name)
+        """The claim of a task is known now."""
+        entry = self.cache.store.get(TASK, name)
         if entry is None:
             return
         of = (name[0], entry.raw["spec"].get("template", ""))
-        self._ask_all(self.world.claims.note(name, entry, self.world.template(of)))
+        self._enqueue_all(self.cache.claims.note(name, entry, self.cache.template(of)))
         self.task(name)
 
     def settled(self, template: Name) -> None:
-        """Take the news that it is known what all tasks of a template claim."""
-        for name in self.world.instances_of(template):
+        """The claims of all tasks of a template are known now."""
+        for name in self.cache.instances_of(template):
             self.instance(name)
 
     def _template(self, name: Name, old: Entry | None, entry: Entry) -> None:
         status = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
-        self.world.overlap.note(name, status.manager, time.time())
+        self.cache.overlap.note(name, status.manager, time.time())
         self.template(name)
-        self.world.note_limits(name)
+        self.cache.note_limits(name)
         if old is None or old.uid != entry.uid or _written(old)[:2] != _written(entry)[:2]:
             self._claim_again(name)
             self._rules(name[0])
 
     def _claim_again(self, template: Name) -> None:
-        """Ask all tasks of the template anew what they claim, and look at all its instances."""
-        touched = {template, *self.world.instances_of(template)}  # its own name is that of its baseline
-        touched |= self.world.falling_back_to(template)
-        for name in self.world.claims.tasks_of(template):
-            entry = self.world.store.get(TASK, name)
+        """Determine the claims of all tasks of the template again, and enqueue its instances."""
+        touched = {template, *self.cache.instances_of(template)}  # its own name is that of its baseline
+        touched |= self.cache.falling_back_to(template)
+        for name in self.cache.claims.tasks_of(template):
+            entry = self.cache.store.get(TASK, name)
             if entry is not None:
-                touched |= self.world.claims.note(name, entry, self.world.template(template))
+                touched |= self.cache.claims.note(name, entry, self.cache.template(template))
                 self.task(name)
-        self._ask_all(touched)
+        self._enqueue_all(touched)
 
     def _instance(self, name: Name, old: Entry | None, entry: Entry) -> None:
         self._look_at_one(name)
@@ -170,27 +179,27 @@ class Router:
 
     def _child(self, raw: Object, old: Entry | None, entry: Entry) -> None:
         if kind_of(raw) == POD:
-            if self.world.pods.note(raw):
-                self._ask_for_owner(entry.raw)
+            if self.cache.pods.note(raw):
+                self._enqueue_owner(entry.raw)
             if _is_a_workloads(entry.raw):
                 return  # that its pods are ready, a workload says itself
         self.applier.note(entry.raw)
         if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
-            self._ask_for_owner(entry.raw)
+            self._enqueue_owner(entry.raw)
         if old is None or old.raw.get("data") != entry.raw.get("data"):
-            self._ask_for_configuration(entry.raw)
+            self._enqueue_configuration(entry.raw)
 
     def _significance(self, entry: Entry) -> tuple[str, bool, str | None, bool]:
         """What of an object matters to its instance; workloads change their status far more often."""
         raw = entry.raw
         return entry.uid, "deletionTimestamp" in raw["metadata"], not_ready(raw), pods_left(raw) > 0
 
-    def _ask_for_owner(self, raw: Object) -> None:
+    def _enqueue_owner(self, raw: Object) -> None:
         owner = _instance_of(raw)
         if owner is not None:
             self.instance(owner)
 
-    def _ask_for_configuration(self, raw: Object) -> None:
+    def _enqueue_configuration(self, raw: Object) -> None:
         owner = _instance_of(raw)
         if kind_of(raw) == CONFIG_MAP and owner is not None and name_of(raw)[1] == config_map_name(owner[1]):
             self.configuration(owner)
@@ -200,14 +209,14 @@ class Router:
         if holder is None:
             return
         key = (name[0], holder)
-        at = self.world.healthy.elapsed
-        first, before = not self.world.leases.seen(key), self.world.leases.view(key, at)
-        renewed = self.world.leases.observe(key, raw, at)
+        at = self.cache.healthy.elapsed
+        first, before = not self.cache.leases.seen(key), self.cache.leases.view(key, at)
+        renewed = self.cache.leases.observe(key, raw, at)
         returns = renewed and (not before.renewed or before.unchanged >= before.duration)
         if returns:
             log.info("holder %s/%s renews its Lease", *key)
         if first or returns:  # only now is it known how long it lasts
-            self._ask_all(self.world.claims.holders().get(key, ()))
+            self._enqueue_all(self.cache.claims.holders().get(key, ()))
 
     def _rules(self, namespace: str) -> None:
         """Rules and detectors of a namespace are judged together: either may be what is wrong with the other.
@@ -215,20 +224,20 @@ class Router:
         And what rules say of templates, these may have changed.
         """
         for kind in _RULES:
-            for name, _ in self.world.store.all(kind):
+            for name, _ in self.cache.store.all(kind):
                 if name[0] == namespace:
                     self.rule((kind, name))
 
     def look_at(self, name: Name) -> None:
-        """Ask for an instance, or for all of a template where the name stands for these."""
-        for each in self.world.meant(name):
+        """Enqueue an instance, or all of a template where the name stands for these."""
+        for each in self.cache.meant(name):
             self._look_at_one(each)
 
     def _look_at_one(self, instance: Name) -> None:
-        self.world.places.touch(instance)
+        self.cache.places.touch(instance)
         self.instance(instance)
 
-    def _ask_all(self, instances: Iterable[Name]) -> None:
+    def _enqueue_all(self, instances: Iterable[Name]) -> None:
         for name in instances:
             self.look_at(name)
 

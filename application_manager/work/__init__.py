@@ -1,1 +1,1 @@
-"""What is done when something changed: a queue of keys for each kind, and the reconciling of one key."""
+"""Reconciling: a queue of keys for each kind, and the work on one key."""

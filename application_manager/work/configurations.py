@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.apply import Applier, controller_uid
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Name
 from application_manager.core.objects import following
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
-from application_manager.knowledge.world import World
 from application_manager.work.publishing import Publisher
 from wayside.api import ApplicationInstance
 
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 class ConfigurationWork:
     """Brings configurations out."""
 
-    world: World
+    cache: ClusterCache
     client: Client
     applier: Applier
     publisher: Publisher
@@ -37,7 +37,7 @@ class ConfigurationWork:
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
-        instance = self.world.instance(name)
+        instance = self.cache.instance(name)
         live = self.applier.live(name[0], (*CONFIG_MAP, config_map_name(name[1])))
         if instance is None or live is None or controller_uid(live) != instance.metadata.uid:
             self.publisher.withdraw(name)
@@ -71,7 +71,7 @@ class ConfigurationWork:
         return told
 
     def _workloads(self, name: Name, instance: ApplicationInstance) -> list[Object]:
-        record = self.world.records.get(name)
+        record = self.cache.records.get(name)
         if record is not None and record.uid == instance.metadata.uid:
             objects = list(record.applied.objects)
         else:

@@ -12,6 +12,8 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
+from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
+from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cluster.apply import controller_uid, our_fields
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Name
@@ -22,8 +24,6 @@ from application_manager.core.objects.detectors import KINDS, Manifest, detector
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import has_sidecar
 from application_manager.core.statuses.running import NOT_ACCEPTED, NOT_RUN, RUNNING, carried, running
-from application_manager.knowledge.detectorbook import DetectorBook
-from application_manager.knowledge.world import DETECTOR, World
 from application_manager.work.sidecars import SidecarNews
 from wayside.api import Detector
 from wayside.api.pod import DetectorMode
@@ -42,9 +42,9 @@ class DetectorWork:
         sidecars: tells of pods that were to have a detector and have none.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
-    book: DetectorBook
+    book: DetectorIndex
     judge: Callable[[Name], None]
     sidecars: SidecarNews
     _applied: dict[str, tuple[str, str]] = field(default_factory=dict)  # uid → what was applied, and our fields since
@@ -54,7 +54,7 @@ class DetectorWork:
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
-        entry = self.world.store.get(DETECTOR, name)
+        entry = self.cache.store.get(DETECTOR, name)
         self.sidecars.tell(name)
         if entry is None:
             self.book.said.pop(name, None)

@@ -1,7 +1,7 @@
 """Reconciling one instance: decide, apply the instance, apply its objects. All the way in one go.
 
 Nothing here waits for our own watch events: each answer of the API server enters the store, and the next step goes on
-from it. What fails is tried again as a whole, from what is known then. How it went is noted in the world's record of
+from it. What fails is tried again as a whole, from what is known then. How it went is noted in the cache's record of
 the instance, and said afterwards (`instancestatus`).
 """
 
@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+from application_manager.cache.cluster_cache import ClusterCache, Record
 from application_manager.cluster.apply import Applied, Applier, Known, ObjectKey, references
 from application_manager.cluster.attempts import Attempts
 from application_manager.cluster.client import ApiError, Client, Object, Resource
@@ -24,7 +25,6 @@ from application_manager.core.demand.decisions import Decision
 from application_manager.core.health.refusals import reason_of, with_remedy
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.rendering import Rendering, object_key
-from application_manager.knowledge.world import Record, World
 from application_manager.work.recorder import Reason, Recorder
 from application_manager.work.suspending import Suspending
 from wayside.api import ApplicationInstance
@@ -52,7 +52,7 @@ class InstanceWork:
         not_made: told why an instance cannot be made that should be.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     applier: Applier
     recorder: Recorder
@@ -89,11 +89,11 @@ class InstanceWork:
             return
         # Decided only now: while the tasks were listed, the instance itself may have gone. From here to the first
         # request nothing is waited for, so what was decided and what there is belong together.
-        instance, decision = self.world.instance(name), self.world.decide(name, time.time())
+        instance, decision = self.cache.instance(name), self.cache.decide(name, time.time())
         if decision is not None and decision.next_change is not None:
             self.again(name, decision.next_change)
         if decision is None or (instance is None and not decision.wanted):
-            self.world.records.pop(name, None)
+            self.cache.records.pop(name, None)
             self.attempts.forget(name)
             self.absent(name, decision)
             return
@@ -110,7 +110,7 @@ class InstanceWork:
             self.not_made(name, decision, f"instance {name[1]} is not made: {decision.too_large}")
             return
         wanted = drafting.draft(name, decision, existing)
-        template = self.world.template((name[0], wanted.spec.template))
+        template = self.cache.template((name[0], wanted.spec.template))
         rendering = self.objects(wanted, template)
         if rendering is None:
             return
@@ -120,7 +120,7 @@ class InstanceWork:
             # Both at once: what to look for is known before the instance has a uid.
             to_look = rendering.manifests if existing is None and isinstance(rendering, Rendering) else ()
             if existing is None:
-                self.world.places.being_made.add(name)  # it takes its place from here on
+                self.cache.places.being_made.add(name)  # it takes its place from here on
             try:
                 raw, looked = await asyncio.gather(
                     self.client.apply(self.instances, manifest), self.applier.look(name[0], to_look)
@@ -131,8 +131,8 @@ class InstanceWork:
                     self.not_made(name, decision, f"instance {name[1]} cannot be made: {why}")
                 raise
             self.observe(raw)
-            self.world.places.being_made.discard(name)
-        instance = self.world.instance(name)
+            self.cache.places.being_made.discard(name)
+        instance = self.cache.instance(name)
         if instance is None or instance.metadata.deletion_timestamp is not None:
             return  # deleted by somebody meanwhile: its event brings us back
         known = self._known(name, instance)
@@ -144,7 +144,7 @@ class InstanceWork:
             )
             return
         await self.suspending.settle(instance, rendering)
-        instance = self.world.instance(name) or instance
+        instance = self.cache.instance(name) or instance
         pending = self.applier.pending(instance, rendering, known)
         was_applied = self._was_applied(name, instance)
         if not pending and was_applied is not None:
@@ -152,7 +152,7 @@ class InstanceWork:
             return
         trying = (instance.metadata.uid, rendering.digest)
         until = self.attempts.waits_until(name, trying, time.time())
-        if until is not None and (record := self.world.records.get(name)) is not None:
+        if until is not None and (record := self.cache.records.get(name)) is not None:
             self.again(name, until)
             self._note(name, instance, decision, record.applied, record.digest)
             return
@@ -182,12 +182,12 @@ class InstanceWork:
 
     async def _know_whether_it_was_made(self, name: Name) -> None:
         """Look for the instance where an attempt to make it failed, and so may have made it or not."""
-        if name in self.world.places.being_made:
+        if name in self.cache.places.being_made:
             raw = await self.client.get(self.instances, name[0], name[1])
             if raw is not None:
                 self.observe(raw)
-            self.world.places.being_made.discard(name)
-            self.world.places.touch(name)
+            self.cache.places.being_made.discard(name)
+            self.cache.places.touch(name)
 
     def _leave(self, name: Name, decision: Decision, instance: ApplicationInstance) -> None:
         """Note that the instance stays as it is, by a person's wish."""
@@ -203,7 +203,7 @@ class InstanceWork:
 
     def _known(self, name: Name, instance: ApplicationInstance) -> Known:
         """What was applied so far: our own record where it is newer than the status."""
-        record = self.world.records.get(name)
+        record = self.cache.records.get(name)
         if record is not None and record.uid == instance.metadata.uid:
             return Known.read(record.digest, record.applied.objects)
         status = instance.status
@@ -211,7 +211,7 @@ class InstanceWork:
 
     def _was_applied(self, name: Name, instance: ApplicationInstance) -> Aspect | None:
         """The condition Applied, where it is True."""
-        record = self.world.records.get(name)
+        record = self.cache.records.get(name)
         if record is not None and record.uid == instance.metadata.uid:
             return record.applied.aspect if record.applied.aspect.holds else None
         kept = find(instance.status.conditions, "Applied") if instance.status else None
@@ -232,14 +232,14 @@ class InstanceWork:
     ) -> None:
         if decision.too_large and applied.aspect.holds:  # what it has is applied, and not what is demanded
             applied = replace(applied, aspect=Aspect("Applied", False, TOO_LARGE, decision.too_large))
-        uid, before = instance.metadata.uid, self.world.records.get(name)
+        uid, before = instance.metadata.uid, self.cache.records.get(name)
         since = before.since if before is not None and before.uid == uid else time.time()
-        self.world.records[name] = Record(uid, decision, applied, digest, since)
+        self.cache.records[name] = Record(uid, decision, applied, digest, since)
         self.done(name)
 
     async def _released(self, name: Name) -> bool:
         """Delete the instance if its linger is over and a fresh look at the tasks agrees; whether it was deleted."""
-        instance = self.world.instance(name)
+        instance = self.cache.instance(name)
         if instance is None or instance.metadata.deletion_timestamp is not None or self._over(name) is None:
             return False
         # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
@@ -250,7 +250,7 @@ class InstanceWork:
         over = self._over(name)
         if over is None:
             return False
-        if self.world.claims.pending((name[0], instance.spec.template)):
+        if self.cache.claims.pending((name[0], instance.spec.template)):
             self.again(name, time.time() + _LOOK_AGAIN)  # one of the tasks that were listed may demand it
             return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)
@@ -260,13 +260,13 @@ class InstanceWork:
         return True
 
     def _is_unsettled(self, name: Name) -> bool:
-        instance = self.world.instance(name)
-        return instance is not None and self.world.claims.unsettled((name[0], instance.spec.template))
+        instance = self.cache.instance(name)
+        return instance is not None and self.cache.claims.unsettled((name[0], instance.spec.template))
 
     def _over(self, name: Name) -> Decision | None:
         """The decision, where it is that the instance goes now: its linger is over, or another has its place."""
         now = time.time()
-        decision = self.world.decide(name, now)
+        decision = self.cache.decide(name, now)
         if decision is None or decision.release_time is None or decision.release_time > now:
             return None
         return decision

@@ -1,6 +1,6 @@
 """Saying how an instance is, after the work: its status, its Events, and the news for its tasks.
 
-Apart from the work itself, so that words never hold up what runs. Until a status is written, the world's record of the
+Apart from the work itself, so that words never hold up what runs. Until a status is written, the cache's record of the
 instance stands for it; should we die before, the work is done again, and finds that nothing is left to do.
 """
 
@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import ClusterCache, Record, Served
 from application_manager.cluster.apply import Applied, Applier, ObjectKey
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.failedpods import FailedPodsLook
@@ -25,7 +26,6 @@ from application_manager.core.health.pods import Trouble, summary
 from application_manager.core.health.readiness import is_unseen, not_ready
 from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
 from application_manager.core.statuses.status import Service, difference, instance_status, suspension_aspect
-from application_manager.knowledge.world import Record, Served, World
 from application_manager.work.recorder import Reason, Recorder
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus
@@ -50,7 +50,7 @@ class InstanceStatusWork:
         again: asks for an instance at a time, in seconds since 1970.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     applier: Applier
     recorder: Recorder
@@ -66,11 +66,11 @@ class InstanceStatusWork:
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
-        instance, record = self.world.instance(name), self.world.records.get(name)
+        instance, record = self.cache.instance(name), self.cache.records.get(name)
         if instance is None or record is None or record.uid != instance.metadata.uid:
             return
         looked_up = await self._looked_up(instance, record.applied)
-        instance, record = self.world.instance(name), self.world.records.get(name)
+        instance, record = self.cache.instance(name), self.cache.records.get(name)
         if instance is None or record is None or record.uid != instance.metadata.uid:
             return
         now = time.time()
@@ -129,7 +129,7 @@ class InstanceStatusWork:
 
     def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:
         """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
-        old = self.world.served.pop(name, None)
+        old = self.cache.served.pop(name, None)
         verdicts = decision.verdicts if decision is not None else {}
         for task in old.verdicts.keys() - verdicts.keys() if old is not None else ():
             self.task_changed((name[0], task))  # one that means all instances may have others yet
@@ -137,7 +137,7 @@ class InstanceStatusWork:
             return
         given = service or Service(name[1], applied=False, ready=False)
         served = Served(decision.verdicts, given, decision.fallback)
-        self.world.served[name] = served
+        self.cache.served[name] = served
         all_changed = old is None or old.service != served.service or old.fallback != served.fallback
         for task, verdict in decision.verdicts.items():
             if all_changed or old is None or old.verdicts.get(task) != verdict:
@@ -148,7 +148,7 @@ class InstanceStatusWork:
     ) -> list[Trouble]:
         """Those of its pods, and why pods cannot be made or fit no node."""
         refused = [found for each in objects.values() if each is not None and (found := refused_pods(each)) is not None]
-        return summary([*self.world.pods.troubles(name), *refused, *looked_up])
+        return summary([*self.cache.pods.troubles(name), *refused, *looked_up])
 
     async def _looked_up(self, instance: ApplicationInstance, applied: Applied) -> list[Trouble]:
         """The troubles of what is not ready that no watch tells: no node is as required, pods are refused."""

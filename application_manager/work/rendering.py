@@ -12,12 +12,12 @@ from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.store import Name
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
 from application_manager.core.objects.charts import ChartFailure, ChartOutcome, ChartRequest, Charts
 from application_manager.core.objects.rendering import Rendering
-from application_manager.knowledge.world import World
 from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.jobs import Problem, RenderJob
 from application_manager.workers.plain import objects_are_plain, values_are_small
@@ -32,7 +32,7 @@ class Renderings:
 
     def __init__(
         self,
-        world: World,
+        cache: ClusterCache,
         answers: AnswerCache,
         charts: Charts,
         again: Callable[[Name, float], None],
@@ -41,13 +41,13 @@ class Renderings:
         """Make it.
 
         Args:
-            world: the policy, and what exceeded.
+            cache: the policy, and what exceeded.
             answers: has the renderings worked out.
             charts: knows what became of a chart.
             again: asks for an instance at a time, in seconds since 1970.
             template_changed: asks for a template whose renderings exceed the limit, or do so no more.
         """
-        self._world = world
+        self._cache = cache
         self._answers = answers
         self._charts = charts
         self._again = again
@@ -83,7 +83,7 @@ class Renderings:
         """Drop what is known of an instance that is gone."""
         for kind in ("rendering", "chart"):
             self._answers.forget((kind, *name))
-        for template in [each for each, instances in self._world.exceeded.items() if name in instances]:
+        for template in [each for each, instances in self._cache.exceeded.items() if name in instances]:
             self._note(name, template, Problem("", ""))
 
     def _answer(
@@ -94,7 +94,7 @@ class Renderings:
         bare = wanted.model_copy(update={"status": None})
 
         def job() -> RenderJob:
-            return RenderJob(metadata.uid, metadata.generation, self._bytes(template), self._world.policy, bare, chart)
+            return RenderJob(metadata.uid, metadata.generation, self._bytes(template), self._cache.policy, bare, chart)
 
         if self._is_plain(template) and values_are_small(bare):
             return job().run()
@@ -132,7 +132,7 @@ class Renderings:
         """Note whether the instance's rendering exceeds the limit; nothing while it is being worked out."""
         if found is None:
             return
-        known = self._world.exceeded.get(template, {})
+        known = self._cache.exceeded.get(template, {})
         before = known.get(name)
         after = found.message if isinstance(found, Exceeded) else None
         if before == after:
@@ -140,7 +140,7 @@ class Renderings:
         if after is None:
             del known[name]
             if not known:
-                del self._world.exceeded[template]
+                del self._cache.exceeded[template]
         else:
-            self._world.exceeded.setdefault(template, {})[name] = after
+            self._cache.exceeded.setdefault(template, {})[name] = after
         self._template_changed(template)

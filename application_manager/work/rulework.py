@@ -6,14 +6,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache
+from application_manager.cache.detector_index import DetectorIndex
+from application_manager.cache.surroundings import surroundings
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Entry, Name
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.statuses.rulestatus import DETECTOR_INVALID, RULE_INVALID, unreadable_status
 from application_manager.core.statuses.status import difference
-from application_manager.knowledge.detectorbook import DetectorBook
-from application_manager.knowledge.surroundings import surroundings
-from application_manager.knowledge.world import EVENT_RULE, World
 from application_manager.work.recorder import Recorder
 from application_manager.workers.jobs import DetectorStatusJob, RuleJob, RuleStatusJob
 from application_manager.workers.pool import ExceededError, Runs
@@ -39,13 +39,13 @@ class RuleWork:
         detectors: what is known of those that the manager runs.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     recorder: Recorder
     resources: dict[KindKey, Resource]
     observe: Callable[[Object], None]
     pool: Runs
-    detectors: DetectorBook = field(default_factory=DetectorBook)
+    detectors: DetectorIndex = field(default_factory=DetectorIndex)
 
     async def reconcile(self, key: RuleKey) -> None:
         """Write the status of the rule or detector if it is news.
@@ -53,7 +53,7 @@ class RuleWork:
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
         kind, name = key
-        entry = self.world.store.get(kind, name)
+        entry = self.cache.store.get(kind, name)
         if entry is None:
             return
         now = time.time()
@@ -82,7 +82,7 @@ class RuleWork:
             old, judged = EventRuleStatus.model_validate(written), entry.model
             if not isinstance(judged, EventRule):
                 return old, unreadable_status(old, RULE_INVALID, entry.problem, generation, now)
-            job = RuleStatusJob(RuleJob(judged, surroundings(self.world, judged)), now)
+            job = RuleStatusJob(RuleJob(judged, surroundings(self.cache, judged)), now)
             try:
                 return old, await self.pool.run(namespace, job)
             except ExceededError as error:
@@ -90,7 +90,7 @@ class RuleWork:
         old, judged = DetectorStatus.model_validate(written), entry.model
         if not isinstance(judged, Detector):
             return old, unreadable_status(old, DETECTOR_INVALID, entry.problem, generation, now)
-        rules, running = self.world.models(EVENT_RULE, EventRule, namespace), self.detectors.said.get(name)
+        rules, running = self.cache.models(EVENT_RULE, EventRule, namespace), self.detectors.said.get(name)
         try:
             return old, await self.pool.run(namespace, DetectorStatusJob(judged, rules, now, running))
         except ExceededError as error:

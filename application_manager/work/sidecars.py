@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
+from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cluster.store import Name
 from application_manager.core.findings.injections import injection
 from application_manager.core.objects.sidecars import has_sidecar
-from application_manager.knowledge.detectorbook import DetectorBook
-from application_manager.knowledge.world import DETECTOR, World
 from application_manager.work.recorder import Reason, Recorder
 from wayside.api import Detector
 from wayside.api.base import Kind, Metadata
@@ -37,14 +37,14 @@ class _Told:
 class SidecarNews:
     """Tells it, once a pod and cause."""
 
-    world: World
-    book: DetectorBook
+    cache: ClusterCache
+    book: DetectorIndex
     recorder: Recorder
     _told: dict[Name, dict[str, _Told]] = field(default_factory=dict)  # by Detector, then the pod's uid
 
     def tell(self, name: Name) -> None:
         """Tell of the pods that ask for the Detector of this namespace and name."""
-        entry = self.world.store.get(DETECTOR, name)
+        entry = self.cache.store.get(DETECTOR, name)
         detector = entry.model if entry is not None and isinstance(entry.model, Detector) else None
         version = entry.version if entry is not None else 0
         before, told, now = self._told.pop(name, {}), dict[str, _Told](), time.time()

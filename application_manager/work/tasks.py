@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
@@ -16,7 +17,6 @@ from application_manager.core.demand.demand import finished
 from application_manager.core.demand.fallback import FALLEN_BACK, turned
 from application_manager.core.objects import trimming
 from application_manager.core.statuses.status import Service, difference, finished_since, task_status, together
-from application_manager.knowledge.world import World
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces
 from application_manager.work.recorder import Recorder
@@ -50,7 +50,7 @@ class TaskWork:
         traces: told likewise, where traces are on.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     recorder: Recorder
     tasks: Resource
@@ -66,10 +66,10 @@ class TaskWork:
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
-        if name in self.world.store.shed:
+        if name in self.cache.store.shed:
             await self._tell_shed(name)
             return
-        task = self.world.task(name)
+        task = self.cache.task(name)
         known = self._verdict(name)
         if task is None or known is None or task.metadata.deletion_timestamp is not None:
             return
@@ -132,17 +132,17 @@ class TaskWork:
 
     def _verdict(self, name: Name) -> tuple[Verdict, Service | None] | None:
         """What became of the task; None where its instance was not looked at yet."""
-        verdict = self.world.claims.verdict(name)
+        verdict = self.cache.claims.verdict(name)
         if verdict is not None:
             return verdict, None
-        claimed = self.world.claims.claim(name)
+        claimed = self.cache.claims.claim(name)
         if claimed is not None and (template := template_of_all(claimed.instance)) is not None:
             return self._of_all(name, claimed, (name[0], template))
-        served = self.world.served.get((name[0], claimed.instance)) if claimed is not None else None
+        served = self.cache.served.get((name[0], claimed.instance)) if claimed is not None else None
         if served is None or name[1] not in served.verdicts:
             return None
         instead = served.fallback.instance_of(name[1]) if served.fallback is not None else None
-        other = self.world.served.get((name[0], instead)) if instead is not None else None
+        other = self.cache.served.get((name[0], instead)) if instead is not None else None
         others = other.verdicts if other is not None else {}
         verdict = turned(served.verdicts[name[1]], name[1], served.fallback, others)
         serves = other if other is not None and verdict.reason == FALLEN_BACK else served
@@ -150,13 +150,13 @@ class TaskWork:
 
     def _of_all(self, name: Name, claimed: Claim, template: Name) -> tuple[Verdict, Service | None] | None:
         """What became of a task that means all instances of a template, from what was said of it by each."""
-        alone = self.world.served.get((name[0], claimed.instance))
+        alone = self.cache.served.get((name[0], claimed.instance))
         if alone is None or name[1] not in alone.verdicts:
             return None
         each = {
             instance[1]: served
-            for instance in self.world.meant((name[0], claimed.instance))
-            if (served := self.world.served.get(instance)) is not None and served is not alone
+            for instance in self.cache.meant((name[0], claimed.instance))
+            if (served := self.cache.served.get(instance)) is not None and served is not alone
         }
         parts = {instance: served.verdicts[name[1]] for instance, served in each.items() if name[1] in served.verdicts}
         verdict = gathered(claimed, parts, alone.verdicts[name[1]])
@@ -164,7 +164,7 @@ class TaskWork:
         return verdict, together(serving) if serving else None
 
     async def _expire(self, name: Name) -> None:
-        task = self.world.task(name)
+        task = self.cache.task(name)
         since = finished_since(task) if task is not None else None
         if task is None or since is None:
             return

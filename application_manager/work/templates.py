@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from application_manager.cache.cluster_cache import TEMPLATE, ClusterCache
+from application_manager.cache.overlap_index import Turn
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
 from application_manager.core.statuses.status import difference, template_status
-from application_manager.knowledge.overlapbook import Turn
-from application_manager.knowledge.world import TEMPLATE, World
 from application_manager.work.recorder import Reason, Recorder
 from application_manager.workers.jobs import TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
@@ -31,7 +31,7 @@ class TemplateWork:
         again: asks for a template at a time, in seconds since 1970.
     """
 
-    world: World
+    cache: ClusterCache
     client: Client
     recorder: Recorder
     templates: Resource
@@ -44,21 +44,21 @@ class TemplateWork:
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
-        entry = self.world.store.get(TEMPLATE, name)
+        entry = self.cache.store.get(TEMPLATE, name)
         if entry is None:
             return
         metadata = Metadata.model_validate(entry.raw["metadata"])
         now = time.time()
         old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
-        own = self.world.overlap.own()
-        turn, when = self.world.overlap.turn(name, now)
+        own = self.cache.overlap.own()
+        turn, when = self.cache.overlap.turn(name, now)
         if turn is not Turn.ACT:
             self.again(name, when)
             if turn is Turn.CHALLENGE and own is not None:
                 await self._challenge(name, metadata, own, now)
             return
         findings = await self._findings(name)
-        new = template_status(old, metadata.generation, findings, len(self.world.instances_of(name)), now, own)
+        new = template_status(old, metadata.generation, findings, len(self.cache.instances_of(name)), now, own)
         patch = difference(old.to_json() if entry.raw.get("status") else {}, new.to_json())
         if not patch:
             return
@@ -68,7 +68,7 @@ class TemplateWork:
 
     async def _challenge(self, name: Name, metadata: Metadata, own: TemplateManager, now: float) -> None:
         """See by the template's status whether the manager is alive that looks after the namespace as well."""
-        about, other = Kind(kind=self.templates.kind, metadata=metadata), self.world.overlap.waits_for(name[0])
+        about, other = Kind(kind=self.templates.kind, metadata=metadata), self.cache.overlap.waits_for(name[0])
         note = f"the managers of the Leases {other} and {own.lease} look after this namespace: the second one waits"
         self.recorder.say(about, Reason.MANAGERS_OVERLAP, note, now, once=True)
         await self._write(name, metadata, {"manager": own.to_json()})
@@ -84,19 +84,19 @@ class TemplateWork:
         return True
 
     async def _findings(self, name: Name) -> Findings:
-        template = self.world.template(name)
+        template = self.cache.template(name)
         if isinstance(template, InvalidTemplate):
             return Findings((template.problem,))
         if template is None:
             return Findings()
-        found = self.world.known_findings(template)
+        found = self.cache.known_findings(template)
         if found is None:
             try:
-                found = await self.pool.run(name[0], TemplateJob(template, self.world.policy))
+                found = await self.pool.run(name[0], TemplateJob(template, self.cache.policy))
             except ExceededError as error:
                 found = Findings((f"spec: to render the template {error}",))
-            self.world.note_findings(template, found)
-        exceeded = self.world.exceeded.get(name)
+            self.cache.note_findings(template, found)
+        exceeded = self.cache.exceeded.get(name)
         if exceeded:
             instance, why = min(exceeded.items())
             return replace(found, problems=(*found.problems, f"spec: to render instance {instance[1]} {why}"))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.apply import Applier
 from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.connection import load_configuration
@@ -17,7 +18,6 @@ from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import Policy
-from application_manager.knowledge.world import World
 from application_manager.watching.router import Router
 from application_manager.work.instances import InstanceWork
 from application_manager.work.recorder import Recorder
@@ -37,13 +37,13 @@ def ignore(*_: object) -> None:
     """Stands for the queues, which do not run here."""
 
 
-def work_on(world: World, client: Client) -> tuple[Router, InstanceWork]:
+def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
     resources = {("apps/v1", "Deployment"): Resource("apps/v1", "Deployment", "deployments")}
-    applier = Applier(client, world.store, resources)
-    router = Router(world, applier, ignore, ignore, ignore, ignore, ignore)
+    applier = Applier(client, cache.store, resources)
+    router = Router(cache, applier, ignore, ignore, ignore, ignore, ignore)
     absent: Callable[[Name, Decision | None], None] = ignore
     work = InstanceWork(
-        world=world,
+        cache=cache,
         client=client,
         applier=applier,
         recorder=Recorder(client),
@@ -66,7 +66,7 @@ def reconcile(api: Api, known: list[Object]) -> None:
     async def run() -> None:
         client = Client(await load_configuration())
         try:
-            router, work = work_on(World(Policy()), client)
+            router, work = work_on(ClusterCache(Policy()), client)
             for raw in known:
                 router.observe(raw)
             await work.reconcile((api.namespace, NORTH))

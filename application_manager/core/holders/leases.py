@@ -74,7 +74,7 @@ class _Observation:
 
 
 @dataclass(slots=True)
-class LeaseBook:
+class LeaseIndex:
     """What was observed of all Leases; times are healthy seconds (see `HealthyTime.elapsed`)."""
 
     _observed: dict[HolderKey, _Observation] = field(default_factory=dict)

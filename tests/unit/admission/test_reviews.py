@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from kubernetes.aio.client import Configuration
 
 from application_manager.admission.admission import Admission
+from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
 from application_manager.cluster.client import ApiError, Client, Resource
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import LONGEST, MOST_TOLD, ReviewError, answer, read
 from application_manager.core.findings.webhooks import Place, webhook_configuration
 from application_manager.core.objects.policy import Policy
-from application_manager.knowledge.world import DETECTOR, EVENT_RULE, TEMPLATE, World
 from application_manager.measures import Measures
 from tests.inprocess import InProcess
 from tests.unit.manager_objects import template
@@ -170,14 +170,14 @@ def reviewed(
     """What is answered where the manager knows some objects, and the API server has others."""
 
     async def ask() -> dict[str, Any]:
-        world = World(Policy())
+        cache = ClusterCache(Policy())
         for each in known:
-            world.store.put(raw(each, 1))
+            cache.store.put(raw(each, 1))
         resources = {
             kind: Resource(API_VERSION, kind[1], f"{kind[1].lower()}s") for kind in (DETECTOR, EVENT_RULE, TEMPLATE)
         }
         client = Cluster(*live)
-        admission = Admission(world, client, resources, world.store.put, Measures(), InProcess(), namespaces)
+        admission = Admission(cache, client, resources, cache.store.put, Measures(), InProcess(), namespaces)
         asked = question("CREATE" if old is None else "UPDATE", new.to_json(), old and old.to_json(), new.kind)
         try:
             return await admission.review(asked)

@@ -13,8 +13,8 @@ import msgspec
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.objects.policy import Policy
-from application_manager.knowledge.world import World
 from application_manager.measures import Measures
 from application_manager.observability.overview import Overview
 from charts.generate import FILES
@@ -44,7 +44,7 @@ def expressions() -> list[str]:
 def exported() -> set[str]:
     """The names of all samples of both programs."""
     measures = Measures()
-    measures.registry.register(Overview(World(Policy()), lambda: [("task", 0, 0)]))
+    measures.registry.register(Overview(ClusterCache(Policy()), lambda: [("task", 0, 0)]))
     taken = Kept(Drive(a_detector(), FAST)).take(arrival(0.5, "car", {"v": 20}), until=1)
     status = msgspec.structs.replace(taken, certificate=CertificateStatus(expires=1.0))
     texts = measures.text().decode(), Metrics(lambda: status).text().decode()

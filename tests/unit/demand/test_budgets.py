@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from application_manager.cache.budget_index import BudgetIndex
 from application_manager.core.claims.operations import Standing
 from application_manager.core.holders.policies import HolderPolicy, TaskPolicy
-from application_manager.knowledge.budgetbook import BudgetBook
 from tests.unit.manager_objects import task
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import Requester
@@ -45,7 +45,7 @@ def expected(live: set[str]) -> set[str]:
 
 @given(st.lists(st.tuples(st.sampled_from(("enter", "leave")), st.sampled_from(NAMES)), max_size=40))
 def test_the_oldest_are_within_and_every_change_is_reported(steps: list[Step]) -> None:
-    book = BudgetBook(POLICY)
+    book = BudgetIndex(POLICY)
     live: set[str] = set()
     for step, name in steps:
         before = expected(live)
@@ -63,7 +63,7 @@ def test_the_oldest_are_within_and_every_change_is_reported(steps: list[Step]) -
 
 
 def test_one_beyond_them_waits_and_says_for_what() -> None:
-    book = BudgetBook(POLICY)
+    book = BudgetIndex(POLICY)
     for name in ("t2", "t1", "t0"):
         book.enter(made(name))
     verdict = book.verdict((made("t0").namespace, "t0"))

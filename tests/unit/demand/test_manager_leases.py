@@ -8,16 +8,16 @@ from typing import Any
 
 from kubernetes.aio.client import Configuration
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import LEASES, ApiError, Client, Resource
 from application_manager.cluster.store import Entry
 from application_manager.core.holders.leases import (
     RAREST_LOOK,
     HealthyTime,
-    LeaseBook,
+    LeaseIndex,
     LeaseView,
 )
 from application_manager.core.objects.policy import Policy
-from application_manager.knowledge.world import World
 from application_manager.watching.leasewatch import LeaseWatch
 from tests.unit.manager_objects import task, template
 from wayside.leases import DEFAULT_DURATION, lease_name
@@ -33,7 +33,7 @@ def lease(renewed: str, duration: int = 3, **metadata: Any) -> dict[str, Any]:
 
 
 def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     assert book.observe(KEY, lease("2020-01-01T00:00:00Z"), 10.0) is False
     book.observe(KEY, lease("2020-01-01T00:00:00Z"), 12.0)
     assert book.view(KEY, 12.0) == LeaseView(2.0, 3.0, renewed=False)
@@ -43,7 +43,7 @@ def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
 
 
 def test_time_in_which_nobody_looked_says_nothing() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     book.observe(KEY, lease("a"), 0.0)
     assert book.view(KEY, 100.0).unchanged == 0.0
     assert not book.due(KEY, 2.9)
@@ -51,7 +51,7 @@ def test_time_in_which_nobody_looked_says_nothing() -> None:
 
 
 def test_the_longer_a_lease_is_overdue_the_rarer_it_is_looked_at() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     book.observe(KEY, lease("a"), 0.0)
     looks = []
     for at in range(3, 200):
@@ -66,14 +66,14 @@ def test_the_longer_a_lease_is_overdue_the_rarer_it_is_looked_at() -> None:
 
 
 def test_seeing_the_same_again_is_no_renewal() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     book.observe(KEY, lease("a"), 0.0)
     assert book.observe(KEY, lease("a", resourceVersion="9", labels={"x": "y"}), 6.0) is False
     assert book.view(KEY, 6.0).unchanged == 6.0
 
 
 def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     book.observe(KEY, lease("a"), 0.0)
     assert book.observe(KEY, None, 4.0) is False
     book.observe(KEY, None, 5.0)
@@ -83,7 +83,7 @@ def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
 
 
 def test_the_first_look_at_a_lease_is_no_sign_of_life_though_somebody_asked_before() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     assert book.view(KEY, 1.0).unchanged == 0.0
     assert not book.seen(KEY)
     assert book.due(KEY, 1.0)
@@ -94,7 +94,7 @@ def test_the_first_look_at_a_lease_is_no_sign_of_life_though_somebody_asked_befo
 
 
 def test_a_lease_that_was_looked_for_and_appears_is_a_sign_of_life() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     book.view(KEY, 1.0)
     book.observe(KEY, None, 2.0)
     assert book.observe(KEY, lease("a"), 3.0) is True
@@ -102,14 +102,14 @@ def test_a_lease_that_was_looked_for_and_appears_is_a_sign_of_life() -> None:
 
 
 def test_a_holder_without_a_lease_counts_from_when_we_first_heard_of_it() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     assert book.view(KEY, 7.0) == LeaseView(0.0, DEFAULT_DURATION, renewed=False)
     book.observe(KEY, None, 9.0)
     assert book.view(KEY, 9.0).unchanged == 2.0
 
 
 def test_what_concerns_nobody_is_forgotten() -> None:
-    book = LeaseBook()
+    book = LeaseIndex()
     book.observe(KEY, lease("a"), 0.0)
     book.forget_except([])
     assert book.view(KEY, 8.0).unchanged == 0.0
@@ -139,18 +139,18 @@ class _OneUnreadable(Client):
 
 
 def test_a_lease_that_cannot_be_read_does_not_keep_the_others_from_being_read() -> None:
-    world = World(Policy())
+    cache = ClusterCache(Policy())
     holders = ("a", "bad", "c")
     for holder in holders:
         wanted = task(holder, of=holder, holder=holder)
-        world.claims.note(("site", holder), Entry(wanted.to_json(), wanted), template(holder))
+        cache.claims.note(("site", holder), Entry(wanted.to_json(), wanted), template(holder))
     asked: list[tuple[str, str]] = []
 
     async def read() -> None:
         client = _OneUnreadable(Configuration())
-        await LeaseWatch(world, client, LEASES, (), asked.append).read_due()
+        await LeaseWatch(cache, client, LEASES, (), asked.append).read_due()
         await client.close()
 
     asyncio.run(read())
     assert sorted(asked) == [("site", "a"), ("site", "c")]
-    assert [holder for holder in holders if world.leases.due(("site", holder), 0.0)] == ["bad"]
+    assert [holder for holder in holders if cache.leases.due(("site", holder), 0.0)] == ["bad"]

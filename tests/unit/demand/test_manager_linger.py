@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from application_manager.cache.cluster_cache import INSTANCE, ClusterCache
 from application_manager.cluster.store import Entry
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import Policy
-from application_manager.knowledge.world import INSTANCE, World
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.base import API_VERSION
@@ -15,43 +15,43 @@ from wayside.api.base import API_VERSION
 NAME = ("site", "app")
 
 
-def world_with(existing: ApplicationInstance) -> World:
-    world = World(Policy())
-    see(world, template(lifecycle={"linger": "30s"}), "1")
-    see(world, existing, "2")
-    return world
+def world_with(existing: ApplicationInstance) -> ClusterCache:
+    cache = ClusterCache(Policy())
+    see(cache, template(lifecycle={"linger": "30s"}), "1")
+    see(cache, existing, "2")
+    return cache
 
 
-def see(world: World, model: Any, version: str) -> None:
+def see(cache: ClusterCache, model: Any, version: str) -> None:
     raw = {"apiVersion": API_VERSION, **model.to_json()}
     raw["metadata"] = {**raw["metadata"], "uid": model.metadata.uid or model.name, "resourceVersion": version}
-    assert world.store.put(raw) is not None
+    assert cache.store.put(raw) is not None
 
 
-def claim(world: World, wanted: ApplicationTask) -> None:
-    world.claims.note(("site", wanted.name), Entry(wanted.to_json(), wanted), world.template(NAME))
+def claim(cache: ClusterCache, wanted: ApplicationTask) -> None:
+    cache.claims.note(("site", wanted.name), Entry(wanted.to_json(), wanted), cache.template(NAME))
 
 
-def decided(world: World, at: float) -> Decision:
-    decision = world.decide(NAME, NOW + at)
+def decided(cache: ClusterCache, at: float) -> Decision:
+    decision = cache.decide(NAME, NOW + at)
     assert decision is not None
     return decision
 
 
 def test_a_deadline_holds_from_when_it_was_decided_though_no_status_says_it_yet() -> None:
-    world = world_with(instance())
-    assert decided(world, 0).release_time == NOW + 30
-    assert decided(world, 20).release_time == NOW + 30
-    assert decided(world, 31).release_time == NOW + 30
+    cache = world_with(instance())
+    assert decided(cache, 0).release_time == NOW + 30
+    assert decided(cache, 20).release_time == NOW + 30
+    assert decided(cache, 31).release_time == NOW + 30
 
 
 def test_a_demand_that_came_and_went_begins_the_linger_anew_though_the_status_says_the_old_deadline() -> None:
-    world = world_with(instance(release_at=NOW + 10))
-    assert decided(world, 0).release_time == NOW + 10
-    claim(world, task("a"))
-    assert decided(world, 5).release_time is None
-    claim(world, task("a", ended=True))
-    assert decided(world, 9).release_time == NOW + 9 + 30
+    cache = world_with(instance(release_at=NOW + 10))
+    assert decided(cache, 0).release_time == NOW + 10
+    claim(cache, task("a"))
+    assert decided(cache, 5).release_time is None
+    claim(cache, task("a", ended=True))
+    assert decided(cache, 9).release_time == NOW + 9 + 30
 
 
 def test_after_a_restart_the_status_is_what_is_known() -> None:
@@ -59,20 +59,20 @@ def test_after_a_restart_the_status_is_what_is_known() -> None:
 
 
 def test_the_deadline_of_a_namesake_is_worth_nothing() -> None:
-    world = world_with(instance())
-    assert decided(world, 0).release_time == NOW + 30
+    cache = world_with(instance())
+    assert decided(cache, 0).release_time == NOW + 30
     successor = instance()
     successor = successor.model_copy(update={"metadata": successor.metadata.model_copy(update={"uid": "another"})})
-    see(world, successor, "3")
-    assert world.store.get(INSTANCE, NAME) is not None
-    assert decided(world, 20).release_time == NOW + 50
+    see(cache, successor, "3")
+    assert cache.store.get(INSTANCE, NAME) is not None
+    assert decided(cache, 20).release_time == NOW + 50
 
 
 def test_the_deadline_of_what_is_gone_is_forgotten() -> None:
-    world = world_with(instance(release_at=NOW + 10))
-    decided(world, 0)
-    entry = world.store.get(INSTANCE, NAME)
+    cache = world_with(instance(release_at=NOW + 10))
+    decided(cache, 0)
+    entry = cache.store.get(INSTANCE, NAME)
     assert entry is not None
-    world.store.remove(entry.raw)
-    assert world.decide(NAME, NOW + 11) is None
-    assert world.deadlines == {}
+    cache.store.remove(entry.raw)
+    assert cache.decide(NAME, NOW + 11) is None
+    assert cache.deadlines == {}

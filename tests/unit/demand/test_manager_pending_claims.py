@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from application_manager.cache.claim_index import ClaimIndex
 from application_manager.cluster.store import Entry
 from application_manager.core.claims.claims import Claim, Refused
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict
-from application_manager.knowledge.claimbook import ClaimBook
 from application_manager.workers.answers import Exceeded
 from application_manager.workers.claiming import Claiming
 from wayside.api import ApplicationTask, ApplicationTemplate
@@ -46,8 +46,8 @@ class Answers:
         return self.found
 
 
-def book_of(answers: Answers) -> ClaimBook:
-    return ClaimBook(Claiming(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
+def book_of(answers: Answers) -> ClaimIndex:
+    return ClaimIndex(Claiming(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
 
 
 def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_elsewhere() -> None:

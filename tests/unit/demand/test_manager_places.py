@@ -7,13 +7,13 @@ from typing import Any, cast
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from application_manager.cache.cluster_cache import INSTANCE, TASK, TEMPLATE, ClusterCache
 from application_manager.cluster.apply import Applier
 from application_manager.cluster.client import Client
 from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.demand import demand
 from application_manager.core.objects.policy import Policy
-from application_manager.knowledge.world import INSTANCE, TASK, TEMPLATE, World
 from application_manager.watching.router import Router
 from tests.unit.demand.test_limits import KEYED, limited
 from tests.unit.manager_objects import NOW, instance, task, template
@@ -35,15 +35,15 @@ events = st.lists(
 
 
 class Manager:
-    """A world and its router, without an API server."""
+    """A cache and its router, without an API server."""
 
     def __init__(self, limit: int | None) -> None:
-        self.world = World(Policy(), limit)
+        self.cache = ClusterCache(Policy(), limit)
         self.asked: set[Name] = set()
-        self.world.places.changed = self.asked.add
+        self.cache.places.changed = self.asked.add
         ask: Any = lambda _: None  # noqa: E731
-        applier = Applier(cast("Client", None), self.world.store, {})
-        self.router = Router(self.world, applier, self.asked.add, ask, ask, ask, ask)
+        applier = Applier(cast("Client", None), self.cache.store, {})
+        self.router = Router(self.cache, applier, self.asked.add, ask, ask, ask, ask)
         self.version = 0
 
     def sees(self, model: Kind) -> None:
@@ -54,7 +54,7 @@ class Manager:
         self.router.observe(raw)
 
     def misses(self, kind: tuple[str, str], name: str) -> None:
-        entry = self.world.store.get(kind, ("site", name))
+        entry = self.cache.store.get(kind, ("site", name))
         if entry is not None:
             self.router.vanished(entry.raw)
 
@@ -63,7 +63,7 @@ class Manager:
         said: dict[str, tuple[bool, dict[str, Any]]] = {}
         while self.asked:
             name = self.asked.pop()
-            decision = self.world.decide(name, NOW)
+            decision = self.cache.decide(name, NOW)
             if decision is None:
                 said[name[1]] = (False, {})
             else:
@@ -97,11 +97,11 @@ def test_the_book_agrees_with_the_pure_function_after_each_event(history: Any, l
             case _:
                 manager.sees(template(of, **KEYED, **({"maxInstances": number} if number else {})))
         said |= manager.works()
-        world = manager.world
+        cache = manager.cache
         outcome = demand(
-            world.models(TEMPLATE, ApplicationTemplate, "site"),
-            world.models(TASK, ApplicationTask, "site"),
-            world.models(INSTANCE, ApplicationInstance, "site"),
+            cache.models(TEMPLATE, ApplicationTemplate, "site"),
+            cache.models(TASK, ApplicationTask, "site"),
+            cache.models(INSTANCE, ApplicationInstance, "site"),
             {},
             NOW,
             limit,
@@ -119,7 +119,7 @@ def test_what_is_being_made_has_its_place_already() -> None:
     manager.sees(limited(1))
     manager.sees(task("a", {"region": "a"}))
     assert manager.works()[instance_name("app", "a")][0]
-    manager.world.places.being_made.add(("site", instance_name("app", "a")))
+    manager.cache.places.being_made.add(("site", instance_name("app", "a")))
     manager.sees(task("b", {"region": "b"}, priority=9))
     said = manager.works()
     assert said[instance_name("app", "b")] == (False, {"b": ("Waiting", "LimitReached")})

@@ -6,11 +6,11 @@ from collections.abc import AsyncIterator
 from copy import deepcopy
 from typing import cast
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.apply import Applier
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.store import Entry, Name
 from application_manager.core.objects.policy import Policy
-from application_manager.knowledge.world import World
 from application_manager.work.instances import InstanceWork
 from application_manager.work.recorder import Recorder
 from application_manager.work.suspending import Suspending
@@ -75,34 +75,34 @@ class MemoryServer:
             raise ApiError(409, "Precondition failed: UID in precondition differs from UID in object meta")
 
 
-def work_on(world: World, server: object, absent: list[Name]) -> InstanceWork:
+def work_on(cache: ClusterCache, server: object, absent: list[Name]) -> InstanceWork:
     """The work on instances, with that server; the instances that neither exist nor should go into `absent`."""
     client = cast("Client", server)
-    applier = Applier(client, world.store, {("v1", "ConfigMap"): CONFIG_MAPS})
+    applier = Applier(client, cache.store, {("v1", "ConfigMap"): CONFIG_MAPS})
     return InstanceWork(
-        world=world,
+        cache=cache,
         client=client,
         applier=applier,
         recorder=Recorder(client),
-        suspending=Suspending(client, applier, INSTANCES, world.store.put),
+        suspending=Suspending(client, applier, INSTANCES, cache.store.put),
         instances=INSTANCES,
         tasks=TASKS,
         again=lambda name, at: None,
         done=lambda name: None,
         absent=lambda name, decision: absent.append(name),
-        observe=world.store.put,
+        observe=cache.store.put,
         configured=lambda name: None,
         objects=objects,
     )
 
 
-def a_world(*known: Object, task: ApplicationTask) -> World:
-    """A world that knows these objects, and a task for template app."""
-    world = World(Policy())
+def a_world(*known: Object, task: ApplicationTask) -> ClusterCache:
+    """A cache that knows these objects, and a task for template app."""
+    cache = ClusterCache(Policy())
     for each in known:
-        assert world.store.put(each) is not None
-    world.claims.note((task.namespace, task.name), Entry(task.to_json(), task), world.template((task.namespace, "app")))
-    return world
+        assert cache.store.put(each) is not None
+    cache.claims.note((task.namespace, task.name), Entry(task.to_json(), task), cache.template((task.namespace, "app")))
+    return cache
 
 
 def raw(model: Kind, version: int) -> Object:

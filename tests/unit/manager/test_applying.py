@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.apply import Applied, Applier, Known, references
 from application_manager.cluster.client import Object
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer, owned
-from application_manager.knowledge.world import World
 from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_world, raw, work_on
 from tests.unit.manager_objects import instance, task, template
 
@@ -40,7 +40,7 @@ def applied(server: MemoryServer, *names: str, known: Known | None = None, meanw
 
     async def run() -> Applied:
         rendering = Renderer(template(manifests=[config(name, new="yes") for name in names]), Policy()).render(APP)
-        applier = Applier(server, World(Policy()).store, {key("")[:2]: CONFIG_MAPS})  # type: ignore[arg-type]
+        applier = Applier(server, ClusterCache(Policy()).store, {key("")[:2]: CONFIG_MAPS})  # type: ignore[arg-type]
         looked = await applier.look("site", rendering.manifests)
         if meanwhile is not None:
             server.put(meanwhile)
@@ -74,7 +74,7 @@ def test_what_the_rendering_has_no_more_is_pruned_where_it_is_still_the_instance
     assert {each.name for each in found.objects} == {"new"}
 
 
-def reconciled(*manifests: Object) -> tuple[MemoryServer, World]:
+def reconciled(*manifests: Object) -> tuple[MemoryServer, ClusterCache]:
     """An instance that has ConfigMap a, reconciled once with these manifests in its template."""
     objects = [each.to_json() for each in references({key("a"): "uid-a"})]
     made = raw(APP, 1)
@@ -82,13 +82,13 @@ def reconciled(*manifests: Object) -> tuple[MemoryServer, World]:
     server = MemoryServer()
     known = [server.put(raw(template(manifests=list(manifests)), 1)), server.put(made)]
     server.put(there("a", APP, "uid-a"))
-    world = a_world(*known, task=task("t"))
-    asyncio.run(work_on(world, server, []).reconcile(NAME))
-    return server, world
+    cache = a_world(*known, task=task("t"))
+    asyncio.run(work_on(cache, server, []).reconcile(NAME))
+    return server, cache
 
 
 def test_the_status_names_what_will_belong_to_the_instance_before_it_is_applied() -> None:
-    server, world = reconciled(config("a"), config("b"))
+    server, cache = reconciled(config("a"), config("b"))
     assert server.written[-3:] == [
         ("status", "ApplicationInstance", "app"),
         ("apply", "ConfigMap", "a"),
@@ -98,12 +98,12 @@ def test_the_status_names_what_will_belong_to_the_instance_before_it_is_applied(
         each["name"]: each.get("uid") for each in server.objects[("ApplicationInstance", "app")]["status"]["objects"]
     }
     assert announced == {"a": "uid-a", "b": None}
-    assert world.records[NAME].applied.complete
+    assert cache.records[NAME].applied.complete
 
 
 def test_while_a_template_cannot_be_rendered_what_runs_stays_as_it_is_and_is_not_forgotten() -> None:
-    server, world = reconciled(config("a", x="${parameters.nothing}"))
+    server, cache = reconciled(config("a", x="${parameters.nothing}"))
     assert [each for each in server.written if each[1] == "ConfigMap"] == []
-    record = world.records[NAME]
+    record = cache.records[NAME]
     assert (record.applied.aspect.reason, record.digest) == ("RenderFailed", "before")
     assert [(each.name, each.uid) for each in record.applied.objects] == [("a", "uid-a")]

@@ -11,12 +11,12 @@ import aiohttp
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import ApiError
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
 from application_manager.headroom import Headroom
-from application_manager.knowledge.world import World
 from application_manager.measures import PREFIX, Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.pages import STALLED_AFTER, pages, stalled
@@ -47,19 +47,19 @@ def samples(measures: Measures) -> dict[tuple[str, ...], float]:
 
 
 def test_tasks_instances_and_templates_are_counted_by_what_they_are() -> None:
-    world, measures = World(Policy()), Measures()
-    measures.registry.register(Overview(world, lambda: [("task", 3, 1)]))
-    world.store.put(raw(task("a"), phase="Ready"))
-    world.store.put(raw(task("b"), phase="Ready"))
-    world.store.put(raw(task("c")))
-    world.store.put(raw(instance(), phase="Lingering"))
+    cache, measures = ClusterCache(Policy()), Measures()
+    measures.registry.register(Overview(cache, lambda: [("task", 3, 1)]))
+    cache.store.put(raw(task("a"), phase="Ready"))
+    cache.store.put(raw(task("b"), phase="Ready"))
+    cache.store.put(raw(task("c")))
+    cache.store.put(raw(instance(), phase="Lingering"))
     accepted = {
         "type": "Accepted",
         "status": "True",
         "reason": "Accepted",
         "lastTransitionTime": "2026-01-01T00:00:00Z",
     }
-    world.store.put(raw(template(), conditions=[accepted]))
+    cache.store.put(raw(template(), conditions=[accepted]))
     found = samples(measures)
     assert (found["tasks", "Ready"], found["tasks", "None"], found["tasks", "Refused"]) == (2, 1, 0)
     assert (found["instances", "Lingering"], found["templates", "True"]) == (1, 1)
@@ -148,7 +148,7 @@ def test_an_object_that_changes_all_the_time_is_told_of_now_and_then() -> None:
 
 def test_the_guide_describes_every_metric() -> None:
     measures = Measures()
-    measures.registry.register(Overview(World(Policy()), list))
+    measures.registry.register(Overview(ClusterCache(Policy()), list))
     measures.registry.register(LostSpans(cast("Tracing", SimpleNamespace(dropped=0, failed=0))))
     measures.registry.register(Pulse(90, lambda: 0.0))
     measures.registry.register(Headroom(1))

@@ -6,9 +6,9 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Any
 
+from application_manager.cache.cluster_cache import INSTANCE, ClusterCache
 from application_manager.cluster.client import Resource
 from application_manager.cluster.store import Name
-from application_manager.knowledge.world import INSTANCE, World
 from tests.unit.manager.memory_server import a_world, raw, work_on
 from tests.unit.manager_objects import NOW, instance, task, template
 
@@ -19,14 +19,14 @@ KEYED = {"key": "${parameters.place}", "parameters": {"place": {"type": "string"
 class GoingServer:
     """An API server on which the instance goes just while the tasks are listed; everything written is noted."""
 
-    def __init__(self, world: World) -> None:
-        self.world = world
+    def __init__(self, cache: ClusterCache) -> None:
+        self.cache = cache
         self.written: list[Any] = []
 
     async def pages(self, *_: object, **__: object) -> AsyncIterator[tuple[list[Any], str]]:
-        entry = self.world.store.get(INSTANCE, NAME)
+        entry = self.cache.store.get(INSTANCE, NAME)
         assert entry is not None
-        self.world.store.remove(entry.raw)
+        self.cache.store.remove(entry.raw)
         yield [], "9"
 
     async def apply(self, resource: Resource, body: Any) -> Any:
@@ -40,9 +40,9 @@ class GoingServer:
 def test_an_instance_that_goes_while_its_release_is_checked_stays_gone_while_its_holder_is_lost() -> None:
     lost = task("a", {"place": "west"}, holder="town", accepted_condition=("False", "HolderLost", NOW - 100))
     going = instance(NAME[1], key="west", release_at=NOW - 1e8)
-    world = a_world(raw(template(**KEYED), 1), raw(going, 2), task=lost)
-    server = GoingServer(world)
+    cache = a_world(raw(template(**KEYED), 1), raw(going, 2), task=lost)
+    server = GoingServer(cache)
     absent: list[Name] = []
-    asyncio.run(work_on(world, server, absent).reconcile(NAME))
+    asyncio.run(work_on(cache, server, absent).reconcile(NAME))
     assert server.written == []
     assert absent == [NAME]

@@ -8,9 +8,9 @@ from typing import cast
 
 import pytest
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.store import Entry
-from application_manager.knowledge.world import World
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces
 from application_manager.work.recorder import Recorder
@@ -44,7 +44,7 @@ def traced(*, ended: bool) -> ApplicationTask:
     return made.model_copy(update={"metadata": metadata})
 
 
-Run = Callable[[TaskTraces, World, Server, Callable[[], Awaitable[None]]], Awaitable[None]]
+Run = Callable[[TaskTraces, ClusterCache, Server, Callable[[], Awaitable[None]]], Awaitable[None]]
 
 
 def spans(monkeypatch: pytest.MonkeyPatch, run: Run) -> dict[str, Received]:
@@ -56,33 +56,33 @@ def spans(monkeypatch: pytest.MonkeyPatch, run: Run) -> dict[str, Received]:
 
         async def whole() -> None:
             server = Server(raw(traced(ended=False), 1))
-            world = a_world(
+            cache = a_world(
                 server.put(raw(template(manifests=[CONFIG]), 2)),
                 server.objects["ApplicationTask", "t"],
                 task=traced(ended=False),
             )
-            traces = TaskTraces(exporting, world)
+            traces = TaskTraces(exporting, cache)
             client = cast("Client", server)
             work = TaskWork(
-                world=world,
+                cache=cache,
                 client=client,
                 recorder=Recorder(client),
                 tasks=TASKS,
                 templates=TASKS,
                 ttl=60,
                 again=lambda name, at: None,
-                observe=world.store.put,
+                observe=cache.store.put,
                 measures=Measures(),
                 traces=traces,
             )
 
             async def end() -> None:
                 over = traced(ended=True)
-                world.store.put(server.put(raw(over, 3)))
-                world.claims.note(TASK, Entry(over.to_json(), over), world.template(APP))
+                cache.store.put(server.put(raw(over, 3)))
+                cache.claims.note(TASK, Entry(over.to_json(), over), cache.template(APP))
                 await work.reconcile(TASK)
 
-            await run(traces, world, server, end)
+            await run(traces, cache, server, end)
 
         asyncio.run(whole())
         exporting.close()
@@ -102,16 +102,16 @@ def failed(found: dict[str, Received]) -> None:
 def test_a_task_that_ends_before_its_status_says_that_it_is_applied_was_never_ready(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def run(traces: TaskTraces, world: World, server: Server, end: Callable[[], Awaitable[None]]) -> None:
-        await traces.reconciling(APP, work_on(world, server, []).reconcile)
+    async def run(traces: TaskTraces, cache: ClusterCache, server: Server, end: Callable[[], Awaitable[None]]) -> None:
+        await traces.reconciling(APP, work_on(cache, server, []).reconcile)
         await end()
 
     failed(spans(monkeypatch, run))
 
 
 def test_a_task_that_ends_while_its_instance_is_applied_was_never_ready(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def run(traces: TaskTraces, world: World, server: Server, end: Callable[[], Awaitable[None]]) -> None:
+    async def run(traces: TaskTraces, cache: ClusterCache, server: Server, end: Callable[[], Awaitable[None]]) -> None:
         server.meanwhile = end  # type: ignore[method-assign,assignment]
-        await traces.reconciling(APP, work_on(world, server, []).reconcile)
+        await traces.reconciling(APP, work_on(cache, server, []).reconcile)
 
     failed(spans(monkeypatch, run))

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from kubernetes.aio.client import Configuration
 
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import Client, Resource
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.rulestatus import detector_status, rule_status
-from application_manager.knowledge.world import World
 from application_manager.work.recorder import Recorder
 from application_manager.work.rulework import RuleWork
 from tests.inprocess import InProcess
@@ -114,11 +114,11 @@ def test_a_rule_that_nobody_selects_is_told_of_detectors_that_are_none() -> None
 
 @pytest.mark.parametrize(("kind", "reason"), [("EventRule", "RuleInvalid"), ("Detector", "DetectorInvalid")])
 def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: str, reason: str) -> None:
-    world = World(Policy())
+    cache = ClusterCache(Policy())
     written: list[dict[str, Any]] = []
 
     def observe(seen: dict[str, Any]) -> None:
-        world.store.put(seen)
+        cache.store.put(seen)
 
     raw: dict[str, Any] = {
         "apiVersion": API_VERSION,
@@ -126,7 +126,7 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
         "metadata": {"name": "odd", "namespace": "site", "uid": "u", "resourceVersion": "1", "generation": 2},
         "spec": {"odd": True},
     }
-    assert world.store.put(raw) is not None
+    assert cache.store.put(raw) is not None
 
     class Accepting(Client):
         """An API server that takes every status."""
@@ -140,7 +140,7 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
     async def reconcile_twice() -> None:
         client = Accepting(Configuration())
         resources = {(API_VERSION, kind): Resource(API_VERSION, kind, f"{kind.lower()}s")}
-        work = RuleWork(world, client, Recorder(client), resources, observe, InProcess())
+        work = RuleWork(cache, client, Recorder(client), resources, observe, InProcess())
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await client.close()

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
+from application_manager.cache.claim_index import ClaimIndex
 from application_manager.cluster.store import Entry
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import Aspect, changed, updated
 from application_manager.core.statuses.status import Service, difference, finished_since, task_status
-from application_manager.knowledge.claimbook import ClaimBook
 from tests.unit.manager_objects import NOW, task, template
 from wayside.api.applicationtask import TaskPhase
 from wayside.times import format_seconds, parse_seconds
@@ -94,7 +94,7 @@ def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
 
 
 def test_a_task_that_ends_before_its_status_is_written_still_says_what_served_it() -> None:
-    book, name = ClaimBook(), ("site", "a")
+    book, name = ClaimIndex(), ("site", "a")
     book.note(name, Entry({}, task("a")), template())
     claimed = book.claim(name)
     assert claimed is not None

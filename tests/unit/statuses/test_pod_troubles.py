@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
+from application_manager.cache.pod_index import PodIndex
 from application_manager.core.health.pods import Trouble, TroubleReason, summary, trouble
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
-from application_manager.knowledge.podbook import PodBook
 from tests.unit.manager_objects import DEPLOYMENT, instance, template
 
 CAUSE = 'failed to resolve reference "app:1": app:1: not found'
@@ -148,7 +148,7 @@ def test_the_same_trouble_of_many_pods_is_told_once_and_the_most_telling_first()
 
 
 def test_the_book_knows_an_instances_troubles_and_whether_news_change_them() -> None:
-    book, of = PodBook(), ("site", "app")
+    book, of = PodIndex(), ("site", "app")
     assert not book.note(pod())
     assert book.note(pod(**waiting("ErrImagePull", "no")))
     assert not book.note(pod("app-2", **waiting("ErrImagePull", "no")))

@@ -14,7 +14,7 @@ from application_manager.core.objects.sidecars import SIDECAR_LABEL
 
 
 @dataclass
-class DetectorBook:
+class DetectorIndex:
     """By the Detector's namespace and name, and its objects by the uid of the Detector that controls them.
 
     Labels find what may be a Detector's; anybody can copy them. So an object counts by its controller, and a pod by the

@@ -6,7 +6,7 @@ from application_manager.cluster.store import Name
 from application_manager.core.demand.fallback import Fallback
 
 
-class TurnBook:
+class FallbackIndex:
     """Fallbacks of templates, and of instances that are not ready."""
 
     def __init__(self) -> None:

@@ -45,7 +45,7 @@ class _Yielded:
     tried: bool = False
 
 
-class OverlapBook:
+class OverlapIndex:
     """Namespaces that others look after as well.
 
     Attributes:

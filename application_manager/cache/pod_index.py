@@ -11,7 +11,7 @@ from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 
 
-class PodBook:
+class PodIndex:
     """Troubles of pods."""
 
     def __init__(self) -> None:

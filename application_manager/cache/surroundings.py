@@ -1,25 +1,25 @@
-"""What a rule is judged with: what the world has beside it in its namespace."""
+"""What a rule is judged with: what the cache has beside it in its namespace."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from application_manager.knowledge.world import DETECTOR, EVENT_RULE, TEMPLATE, World
+from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
 from application_manager.workers.jobs import Surroundings
 from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.rules import depends
 
 
-def surroundings(world: World, rule: EventRule) -> Surroundings:
+def surroundings(cache: ClusterCache, rule: EventRule) -> Surroundings:
     """As far as they matter to the rule: other rules where it names any, templates where it deploys."""
     namespace = rule.namespace
     deploys = any(each.deploy is not None for each in rule.spec.actions)
     return Surroundings(
-        detectors=world.models(DETECTOR, Detector, namespace),
-        invalid_detectors=world.invalid(DETECTOR, namespace),
-        rules=world.models(EVENT_RULE, EventRule, namespace) if depends(rule) else [],
-        templates=[_bare(each) for each in world.models(TEMPLATE, ApplicationTemplate, namespace)] if deploys else [],
-        invalid_templates=world.invalid(TEMPLATE, namespace) if deploys else [],
+        detectors=cache.models(DETECTOR, Detector, namespace),
+        invalid_detectors=cache.invalid(DETECTOR, namespace),
+        rules=cache.models(EVENT_RULE, EventRule, namespace) if depends(rule) else [],
+        templates=[_bare(each) for each in cache.models(TEMPLATE, ApplicationTemplate, namespace)] if deploys else [],
+        invalid_templates=cache.invalid(TEMPLATE, namespace) if deploys else [],
     )
 
 

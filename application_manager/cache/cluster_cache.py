@@ -1,4 +1,4 @@
-"""What the manager knows, in one place: the store, the index of claims, the Leases, and what was found of templates."""
+"""The cache of the cluster: the newest version of each object, with its indexes and the findings about templates."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Final, TypeVar
 
+from application_manager.cache.claim_index import ClaimIndex
+from application_manager.cache.fallback_index import FallbackIndex
+from application_manager.cache.overlap_index import OverlapIndex
+from application_manager.cache.place_index import PlaceIndex
+from application_manager.cache.pod_index import PodIndex
 from application_manager.cluster.apply import Applied
 from application_manager.cluster.store import Name, Store
 from application_manager.core.claims.claims import Claim, InvalidTemplate, template_of_all
@@ -18,15 +23,10 @@ from application_manager.core.demand.lingering import written_deadline
 from application_manager.core.demand.places import Candidate, Limits
 from application_manager.core.demand.placing import candidate, limits, placed
 from application_manager.core.findings.findings import Findings
-from application_manager.core.holders.leases import HealthyTime, LeaseBook, LeaseView
+from application_manager.core.holders.leases import HealthyTime, LeaseIndex, LeaseView
 from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.policy import KindKey, Policy
 from application_manager.core.statuses.status import Service
-from application_manager.knowledge.claimbook import ClaimBook
-from application_manager.knowledge.overlapbook import OverlapBook
-from application_manager.knowledge.placebook import PlaceBook
-from application_manager.knowledge.podbook import PodBook
-from application_manager.knowledge.turnbook import TurnBook
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.findings import ignored_by
 
@@ -75,8 +75,8 @@ class Record:
 
 
 @dataclass
-class World:
-    """All that is known; only the event loop's thread touches it.
+class ClusterCache:
+    """The objects of the cluster with their indexes. Only the thread of the event loop uses it.
 
     Attributes:
         served: by instance; empty until it was reconciled for the first time.
@@ -94,24 +94,24 @@ class World:
     full: InitVar[Callable[[], bool]] = lambda: False
     tasks: InitVar[TaskPolicy | None] = None
     store: Store = field(init=False)
-    claims: ClaimBook = field(init=False)
-    pods: PodBook = field(default_factory=PodBook)
-    leases: LeaseBook = field(default_factory=LeaseBook)
+    claims: ClaimIndex = field(init=False)
+    pods: PodIndex = field(default_factory=PodIndex)
+    leases: LeaseIndex = field(default_factory=LeaseIndex)
     healthy: HealthyTime = field(default_factory=HealthyTime)
     served: dict[Name, Served] = field(default_factory=dict)
     records: dict[Name, Record] = field(default_factory=dict)
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
-    turns: TurnBook = field(default_factory=TurnBook)
-    overlap: OverlapBook = field(default_factory=OverlapBook)
-    places: PlaceBook = field(init=False)
+    turns: FallbackIndex = field(default_factory=FallbackIndex)
+    overlap: OverlapIndex = field(default_factory=OverlapIndex)
+    places: PlaceIndex = field(init=False)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
     exceeded: dict[Name, dict[Name, str]] = field(default_factory=dict)
     _findings: dict[Name, tuple[_Version, Findings]] = field(default_factory=dict)
 
     def __post_init__(self, full: Callable[[], bool], tasks: TaskPolicy | None) -> None:
         self.store = Store(OWN_KINDS, full)
-        self.claims = ClaimBook(policy=tasks or TaskPolicy())
-        self.places = PlaceBook(self._alone_and_candidate, self._known_instances)
+        self.claims = ClaimIndex(policy=tasks or TaskPolicy())
+        self.places = PlaceIndex(self._alone_and_candidate, self._known_instances)
 
     def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:
         """The template, also where it is not valid; None where there is none."""

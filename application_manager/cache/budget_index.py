@@ -42,7 +42,7 @@ class _Budget:
         return self.order[self.limit - 1] if index < self.limit <= len(self.order) else None
 
 
-class BudgetBook:
+class BudgetIndex:
     """Budgets of all namespaces and holders; those without a limit cost nothing."""
 
     def __init__(self, policy: TaskPolicy) -> None:

@@ -29,7 +29,7 @@ class _Namespace:
     until: float = float("inf")
 
 
-class PlaceBook:
+class PlaceIndex:
     """Places of all instances.
 
     Attributes:

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+from application_manager.cache.budget_index import BudgetIndex
 from application_manager.cluster.store import Entry, Name
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, all_instances, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.holders.policies import TaskPolicy
-from application_manager.knowledge.budgetbook import BudgetBook
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 Claims = Callable[[ApplicationTemplate | InvalidTemplate | None, ApplicationTask], Claim | Verdict | None]
@@ -24,7 +24,7 @@ Claims = Callable[[ApplicationTemplate | InvalidTemplate | None, ApplicationTask
 _ANY = TaskPolicy()
 
 
-class ClaimBook:
+class ClaimIndex:
     """Claims of all tasks, and the verdicts of those that claim nothing.
 
     A task whose claim is being worked out keeps the one that it had, if any. Those that were there before this process
@@ -41,7 +41,7 @@ class ClaimBook:
         self.claim_of = claim
         self.moved: Callable[[Name], None] = lambda _: None
         self._policy = policy
-        self._budgets = BudgetBook(policy)
+        self._budgets = BudgetIndex(policy)
         self.settled: Callable[[Name], None] = lambda _: None
         self._pending: dict[Name, set[Name]] = {}  # template → tasks
         self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that were there at the beginning

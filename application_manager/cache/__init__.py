@@ -1,0 +1,1 @@
+"""The cache of the cluster, with its indexes, in memory."""

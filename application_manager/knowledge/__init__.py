@@ -1,1 +1,0 @@
-"""What the manager knows of the cluster, with its indexes, in memory."""
