@@ -171,6 +171,7 @@ class Running:
             detector, before = self._good(wanted.detector), self._rule_set.detector.spec
             self._rule_set = replace(wanted, detector=detector)
             self._evaluator.configure(self._rule_set)
+            _log.info("Detector %s runs with %d rules from now on", detector.name, len(wanted.rules))
             spec = detector.spec
             if spec.zenoh != before.zenoh or _subscribed(spec.streams) != _subscribed(before.streams):
                 await asyncio.to_thread(self._outlet.move, self._network(detector))
