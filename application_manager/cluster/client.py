@@ -44,6 +44,8 @@ _RESTARTS = 3  # of a list whose rest is not there any more
 _NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
 _NAMESPACE = re.compile(r"/namespaces/([^/]+)/")
 _BAD_MANIFEST = "failed to create typed patch object"
+_OURS: Mapping[str, str] = {"fieldManager": FIELD_MANAGER}
+_STRICTLY: Mapping[str, str] = {**_OURS, "fieldValidation": "Strict"}
 
 
 class Unreachable(Exception):  # noqa: N818  a state of the world
@@ -229,29 +231,25 @@ class Client:
     async def apply(self, resource: Resource, manifest: Object) -> Object:
         """Server-side apply, as the one field manager that we are."""
         metadata = manifest["metadata"]
-        query = {"fieldManager": FIELD_MANAGER, "force": "true", "fieldValidation": "Strict"}
-        return await self._request(
-            "PATCH", resource.path(metadata["namespace"], metadata["name"]), query, manifest, _APPLY
-        )
+        path = resource.path(metadata["namespace"], metadata["name"])
+        return await self._request("PATCH", path, {**_STRICTLY, "force": "true"}, manifest, _APPLY)
 
     async def patch_status(self, resource: Resource, namespace: str, name: str, uid: str, status: Object) -> Object:
         """Merge into the status of the object with this uid; null removes a field."""
         body = {"metadata": {"uid": uid}, "status": status}
-        query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
-        return await self._request("PATCH", resource.path(namespace, name, "status"), query, body, _MERGE)
+        return await self._request("PATCH", resource.path(namespace, name, "status"), _STRICTLY, body, _MERGE)
 
     async def annotate(
         self, resource: Resource, namespace: str, name: str, uid: str, annotations: Mapping[str, str]
     ) -> Object:
         """Set annotations of the object with this uid, and touch nothing else."""
         body = {"metadata": {"uid": uid, "annotations": dict(annotations)}}
-        query = {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}
-        return await self._request("PATCH", resource.path(namespace, name), query, body, _MERGE)
+        return await self._request("PATCH", resource.path(namespace, name), _STRICTLY, body, _MERGE)
 
     async def merge(self, resource: Resource, namespace: str, name: str, body: Object) -> bool:
         """Merge into the object; whether it was there."""
         try:
-            await self._request("PATCH", resource.path(namespace, name), {"fieldManager": FIELD_MANAGER}, body, _MERGE)
+            await self._request("PATCH", resource.path(namespace, name), _OURS, body, _MERGE)
         except ApiError as error:
             if error.code == 404:
                 return False
@@ -260,15 +258,12 @@ class Client:
 
     async def merge_members(self, resource: Resource, name: str, body: Object) -> Object:
         """Merge into an object of the cluster, lists by their members' names."""
-        return await self._request(
-            "PATCH", resource.path(None, name), {"fieldManager": FIELD_MANAGER}, body, _STRATEGIC
-        )
+        return await self._request("PATCH", resource.path(None, name), _OURS, body, _STRATEGIC)
 
     async def scale(self, resource: Resource, namespace: str, name: str, version: str, replicas: int) -> Object:
         """Set the replicas of the object by its subresource `scale`, if it is still of this resourceVersion."""
         body = {"metadata": {"resourceVersion": version}, "spec": {"replicas": replicas}}
-        query = {"fieldManager": FIELD_MANAGER}
-        return await self._request("PATCH", resource.path(namespace, name, "scale"), query, body, _MERGE)
+        return await self._request("PATCH", resource.path(namespace, name, "scale"), _OURS, body, _MERGE)
 
     async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> bool:
         """Delete the object with this uid, and in the background what it owns. Returns whether it was there."""
