@@ -37,8 +37,11 @@ class Arrivals:
         return put
 
     def wait_for(self, done: Callable[[list[tuple[str, str, bytes]]], bool]) -> None:
+        assert self.comes(done, PATIENCE), self.seen
+
+    def comes(self, done: Callable[[list[tuple[str, str, bytes]]], bool], seconds: float) -> bool:
         with self._changed:
-            assert self._changed.wait_for(lambda: done(self.seen), timeout=PATIENCE), self.seen
+            return self._changed.wait_for(lambda: done(self.seen), timeout=seconds)
 
 
 def stream(name: str = "pose", key: str = "vehicles/${client:*}/pose", **fields: Any) -> Stream:

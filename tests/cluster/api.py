@@ -171,7 +171,7 @@ class Api:
             lambda found: found is not None and holds(found),
             timeout=timeout,
             what=what,
-            transient=(Unreachable,),
+            transient=(Unreachable, KeyError),  # a field, such as the status, may come later than the object
         )
         return cast("Object", found)
 
