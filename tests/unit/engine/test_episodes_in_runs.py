@@ -45,7 +45,7 @@ def what_is_left(state: SubjectState) -> tuple[object, ...]:
     return state.is_open, state.onset, state.rests_until, state.unknown_since if state.is_open or state.onset else None
 
 
-@settings(max_examples=200)
+@settings(max_examples=500)
 @given(
     _runs, st.lists(st.integers(1, 3), min_size=1, max_size=80), st.data(), st.builds(Timing, _times, _times, _times)
 )
@@ -77,7 +77,7 @@ def test_a_run_of_ticks_is_the_same_as_each_tick(
     assert what_is_left(ran) == what_is_left(stepped)
 
 
-@settings(max_examples=100)
+@settings(max_examples=300)
 @given(_runs, _observations, st.builds(Timing, _times, _times, _times))
 def test_nothing_happens_before_the_wake_of_a_run(
     runs: list[tuple[Observation, int]], last: Observation, timing: Timing
