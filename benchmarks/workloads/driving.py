@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from detector.assembly import RuleBook, inlets, make_engine
+from detector.assembly import RuleIndex, inlets, make_engine
 from detector.engine.episodes.events import Event
 from detector.engine.evaluation import Evaluated
 from detector.engine.samples.sample import Arrival
@@ -30,7 +30,7 @@ class Live:
     def __init__(self, detector: Detector, rules: Sequence[EventRule], start: int) -> None:
         """`start`: nanoseconds since the epoch. Raises RefusedError."""
         entries = inlets(detector)
-        compiled, refused = RuleBook().compile(rules, detector, entries.fields)
+        compiled, refused = RuleIndex().compile(rules, detector, entries.fields)
         if refused:
             raise RefusedError(str(refused[0]))
         self._engine = make_engine(detector, entries, holder=detector.name, start=start)
