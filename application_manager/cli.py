@@ -300,9 +300,9 @@ def check(
     """
     with importing():
         from application_manager.commands.checking import check_files
-        from application_manager.core.findings.checks import CHECKS, UNREADABLE_FILE
+        from application_manager.core.findings.checks import CHECKS
         from wayside.api.documents import DocumentError
-        from wayside.findings import ignorable, listed
+        from wayside.findings import UNREADABLE_FILE, ignorable, listed
 
     if listing:
         typer.echo("\n".join(listed(CHECKS)))

@@ -72,6 +72,10 @@ class Measures:
         if failed:
             self._failures.labels(queue).inc()
 
+    def unhandled(self) -> None:
+        """An event of a watch could not be handled; the next resync retries it."""
+        self._failures.labels("watch").inc()
+
     def asked(self, method: str, seconds: float, code: str) -> None:
         """The API server answered with an HTTP status, or NO_ANSWER."""
         self._requests.labels(method).observe(seconds)

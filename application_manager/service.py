@@ -233,6 +233,7 @@ class Manager:
             observe=self._work.router.observe,
             vanished=self._work.router.vanished,
             relist=self._relist,
+            failed=self._measures.unhandled,
             connect=self._connection,
             namespaces=self._options.namespaces,
             ready=watching,

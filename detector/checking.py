@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from detector.assembly import DetectorError, Inlets, inlets, offer_problems
 from detector.findings import (
-    INVALID_DETECTOR,
     INVALID_RULE,
     MISSING_DETECTOR,
     RULE_NOT_SELECTED,
@@ -21,6 +20,7 @@ from wayside.api import Detector, EventRule
 from wayside.api.detector import Clock
 from wayside.api.documents import Document, Problem
 from wayside.api.stream import Encoding, Stream
+from wayside.findings import INVALID_DETECTOR
 from wayside.rules import Fields, RuleError, RuleProblem, compile_rule, dependency_problems, unknown_rules
 from wayside.rules.contradictions import contradictions
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from wayside.findings import Check, Severity
+from wayside.findings import INVALID_DETECTOR, UNREADABLE_FILE, Check, Severity
 from wayside.rules.contradictions import CONTRADICTIONS
 
-UNREADABLE_FILE = Check("unreadable-file", Severity.ERROR, "a file is not YAML, or an object does not fit its kind")
-INVALID_DETECTOR = Check("invalid-detector", Severity.ERROR, "a field of a Detector cannot be used")
 INVALID_RULE = Check("invalid-rule", Severity.ERROR, "an EventRule does not compile with a Detector that selects it")
 MISSING_DETECTOR = Check("missing-detector", Severity.ERROR, "the files have EventRules and no Detector")
 RULE_NOT_SELECTED = Check("rule-not-selected", Severity.ERROR, "no Detector selects the EventRule")

@@ -53,6 +53,10 @@ class Finding:
         return self.text
 
 
+UNREADABLE_FILE = Check("unreadable-file", Severity.ERROR, "a file is not YAML, or an object does not fit its kind")
+INVALID_DETECTOR = Check("invalid-detector", Severity.ERROR, "a field of a Detector cannot be used")
+
+
 def ignorable(names: Iterable[str], checks: Iterable[Check]) -> frozenset[str]:
     """The names, all of which are those of warnings.
 

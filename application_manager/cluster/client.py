@@ -189,8 +189,8 @@ class Client:
     ) -> AsyncIterator[tuple[Iterator[Object], str]]:
         """The objects and the version of `list`, page by page: `size` at first, then as many as make some 4 MiB.
 
-        Each object is decoded when it is reached: Python needs up to twenty times the size of the text. Should the
-        rest not be there any more (410), the list begins anew, and objects may come twice.
+        Each object is decoded when it is reached: Python needs up to twenty times the size of the text. When
+        the rest of the list has expired (410), it restarts, and objects may come twice.
         """
         kind = {"apiVersion": resource.api_version, "kind": resource.kind}
         query = {"labelSelector": labels, "fieldSelector": fields}
@@ -217,7 +217,7 @@ class Client:
     ) -> tuple[list[Object], str]:
         """The objects, with apiVersion and kind, and the resourceVersion of the list; read from the storage itself.
 
-        `limit`: so many at most; 0: all of them.
+        `limit`: the maximum number of objects; 0: no limit.
         """
         found: list[Object] = []
         version = ""
@@ -335,7 +335,7 @@ class Client:
         *,
         writes: bool | None = None,
     ) -> bytes:
-        """Ask, and ask again what the API server did not look at, as long as it keeps to a reasonable time."""
+        """Send a request, and retry it for up to 30 s while the API server rejects it unprocessed."""
         deadline = time.monotonic() + _PATIENCE
         changes = method != "GET" if writes is None else writes
         where = _NAMESPACE.search(path) if changes and self.may_write is not None else None

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from application_manager.core.findings.checks import INVALID_DETECTOR, INVALID_RULE, INVALID_TEMPLATE
+from application_manager.core.findings.checks import INVALID_RULE, INVALID_TEMPLATE
 from application_manager.core.findings.demanding import deploy_remarks
 from application_manager.core.findings.findings import Findings, field_of
 from application_manager.core.findings.rulefindings import detector_findings, rule_findings
@@ -15,7 +15,7 @@ from application_manager.core.objects.policy import Policy
 from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.api.base import Kind
 from wayside.api.documents import Document, FieldPath, field_text, load_documents
-from wayside.findings import Check, Finding
+from wayside.findings import INVALID_DETECTOR, Check, Finding
 
 _INVALID: Mapping[type[Kind], Check] = {
     ApplicationTemplate: INVALID_TEMPLATE,

@@ -65,7 +65,7 @@ class Listing:
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
     async def again(self, group: str, plural: str, namespace: str | None, labels: str) -> None:
-        """List a kind again, in a namespace, or for None in all: what is there and what is gone.
+        """List a kind, in a namespace or (None) in all, and route both the objects found and the deletions missed.
 
         Raises ApiError or Unreachable.
         """

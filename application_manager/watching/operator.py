@@ -1,4 +1,4 @@
-"""The registrations with kopf, and nothing else: every event is handed on (see `relay`), nothing is handled here.
+"""Registers the watches with kopf; `relay` passes every event on to the router.
 
 Only `on.event`, which neither adds finalizers nor writes to objects. kopf's own Events, peering and progress storage
 are off. The API server selects holders' Leases and instances' objects by their labels.
@@ -16,7 +16,7 @@ import kopf
 from application_manager.cluster.client import LEASES, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
-from application_manager.watching.relay import News, Relist, relaying
+from application_manager.watching.relay import Handler, Relist, relaying
 from wayside.leases import HOLDER_LEASE_LABEL
 
 _PAUSES = (0.1, 0.2, 0.5)  # s, between attempts to reach the API server; then the last again and again
@@ -36,19 +36,20 @@ async def watch(
     own: Collection[Resource],
     children: Collection[Resource],
     *,
-    observe: News,
-    vanished: News,
+    observe: Handler,
+    vanished: Handler,
     relist: Relist,
+    failed: Callable[[], None],
     connect: Callable[[], Awaitable[kopf.ConnectionInfo]],
     namespaces: Collection[str],
     ready: asyncio.Event,
     pulse: Pulse,
 ) -> None:
-    """Hand on the news of our own kinds, of holders' Leases, and of what has an instance's label, until cancelled.
+    """Watch our own kinds, holders' Leases, and objects with an instance's label, until cancelled.
 
-    `namespaces` empty: all. `pulse` takes each watch's signs of life. `relist` hands on
-    all that there is of a kind. `ready` is set once kopf has started. `connect`
-    is asked for credentials at the start, and again when the API server no longer takes them.
+    `namespaces` empty: all. `relist` lists a kind and routes its objects; `failed` counts an object that could not be
+    handled. `pulse` receives each watch's signs of life. `ready` is set once kopf has started. `connect` returns
+    credentials, at the start and again when the API server no longer accepts them.
     """
     logging.getLogger("kopf").setLevel(logging.WARNING)
     registry = kopf.OperatorRegistry()
@@ -67,7 +68,7 @@ async def watch(
         return await connect()
 
     async def handled(**_: Any) -> None:
-        """What makes kopf watch a kind; the relay takes the events."""
+        """Make kopf watch a kind; the relay handles the events."""
 
     kopf.on.login(registry=registry)(login)
     for resource in own:
@@ -77,7 +78,7 @@ async def watch(
         settings.watching.label_selectors[resource.group, resource.version, resource.plural] = label
 
     identity: Any = "application-manager"  # else kopf asks for the user's name, and a container's may have none
-    with pulsing(pulse), relaying(observe, vanished, relist):
+    with pulsing(pulse), relaying(observe, vanished, relist, failed):
         await kopf.operator(
             registry=registry,
             settings=settings,

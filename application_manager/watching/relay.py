@@ -1,9 +1,9 @@
-"""News go from kopf's watches straight to where they are taken, and not through kopf's queues.
+"""Relays events from kopf's watches to the router directly, past kopf's queues.
 
-kopf keeps a task and a queue for each object that has news, and the object itself with them. For handlers that do no
-more than put an object into a cache, that is most of the time and the memory that the news take. So kopf keeps the
-watches up (connections, retries, versions that are too old), and sees of each event its version. Its lists are ours: it
-learns the version to watch from, and we list what is there after that. docs/decisions/0027 has the details.
+kopf keeps a task, a queue and the object itself for each object with recent events. Handlers that only put objects into
+a cache need none of these, and they would take most of the time and memory. So kopf maintains the watches (connections,
+retries, expired versions) and sees only the version of each event. kopf's list provides the version to watch from; the
+manager then lists the objects itself. See docs/decisions/0027.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kopf._cogs.clients import fetching, watching
 
 from application_manager.cluster.client import ApiError, Object, Unreachable
 
-News = Callable[[Object], None]
+Handler = Callable[[Object], None]
 Relist = Callable[[Any, str | None, str], Awaitable[None]]
 """Lists a resource of kopf's again: in a namespace, or in all for None, by a label selector. May raise ApiError or
 Unreachable."""
@@ -27,29 +27,32 @@ log = logging.getLogger(__name__)
 
 
 @contextmanager
-def relaying(observe: News, vanished: News, relist: Relist) -> Iterator[None]:
-    """Hand on the news of kopf's watches while the block runs.
+def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callable[[], None]) -> Iterator[None]:
+    """Relay the events of kopf's watches while the block runs.
 
     Args:
-        observe: takes an object that is new or was changed.
-        vanished: takes an object that is gone.
-        relist: hands on all that there is.
+        observe: handles an object that was added or modified.
+        vanished: handles an object that was deleted.
+        relist: lists a kind and routes all of its objects.
+        failed: counts an object that could not be handled.
     """
     watch: Any = watching.watch_objs
     fetch = fetching.fetch_objs
-    takers = {"ADDED": observe, "MODIFIED": observe, "DELETED": vanished}
+    handlers = {"ADDED": observe, "MODIFIED": observe, "DELETED": vanished}
 
     async def watch_objs(**about: Any) -> AsyncIterator[Any]:
         async for event in watch(**about):
-            take = takers.get(event["type"])
-            if take is None:
+            handle = handlers.get(event["type"])
+            if handle is None:
                 yield event
                 continue
             raw: Object = event["object"]
             try:
-                take(raw)
-            except Exception:  # a defect in taking one object must not stop the watch
-                log.exception("%s %s could not be taken", raw.get("kind"), raw["metadata"].get("name"))
+                handle(raw)
+            except Exception:  # a defect in handling one object must not stop the watch
+                name = raw["metadata"].get("name")
+                log.exception("cannot handle %s %s; the next resync retries it", raw.get("kind"), name)
+                failed()
             version = raw["metadata"]["resourceVersion"]
             del event, raw
             yield {"type": "BOOKMARK", "object": {"metadata": {"resourceVersion": version}}}
@@ -63,8 +66,8 @@ def relaying(observe: News, vanished: News, relist: Relist) -> Iterator[None]:
         try:
             await relist(resource, namespace, labels)
         except (ApiError, Unreachable) as error:
-            log.warning("%s cannot be listed: %s", resource.plural, error)
-            raise TimeoutError from error  # which kopf takes as a reason to begin anew
+            log.warning("cannot list %s; retrying with backoff: %s", resource.plural, error)
+            raise TimeoutError from error  # on which kopf retries the list
         yield [], version
 
     watching.watch_objs, fetching.fetch_objs = watch_objs, fetch_objs

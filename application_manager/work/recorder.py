@@ -132,7 +132,7 @@ class _Said:
 
 @dataclass(slots=True)
 class _Series:
-    """An Event that was posted: its name, how often it was said, and when last, in seconds since 1970."""
+    """A posted Event: its name, the number of occurrences, and the time of the last one, in seconds since 1970."""
 
     name: str
     count: int

@@ -1,4 +1,4 @@
-"""Items that wait, by namespace: the namespaces take turns, so many items of one delay no other."""
+"""A queue that is fair by namespace: namespaces take turns, so a flood of items in one delays no other."""
 
 from __future__ import annotations
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import typer
 
 from detector.checking import findings, summary
-from detector.findings import CHECKS, UNREADABLE_FILE, UNREADABLE_RECORDING
+from detector.findings import CHECKS, UNREADABLE_RECORDING
 from wayside.api.documents import DocumentError, load_documents
-from wayside.findings import ignorable, listed
+from wayside.findings import UNREADABLE_FILE, ignorable, listed
 
 
 def list_checks() -> None:

@@ -41,15 +41,15 @@ def list_topics(recordings: Sequence[Path], *, as_yaml: bool) -> None:
 
 
 def list_live_topics(connect: Sequence[str], seconds: float, *, as_yaml: bool) -> None:
-    """Print what comes over Zenoh within so many seconds, or a Detector that takes it.
+    """Print the topics that receive samples over Zenoh within some seconds, or a Detector for them.
 
     Args:
-        connect: endpoints; none: whoever is found on the local network.
+        connect: endpoints; none: those that scouting finds on the local network.
         seconds: how long to listen.
         as_yaml: print a Detector.
 
     Raises:
-        NetworkError: nobody can be reached.
+        NetworkError: no endpoint can be reached.
         NothingHeardError: nothing came.
     """
     config = Zenoh(mode=ZenohMode.CLIENT, connect=[*connect], scouting=False) if connect else Zenoh()

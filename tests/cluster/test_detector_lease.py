@@ -186,7 +186,7 @@ def test_one_that_was_taken_over_holds_no_more(
     first.wait_held()
     api.patch("Lease", NAME, {"spec": {"holderIdentity": "pod-2", "leaseDurationSeconds": LONG}})
     first.wait_held(False)
-    wait_until(lambda: caplog.text, lambda text: "pod-2 took over" in text, what="it is said")
+    wait_until(lambda: caplog.text, lambda text: "pod-2 took over" in text, what="the log reports it")
 
 
 @pytest.mark.own_control_plane

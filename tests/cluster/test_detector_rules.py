@@ -107,7 +107,7 @@ def test_a_status_or_an_annotation_is_no_change(api: Api, following: Following) 
 def test_the_last_known_set_holds_while_the_detector_is_gone(
     api: Api, following: Following, caplog: pytest.LogCaptureFixture
 ) -> None:
-    wait_until(lambda: caplog.text, lambda text: "no Detector 'intersection-a'" in text, what="it is said")
+    wait_until(lambda: caplog.text, lambda text: "no Detector 'intersection-a'" in text, what="the log reports it")
     api.create(detector())
     api.create(rule("a"))
     following.wait_rules("a")

@@ -115,7 +115,7 @@ def watched(tmp_path: Path) -> Iterator[Watched]:
 
 
 def drive(watched: Watched, viewer: Viewer, done: Any) -> None:
-    """Two cars, until what is wanted is there; a value comes and goes."""
+    """Drive two cars until the wanted messages have arrived; one value is absent at times."""
     step, end = 0, time.monotonic() + PATIENCE
     while not done():
         assert time.monotonic() < end, (viewer.channels.keys(), {t: len(m) for t, m in viewer.messages.items()})

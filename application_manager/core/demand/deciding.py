@@ -33,8 +33,8 @@ def decide(
     """What should become of the instance, given the tasks that claim it.
 
     `other` is the template that its own one falls back to, if there is one of that name.
-    `deadline` is the release time of the decision before this one, None where that said to keep the instance: the
-    linger goes on while no demand comes, and begins anew after one came.
+    `deadline` is the release time of the decision before this one, None where that was to keep the instance: a
+    linger continues while there is no demand, and restarts after one.
     """
     ordered = sorted(claims, key=lambda each: precedence(each.task))
     paused = instance is not None and byhand.is_paused(instance)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from wayside.findings import Check, Severity
+from wayside.findings import INVALID_DETECTOR, UNREADABLE_FILE, Check, Severity
 
-UNREADABLE_FILE = Check("unreadable-file", Severity.ERROR, "a file is not YAML, or an object does not fit its kind")
 INVALID_TEMPLATE = Check("invalid-template", Severity.ERROR, "an ApplicationTemplate cannot be rendered")
-INVALID_DETECTOR = Check("invalid-detector", Severity.ERROR, "a field of a Detector cannot be used")
 INVALID_RULE = Check("invalid-rule", Severity.ERROR, "an EventRule compiles with no Detector that selects it")
 RULE_NOT_SELECTED = Check("rule-not-selected", Severity.WARNING, "no valid Detector selects the EventRule")
 RULE_NOT_READY = Check(

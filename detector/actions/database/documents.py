@@ -109,7 +109,7 @@ class Documents:
         *,
         undecoded: bool,
     ) -> Made:
-        """The document, or one that refers to the payload or names what is left out where it is too large."""
+        """The document; if it is too large, one that refers to the payload or lists the omitted fields."""
         collection = collection_of(stream)
         try:
             made = encoded(document)

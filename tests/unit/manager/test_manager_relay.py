@@ -1,4 +1,4 @@
-"""News of kopf's watches are handed on at once, and kopf learns their versions alone: around kopf's own functions."""
+"""Events of kopf's watches are relayed at once, and kopf sees their versions alone: around kopf's own functions."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 from kopf._cogs.clients import api, watching
 
 from application_manager.cluster.client import Unreachable
+from application_manager.measures import Measures
 from application_manager.watching.relay import relaying
 
 RESOURCE = SimpleNamespace(plural="applicationtasks", get_url=lambda **_: "")
@@ -35,8 +36,8 @@ def answering(monkeypatch: pytest.MonkeyPatch, *events: Event) -> None:
     monkeypatch.setattr(kopf.OperatorSettings().watching.label_selectors.__class__, "collect", lambda *_: [])
 
 
-async def watched(taken: list[Event], *, unreachable: bool = False) -> list[Any]:
-    """What kopf sees of a watch; what is handed on goes into `taken`."""
+async def watched(taken: list[Event], measures: Measures, *, unreachable: bool = False) -> list[Any]:
+    """What kopf sees of a watch; what is relayed goes into `taken`."""
 
     def observe(raw: Any) -> None:
         taken.append(("there", raw["metadata"]["name"]))
@@ -51,7 +52,7 @@ async def watched(taken: list[Event], *, unreachable: bool = False) -> list[Any]
     resource: Any = RESOURCE
     stopper: Any = asyncio.get_running_loop().create_future()
     seen = []
-    with relaying(observe, lambda raw: taken.append(("gone", raw["metadata"]["name"])), relist):
+    with relaying(observe, lambda raw: taken.append(("gone", raw["metadata"]["name"])), relist, measures.unhandled):
         async for each in watching.continuous_watch(
             settings=kopf.OperatorSettings(), resource=resource, namespace="town", operator_pause_waiter=stopper
         ):
@@ -61,22 +62,23 @@ async def watched(taken: list[Event], *, unreachable: bool = False) -> list[Any]
     return seen
 
 
-def test_news_are_handed_on_and_kopf_sees_versions_alone(
+def test_events_are_relayed_and_kopf_sees_versions_alone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     answering(monkeypatch, ("ADDED", "new"), ("MODIFIED", "faulty"), ("BOOKMARK", ""), ("DELETED", "old"))
-    taken: list[Event] = []
+    taken, measures = list[Event](), Measures()
     with caplog.at_level(logging.ERROR):
-        seen = asyncio.run(watched(taken))
+        seen = asyncio.run(watched(taken, measures))
     assert taken == [("listed", "applicationtasks in town"), ("there", "new"), ("there", "faulty"), ("gone", "old")]
     versions = [each["object"]["metadata"]["resourceVersion"] for each in seen if isinstance(each, dict)]
     assert versions == ["6", "7", "8", "9"]
     assert {each["type"] for each in seen if isinstance(each, dict)} == {"BOOKMARK"}
-    assert "faulty could not be taken" in caplog.text
+    assert "faulty; the next resync retries it" in caplog.text
+    assert b'reconcile_failures_total{queue="watch"} 1.0' in measures.text()
 
 
 def test_a_list_that_fails_begins_the_watch_again(monkeypatch: pytest.MonkeyPatch) -> None:
     answering(monkeypatch, ("ADDED", "new"))
     taken: list[Event] = []
-    assert asyncio.run(watched(taken, unreachable=True)) == []
+    assert asyncio.run(watched(taken, Measures(), unreachable=True)) == []
     assert taken == []
