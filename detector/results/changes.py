@@ -67,16 +67,11 @@ class Changes:
             self._parts.append((clients[rows], times[ticks], new, tags[rows, ticks]))
         return Found(rows, ticks, new)
 
-    def by_client(self, wanted: NDArray[np.bool_]) -> Iterator[tuple[int, Integers, Doubles, Bytes]]:
-        """Of each client that is wanted, by its number: the number, and times, values and tags of its changes."""
-        if not self._parts or not wanted.any():
+    def by_client(self) -> Iterator[tuple[int, Integers, Doubles, Bytes]]:
+        """Of each client, by its number: the number, and times, values and tags of its changes."""
+        if not self._parts:
             return
         clients, times, values, tags = (np.concatenate(part) for part in zip(*self._parts, strict=True))
-        if not wanted.all():
-            chosen = wanted[clients]
-            clients, times, values, tags = clients[chosen], times[chosen], values[chosen], tags[chosen]
-        if not len(clients):
-            return
         order = np.argsort(clients, kind="stable")
         clients, times, values, tags = clients[order], times[order], values[order], tags[order]
         bounds = [0, *(np.flatnonzero(np.diff(clients)) + 1).tolist(), len(clients)]

@@ -163,8 +163,11 @@ class LiveView:
             return Tracer()
         if not topics:
             return None
-        rules = frozenset(topic.split("/")[2] for topic in topics - {EPISODES, LOG, SCENE})
-        return Tracer(rules, ways=SCENE in topics)
+        subjects: dict[str, set[str]] = {}
+        for topic in topics - {EPISODES, LOG, SCENE}:
+            _, _, rule, subject = topic.split("/", 3)
+            subjects.setdefault(rule, set()).add(subject)
+        return Tracer(subjects, ways=SCENE in topics)
 
     def _hand_over(self, tracer: Tracer, engine: Engine) -> None:
         tracer.settle()
@@ -254,6 +257,8 @@ class LiveView:
         """The subject's channel; it is opened again where there is more to declare."""
         known = self._channels.get(topic)
         if known is not None:
+            if schema == known.schema:
+                return known.channel
             schema = {**schema, "properties": _merged(known.schema["properties"], schema["properties"])}
             if schema == known.schema:
                 return known.channel

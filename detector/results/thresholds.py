@@ -54,21 +54,34 @@ def terms_of(rule: CompiledRule, subject: SubjectTrace) -> Terms:
     for field, expression in (("when", rule.when), ("until", rule.until)):
         if expression is None:
             continue
-        for operator, left, right in _compared(expression):
-            for term, other, sign in ((left, right, operator), (right, left, _TURNED[operator])):
-                limit, name = _constant(other, expression.names, values), _text(term, expression.names)
-                if limit is None or name is None or not set(_names(term, expression.names)) <= subject.signals.keys():
-                    continue
-                thresholds[Threshold(field, name, sign, limit)] = None
-                if name not in subject.signals and name not in computed:
-                    computed[name] = _computed(term, expression.names, subject.signals)
+        for sign, term, other in _compared(expression):
+            limit = _constant(other, expression.names, values)
+            if limit is None or not term.signals <= subject.signals.keys():
+                continue
+            thresholds[Threshold(field, term.text, sign, limit)] = None
+            if term.text not in subject.signals and term.text not in computed:
+                computed[term.text] = _computed(term, expression.names, subject.signals)
     return Terms(tuple(thresholds), computed)
 
 
+class _Term(NamedTuple):
+    """What a comparison compares: a signal, or arithmetic over several."""
+
+    node: Node
+    text: str
+    signals: frozenset[str]
+
+
 @lru_cache(maxsize=1024)
-def _compared(expression: Expression) -> tuple[tuple[str, Node, Node], ...]:
-    """The comparisons of a condition. Decoding its tree takes longer than all that is done with it."""
-    return tuple(_comparisons(expression.tree))
+def _compared(expression: Expression) -> tuple[tuple[str, _Term, Node], ...]:
+    """The comparisons of a condition: the operator, a term, what it is compared with; each from both of its sides."""
+    found = []
+    for operator, left, right in _comparisons(expression.tree):
+        for node, other, sign in ((left, right, operator), (right, left, _TURNED[operator])):
+            text = _text(node, expression.names)
+            if text is not None:
+                found.append((sign, _Term(node, text, frozenset(_names(node, expression.names))), other))
+    return tuple(found)
 
 
 def _comparisons(node: Node) -> Iterator[tuple[str, Node, Node]]:
@@ -138,10 +151,10 @@ def _name(path: Path) -> str:
     return ".".join(map(str, path))
 
 
-def _computed(node: Node, names: frozenset[str], signals: Mapping[str, Series]) -> Series:
-    times = np.unique(np.concatenate([signals[name].times for name in _names(node, names)]))
+def _computed(term: _Term, names: frozenset[str], signals: Mapping[str, Series]) -> Series:
+    times = np.unique(np.concatenate([signals[name].times for name in sorted(term.signals)]))
     with np.errstate(all="ignore"):
-        values = _values(node, names, lambda name: signals[name].at(times))
+        values = _values(term.node, names, lambda name: signals[name].at(times))
     values = np.broadcast_to(np.asarray(values, float), times.shape)
     kept = np.ones(len(times), bool)
     kept[1:] = (values[1:] != values[:-1]) & ~(np.isnan(values[1:]) & np.isnan(values[:-1]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ from detector.results.series import (
 )
 from detector.results.witnessing import Witnessed
 from wayside.expressions.columns.values import Tag
+from wayside.names import subject_text
 from wayside.rules import CompiledRule, PairSubject
 
 _POINTS = 20_000
@@ -61,9 +62,12 @@ class _Plan(NamedTuple):
 class Tracer:
     """Looks on at a replay. The engine's observer; ask it for the trace at the end."""
 
-    def __init__(self, rules: frozenset[str] | None = None, *, ways: bool = True) -> None:
-        """`rules` are those that are looked at, None: all; `ways`: note where clients are."""
-        self._rules = rules
+    def __init__(self, subjects: Mapping[str, Set[str]] | None = None, *, ways: bool = True) -> None:
+        """`subjects`: those to trace, by rule, None: all; `ways`: note where clients are."""
+        self._subjects = subjects
+        self._client_texts = {text.partition("~")[0] for texts in (subjects or {}).values() for text in texts}
+        self._traced: list[int] = []
+        """Numbers of clients that are traced, where not all subjects are."""
         self._with_ways = ways
         self.engine: Engine | None = None
         """That of the replay, for what it counts."""
@@ -131,11 +135,11 @@ class Tracer:
 
     def _note(self, plan: _Plan, block: Seen, codes: Codes, numbers: Integers, looked: Truths | None) -> None:
         everybody = looked is None
-        at_all: slice | NDArray[np.bool_] = slice(None) if looked is None else np.asarray(looked.any(axis=0))
+        at_all = self._rows(numbers, None if looked is None else np.asarray(looked.any(axis=0)))
         for at, track, name, changes in plan.signals:
             self._signal(block, track, name, numbers, changes, at, at_all)
         for row, track, field, changes in plan.conditions:
-            chosen = slice(None) if looked is None else looked[row]
+            chosen = self._rows(numbers, None if looked is None else looked[row])
             self._condition(block, codes, row, track, field, numbers, changes, chosen)
         if everybody:
             gone = plan.seen.difference(numbers.tolist())
@@ -143,6 +147,13 @@ class Tracer:
                 self._lost(plan, np.array(sorted(gone), np.int64), block.times[:1])
             plan.seen.clear()
             plan.seen.update(numbers.tolist())
+
+    def _rows(self, numbers: Integers, looked: Truths | None) -> slice | Truths:
+        """The clients of a block that are traced, of those that the rule looks at."""
+        if self._subjects is None:
+            return slice(None) if looked is None else looked
+        traced = np.isin(numbers, self._traced)
+        return traced if looked is None else traced & looked
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
         """Note what changes in a block of rules about the fleet: the number of members, and conditions."""
@@ -183,7 +194,7 @@ class Tracer:
 
     def looks_at(self, rule: str) -> bool:
         """Whether the rule is one of those that are looked at."""
-        return self._rules is None or rule in self._rules
+        return self._subjects is None or rule in self._subjects
 
     def _pair(self, track: Track, these: PairBlock, time: int, numbers: Integers) -> None:
         log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
@@ -213,26 +224,22 @@ class Tracer:
 
     def _of_clients(self, found: dict[tuple[str, str], SubjectTrace], wanted: Wanted) -> None:
         subjects: dict[tuple[str, str | None, int], SubjectTrace] = {}
-        whole = [Subject(() if name == FLEET else (name,)) for name in self._names]
-        chosen: dict[tuple[str, str | None], NDArray[np.bool_]] = {}
         for (rule, element, field), changes in self._conditions.items():
             reasons = self._reasons[rule, element, field]
-            if (rule, element) not in chosen:
-                texts_of = (subject._replace(element=element).text for subject in whole)
-                chosen[rule, element] = np.array([wanted(rule, text) for text in texts_of], bool)
-            for client, times, values, _ in changes.by_client(chosen[rule, element]):
-                clients = whole[client].clients
+            for client, times, values, _ in changes.by_client():
+                clients = () if self._names[client] == FLEET else (self._names[client],)
                 text = Subject(clients, element).text
-                subject = found.setdefault((rule, text), SubjectTrace(rule, text, clients))
-                subjects[rule, element, client] = subject
-                subject.conditions[field] = _steps(times, values.astype(np.uint8), reasons, client)
+                if wanted(rule, text):
+                    subject = found.setdefault((rule, text), SubjectTrace(rule, text, clients))
+                    subject.conditions[field] = _steps(times, values.astype(np.uint8), reasons, client)
+                    subjects[rule, element, client] = subject
         texts = tuple(self._texts)
         for (rule, element, signal), parts in self._aliases.items():
-            if (rule, element, signal) in self._odd or (rule, element) not in chosen:
+            if (rule, element, signal) in self._odd:
                 continue
             by_client: dict[int, list[Series]] = {}
             for changes in parts.values():
-                for client, times, values, tags in changes.by_client(chosen[rule, element]):
+                for client, times, values, tags in changes.by_client():
                     if (rule, element, client) in subjects:
                         by_client.setdefault(client, []).append(_series(times, values, tags, texts))
             for client, series in by_client.items():
@@ -341,6 +348,8 @@ class Tracer:
         if number is None:
             number = self._numbers[client] = len(self._names)
             self._names.append(client)
+            if self._subjects is not None and subject_text((client,)) in self._client_texts:
+                self._traced.append(number)
         return number
 
     def _time(self, first: int, last: int) -> None:
