@@ -12,7 +12,7 @@ from tests.guides import ROOT, guide
 
 TROUBLES = guide("troubleshooting")
 DECISIONS = ROOT / "docs/decisions"
-STATUS = re.compile(r"(?:Accepted|Superseded by \[\d+\]\(\d{4}-[a-z0-9-]+\.md\)), \d{4}-\d\d-\d\d")
+STATUS = re.compile(r"(?:Accepted|Superseded by \[[\w.]+\]\([\w./-]+\.md\)), \d{4}-\d\d-\d\d")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s<]+)[)#]")
 
 
