@@ -60,11 +60,11 @@ DETECTOR: Object = {
                 "encoding": "cdr",
                 "type": "geometry_msgs/msg/PoseStamped",
                 "staleAfter": "2s",
-                "buffer": {"duration": "30s", "bytes": "64Mi"},
+                "buffer": {"duration": "1m30.5s", "bytes": 67108864},
             },
             {"name": "signals", "key": "rsu/signals", "client": "rsu-1", "encoding": "json", "staleAfter": "Never"},
         ],
-        "buffer": {"duration": "10s", "bytes": "512Mi"},
+        "buffer": {"duration": "10s", "bytes": "5e8"},
         "rules": {"matchLabels": {"site": "intersection-a"}},
     },
 }

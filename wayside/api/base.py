@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
+from decimal import Decimal
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.alias_generators import to_camel
+from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
@@ -36,9 +39,11 @@ class _PatternString(str):
     pattern: ClassVar[str]
     expectation: ClassVar[str]
     maximum_length: ClassVar[int] = 20
+    rules: ClassVar[tuple[JsonDict, ...]] = ()
 
     @classmethod
     def parse(cls, text: str) -> Self:
+        """The value that the text stands for. Raises ValueError, with the text and what is expected."""
         if len(text) > cls.maximum_length or not re.fullmatch(cls.pattern, text):
             raise ValueError(f"{text!r} is not {cls.expectation}")
         return cls(text)
@@ -47,27 +52,38 @@ class _PatternString(str):
     def __get_pydantic_core_schema__(cls, source: type[Any], handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(
             cls.parse,
-            core_schema.str_schema(strict=True),
+            cls._input_schema(),
             serialization=core_schema.plain_serializer_function_ser_schema(str),
         )
 
     @classmethod
+    def _input_schema(cls) -> CoreSchema:
+        return core_schema.str_schema(strict=True)
+
+    @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"type": "string", "pattern": f"^{cls.pattern}$", "maxLength": cls.maximum_length}
+        rules = {"x-kubernetes-validations": list(cls.rules)} if cls.rules else {}
+        return {"type": "string", "pattern": f"^{cls.pattern}$", "maxLength": cls.maximum_length, **rules}
 
 
 class Duration(_PatternString):
-    """A length of time such as ``500ms``, ``10s``, ``5m`` or ``2h``."""
+    """A length of time as Go writes it, such as ``500ms``, ``10s`` or ``1h30m``."""
 
-    pattern = r"[0-9]{1,9}(ms|s|m|h)"
-    expectation = "a duration: write a whole number and a unit, such as 500ms, 10s, 5m or 2h"
-    _UNITS: ClassVar[dict[str, int]] = {"ms": 10**6, "s": 10**9, "m": 60 * 10**9, "h": 3600 * 10**9}
+    pattern = r"([0-9]{1,6}(\.[0-9]{1,9})?(h|m)|[0-9]{1,9}(\.[0-9]{1,9})?(s|ms|us|ns))+"
+    expectation = "a duration: write numbers with units, such as 500ms, 10s, 1.5s or 1h30m"
+    _UNITS: ClassVar[dict[str, int]] = {
+        "ns": 1,
+        "us": 10**3,
+        "ms": 10**6,
+        "s": 10**9,
+        "m": 60 * 10**9,
+        "h": 3600 * 10**9,
+    }
 
     @property
     def ns(self) -> int:
-        """The duration in nanoseconds."""
-        digits = self.rstrip("hms")
-        return int(digits) * self._UNITS[self[len(digits) :]]
+        """The duration in nanoseconds; what is below is cut off, as Go does."""
+        return sum(int(Decimal(number) * self._UNITS[unit]) for number, unit in re.findall(r"([0-9.]+)([a-z]+)", self))
 
     @property
     def seconds(self) -> float:
@@ -78,40 +94,73 @@ class Duration(_PatternString):
 class PositiveDuration(Duration):
     """A length of time that is not zero."""
 
-    pattern = r"0*[1-9][0-9]{0,8}(ms|s|m|h)"
-    expectation = "a duration above zero: write a whole number and a unit, such as 500ms, 10s, 5m or 2h"
+    expectation = "a duration above zero: write numbers with units, such as 500ms, 10s, 1.5s or 1h30m"
+    rules = ({"rule": "!self.matches('^[0.hmnsu]*$')", "message": "give a duration above zero, such as 500ms or 10s"},)
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """As for any duration; raises ValueError for zero as well."""
+        parsed = super().parse(text)
+        if parsed.ns == 0:
+            raise ValueError(f"{text!r} is not {cls.expectation}")
+        return parsed
 
 
 class Quantity(_PatternString):
-    """A size in Kubernetes notation, such as ``64Mi`` or ``1G``."""
+    """An amount in Kubernetes notation, such as ``64Mi``, ``1e9`` or ``250m``; whole numbers need no quotes."""
 
-    pattern = r"[0-9]{1,12}(k|M|G|T|Ki|Mi|Gi|Ti)?"
-    expectation = "a size: write a whole number of bytes with or without a unit, such as 512Mi or 2G"
-    _UNITS: ClassVar[dict[str, int]] = {
-        "": 1,
-        "k": 10**3,
-        "M": 10**6,
-        "G": 10**9,
-        "T": 10**12,
-        "Ki": 2**10,
-        "Mi": 2**20,
-        "Gi": 2**30,
-        "Ti": 2**40,
+    pattern = r"([0-9]{1,18}(\.[0-9]{0,9})?|\.[0-9]{1,9})([numkMGTPE]|[KMGTPE]i|[eE][+-]?[0-9]{1,2})?"
+    expectation = "a quantity: write a number with or without a unit, such as 512Mi, 2G or 1e9"
+    rules = ({"rule": "type(self) != int || self >= 0", "message": "give a quantity of zero or more"},)
+    _UNITS: ClassVar[dict[str, Decimal]] = {
+        **{unit: Decimal(10) ** (3 * power) for power, unit in enumerate(("n", "u", "m", "", "k", *"MGTPE"), -3)},
+        **{f"{unit}i": Decimal(2) ** (10 * power) for power, unit in enumerate("KMGTPE", 1)},
     }
 
     @property
+    def value(self) -> Decimal:
+        """The exact amount."""
+        number, unit = re.fullmatch(r"([0-9.]+)(.*)", self).groups()  # type: ignore[union-attr]  # the pattern fits
+        return Decimal(number) * (self._UNITS[unit] if unit in self._UNITS else Decimal(10) ** int(unit[1:]))
+
+    @property
     def bytes(self) -> int:
-        """The size in bytes."""
-        digits = re.match("[0-9]+", self)
-        assert digits is not None  # noqa: S101  the pattern guarantees it
-        return int(digits[0]) * self._UNITS[self[digits.end() :]]
+        """The amount as a size in bytes, rounded up, as Kubernetes does."""
+        return math.ceil(self.value)
+
+    @classmethod
+    def _input_schema(cls) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(_whole_number_as_text, core_schema.str_schema(strict=True))
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        described = super().__get_pydantic_json_schema__(schema, handler)
+        del described["type"]
+        return {"x-kubernetes-int-or-string": True, **described}
+
+
+def _whole_number_as_text(given: object) -> object:
+    return str(given) if isinstance(given, int) and not isinstance(given, bool) else given
 
 
 class PositiveQuantity(Quantity):
-    """A size that is not zero."""
+    """An amount that is not zero."""
 
-    pattern = r"0*[1-9][0-9]{0,11}(k|M|G|T|Ki|Mi|Gi|Ti)?"
-    expectation = "a size above zero: write a whole number of bytes with or without a unit, such as 512Mi or 2G"
+    expectation = "a quantity above zero: write a number with or without a unit, such as 512Mi, 2G or 1e9"
+    rules = (
+        {
+            "rule": "type(self) == int ? self > 0 : !self.matches('^[0.]+([a-zA-Z].*)?$')",
+            "message": "give a quantity above zero, such as 512Mi",
+        },
+    )
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """As for any quantity; raises ValueError for zero as well."""
+        parsed = super().parse(text)
+        if parsed.value == 0:
+            raise ValueError(f"{text!r} is not {cls.expectation}")
+        return parsed
 
 
 Expression = Annotated[str, Field(min_length=1, max_length=2048)]

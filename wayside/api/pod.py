@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from decimal import Decimal
 from enum import StrEnum
 from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from wayside.api.base import Identifier, Model, ObjectName, PositiveQuantity, validations
+from wayside.api.base import Identifier, Model, ObjectName, PositiveQuantity, Quantity, validations
 
 _ONE = "give claim or size, not both"
 _ONE_SOURCE = "give exactly one of value and fromSecret"
@@ -29,11 +28,8 @@ class DetectorMode(StrEnum):
 MountPath = Annotated[str, Field(min_length=2, max_length=1024, pattern=r"^/[^:]+$")]
 """An absolute path in the pod."""
 
-Amount = Annotated[str, Field(min_length=1, max_length=32, pattern=r"^[0-9]+(\.[0-9]+)?(m|k|M|G|T|Ki|Mi|Gi|Ti)?$")]
-"""An amount of a resource in Kubernetes notation, such as 250m or 1Gi."""
-
 Amounts = Annotated[
-    dict[Annotated[str, Field(max_length=253)], Amount],
+    dict[Annotated[str, Field(max_length=253)], Quantity],
     Field(max_length=16),
 ]
 """By the resource's name: cpu, memory, ephemeral-storage or one of the cluster's own."""
@@ -67,11 +63,11 @@ class DetectorResources(Model):
     """The compute resources of the detector: requests and limits."""
 
     requests: Amounts = Field(
-        default_factory=lambda: {"cpu": "100m", "memory": "256Mi"},
+        default_factory=lambda: {"cpu": Quantity("100m"), "memory": Quantity("256Mi")},
         description="The resources that a node must have available. Default: cpu 100m, memory 256Mi.",
     )
     limits: Amounts = Field(
-        default_factory=lambda: {"memory": "1Gi"},
+        default_factory=lambda: {"memory": Quantity("1Gi")},
         description="The maximum resources. The memory limit must cover the buffer (spec.buffer.bytes) plus some "
         "200Mi. Default: memory 1Gi.",
     )
@@ -88,22 +84,14 @@ class DetectorResources(Model):
                     )
         for name, amount in self.requests.items():
             limit = self.limits.get(name)
-            if limit is not None and _amount(amount) > _amount(limit):
+            if limit is not None and amount.value > limit.value:
                 raise ValueError(f"requests.{name}: {amount} is more than limits.{name}, {limit}: raise the limit")
-            if "/" in name and (limit is None or _amount(amount) != _amount(limit)):
+            if "/" in name and (limit is None or amount.value != limit.value):
                 raise ValueError(f"requests.{name}: {amount} must equal limits.{name}: set both to the same amount")
         return self
 
 
 _RESOURCES = ("cpu", "memory", "ephemeral-storage")
-_UNITS: dict[str, Decimal] = {"m": Decimal("0.001"), "k": Decimal(10**3), "M": Decimal(10**6), "G": Decimal(10**9)} | {
-    "T": Decimal(10**12), "Ki": Decimal(2**10), "Mi": Decimal(2**20), "Gi": Decimal(2**30), "Ti": Decimal(2**40)
-}  # fmt: skip
-
-
-def _amount(text: str) -> Decimal:
-    number = text.rstrip("mkKMGTi")
-    return Decimal(number) * _UNITS.get(text[len(number) :], 1)
 
 
 class SecretKey(Model):

@@ -92,7 +92,7 @@ def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, 
                 result.pop("additionalProperties", None)
     elif result.get("type") == "array":
         result["items"] = _structural(node.get("items", {}), definitions)
-    elif "type" not in result:
+    elif "type" not in result and "x-kubernetes-int-or-string" not in result:
         result["x-kubernetes-preserve-unknown-fields"] = True
     return result
 

@@ -172,7 +172,12 @@ class Stream(Model):
         default=None,
         description="The signals of the stream are unknown if its newest sample is older than this. Never: no limit, "
         "for latched topics. Default: 5s, or clientTimeout if that is shorter; Never for latched streams.",
-        json_schema_extra={"type": "string", "pattern": f"^({PositiveDuration.pattern}|Never)$", "maxLength": 20},
+        json_schema_extra={
+            "type": "string",
+            "pattern": f"^({PositiveDuration.pattern}|Never)$",
+            "maxLength": PositiveDuration.maximum_length,
+            "x-kubernetes-validations": list(PositiveDuration.rules),
+        },
     )
     buffer: StreamBuffer = Field(
         default=StreamBuffer(),

@@ -131,19 +131,19 @@ def test_a_problem_names_its_place_the_value_and_the_remedy(
         ),
         (
             DETECTOR + "  streams:\n  - {name: s, key: 'a/${client:*}', encoding: json, staleAfter: 0s}",
-            "f.yaml:6:5: spec.streams[0]: staleAfter: '0s' is not a duration above zero: write a whole number",
+            "f.yaml:6:5: spec.streams[0]: staleAfter: '0s' is not a duration above zero: write numbers with units",
         ),
         (
             DETECTOR + "  clientTimeout: 0m\n  streams: [{name: s, key: a, client: c, encoding: json}]",
-            "f.yaml:5:18: spec.clientTimeout: '0m' is not a duration above zero: write a whole number and a unit",
+            "f.yaml:5:18: spec.clientTimeout: '0m' is not a duration above zero: write numbers with units",
         ),
         (
             DETECTOR + "  buffer: {bytes: 0Mi}\n  streams: [{name: s, key: a, client: c, encoding: json}]",
-            "f.yaml:5:19: spec.buffer.bytes: '0Mi' is not a size above zero: write a whole number of bytes",
+            "f.yaml:5:19: spec.buffer.bytes: '0Mi' is not a quantity above zero: write a number",
         ),
         (
             DETECTOR + "  buffer: {bytes: 5 MB}\n  streams: [{name: s, key: a, client: c, encoding: json}]",
-            "f.yaml:5:19: spec.buffer.bytes: '5 MB' is not a size above zero: write a whole number of bytes",
+            "f.yaml:5:19: spec.buffer.bytes: '5 MB' is not a quantity above zero: write a number",
         ),
         (
             DETECTOR + "  zenoh: {connect: ['zenoh:7447']}\n  streams: [{name: s, key: a, client: c, encoding: json}]",

@@ -95,7 +95,8 @@ def test_every_field_is_described_and_bounded(kind: str) -> None:
 def test_the_schema_is_structural(kind: str) -> None:
     for path, node in nodes(schema_of(kind), kind):
         assert not node.keys() & {"$ref", "anyOf", "allOf", "oneOf", "patternProperties", "title", "const"}, path
-        assert "type" in node or node.get("x-kubernetes-preserve-unknown-fields"), path
+        typed = node.keys() & {"type", "x-kubernetes-int-or-string", "x-kubernetes-preserve-unknown-fields"}
+        assert typed, path
         assert not ("properties" in node and "additionalProperties" in node), path
         assert None not in node.get("default", {}).values() if isinstance(node.get("default"), dict) else True, path
 
