@@ -86,8 +86,8 @@ def _left_out(documents: dict[str, Document], chosen: dict[str, Document], detec
             )
             yield str(document.problem(("metadata", "namespace"), f"the EventRule {name!r} is not evaluated: {why}"))
         else:
-            labels = ", ".join(f"{key}: {value}" for key, value in detector.spec.rules.match_labels.items())
-            why = f"the Detector {detector.name!r} selects by the labels {{{labels}}}: add them to metadata.labels"
+            selected = f"the Detector {detector.name!r} selects by labels: {detector.spec.rules}"
+            why = f"{selected}: correct metadata.labels"
             yield str(document.problem(("metadata", "labels"), f"the EventRule {name!r} is not evaluated: {why}"))
 
 

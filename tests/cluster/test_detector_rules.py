@@ -16,6 +16,7 @@ from tests.cluster.waiting import PATIENCE, wait_until
 
 API_VERSION = "wayside.dev/v1alpha1"
 SITE = {"site": "a"}
+WITHOUT_SITE = {"key": "site", "operator": "DoesNotExist"}
 
 
 def detector(**spec: Any) -> Object:
@@ -86,7 +87,7 @@ def test_each_change_is_followed(api: Api, following: Following) -> None:
     following.wait_rules("a", "b")
     api.delete("EventRule", "a")
     following.wait_rules("b")
-    api.patch("Detector", "intersection-a", {"spec": {"rules": {"matchLabels": {"site": "none"}}}})
+    api.patch("Detector", "intersection-a", {"spec": {"rules": {"matchExpressions": [WITHOUT_SITE]}}})
     following.wait_rules()
     api.patch("Detector", "intersection-a", {"spec": {"clientTimeout": "7s"}})
     following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the Detector is the changed one")

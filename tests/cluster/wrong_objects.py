@@ -235,6 +235,12 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         r"spec\.zenoh: .*liveliness does not capture the client",
     ),
     ("Detector", "a source without its plugin", {"spec.sources": [{"name": "a"}]}, r"spec\.sources\[0\]\.plugin: Req"),
+    (
+        "Detector",
+        "a selector without its values",
+        {"spec.rules.matchExpressions": [{"key": "site", "operator": "In"}]},
+        r"spec\.rules\.matchExpressions\[0\].*: .*operators In and NotIn need values",
+    ),
     ("Detector", "an unknown clock", {"spec.clock": "Sun"}, r'spec\.clock: Unsupported value: "Sun".*"Wall", "Data"'),
     ("ApplicationTemplate", "no manifests", {"spec.manifests": []}, r"spec\.manifests: .*at least 1 items"),
     (

@@ -24,6 +24,7 @@ from wayside.api.constants import Constants
 from wayside.api.database import Database
 from wayside.api.pod import DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
+from wayside.api.selector import LabelSelector
 from wayside.api.source import DataSource
 from wayside.api.stream import (
     MessageDefinition,
@@ -83,20 +84,6 @@ class State(Model):
         description="The folder, on a volume that outlives the process, e.g. /var/lib/wayside. It is created if "
         "missing. A change takes effect at the next start.",
     )
-
-
-class RuleSelector(Model):
-    """Selects EventRules of the Detector's namespace by their labels."""
-
-    match_labels: dict[Annotated[str, Field(max_length=317)], Annotated[str, Field(max_length=63)]] = Field(
-        default_factory=dict,
-        max_length=16,
-        description="The labels that a rule must have, all of them. An empty map selects every rule.",
-    )
-
-    def matches(self, labels: dict[str, str]) -> bool:
-        """Whether a rule with these labels is selected."""
-        return all(labels.get(key) == value for key, value in self.match_labels.items())
 
 
 _POD_WITHOUT_MODE = "pod has no effect without mode: set mode to Standalone or Sidecar, or remove pod"
@@ -200,8 +187,9 @@ class DetectorSpec(Model):
     database: Database | None = Field(
         default=None, description="The MongoDB database of database actions. Required by rules that use them."
     )
-    rules: RuleSelector = Field(
-        default=RuleSelector(), description="Selects the EventRules of the namespace to evaluate."
+    rules: LabelSelector = Field(
+        default=LabelSelector(),
+        description="Selects the EventRules of the namespace to evaluate, by their labels. Default: every rule.",
     )
 
     @model_validator(mode="after")

@@ -22,6 +22,9 @@ _PATTERNS = {
     "before the host (give credentialsSecret)",
     r"^[^/*$#?]+(/[^/*$#?]+)*$": "a Zenoh key without wildcards, e.g. city/alerts",
     r"^WAYSIDE_[A-Z0-9_]+$": "a name that begins with WAYSIDE_, in capitals: rules cannot use other variables",
+    r"^([-a-z0-9.]{1,253}/)?[A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?$": "a label's key, e.g. site or example.com/site",
+    r"^([A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?)?$": "a label's value: up to 63 letters, digits, - _ . with a letter "
+    "or digit at both ends",
     r"^[a-z]+/.+$": "protocol/address:port, e.g. tcp/zenoh:7447",
 }
 """The models' patterns in words."""

@@ -115,11 +115,7 @@ def _not_selected(rule: EventRule, detectors: Sequence[Detector], invalid: Seque
 
 
 def _remedies(detectors: Sequence[Detector], invalid: Sequence[str]) -> Iterator[str]:
-    wanted = [f"{each.name} selects {_labels(each)}" for each in sorted(detectors, key=lambda each: each.name)]
+    wanted = [f"{each.name} selects {each.spec.rules}" for each in sorted(detectors, key=lambda each: each.name)]
     if wanted:
-        yield f"add labels to metadata.labels: {'; '.join(wanted)}"
+        yield f"correct metadata.labels: {'; '.join(wanted)}"
     yield from (f"correct Detector {name}, whose status says what is wrong with it" for name in sorted(invalid))
-
-
-def _labels(detector: Detector) -> str:
-    return ", ".join(f"{key}={value}" for key, value in sorted(detector.spec.rules.match_labels.items())) or "all"

@@ -82,8 +82,8 @@ def test_an_error_of_a_fleet_condition_names_the_signals_that_it_reads(desk: Des
 @pytest.mark.parametrize(
     ("field", "text", "said"),
     [
-        ("key", "veh/${client:*}/odom/", "detector.yaml:29:10: spec.streams[0].key: "),
-        ("stamp", "msg.", "detector.yaml:31:12: spec.streams[0].stamp: line 1, "),
+        ("key", "veh/${client:*}/odom/", "detector.yaml:30:10: spec.streams[0].key: "),
+        ("stamp", "msg.", "detector.yaml:32:12: spec.streams[0].stamp: line 1, "),
         ("stamp", "t", "; write sample.received for the t of JSON lines"),
     ],
 )

@@ -63,7 +63,7 @@ def test_a_rule_that_the_detector_does_not_select_is_left_out_and_said(write: Wr
     [warning] = loaded.warnings
     assert "r.yaml:" in warning
     assert "'out' is not evaluated" in warning
-    assert "{site: a}: add them" in warning
+    assert "selects by labels: site=a: correct metadata.labels" in warning
 
 
 def test_a_rule_of_another_namespace_is_left_out_and_said(write: Write) -> None:
