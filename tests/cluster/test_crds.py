@@ -223,9 +223,9 @@ class TestKubectl:
     @pytest.mark.parametrize(
         ("short", "manifest", "columns"),
         [
-            ("er", EVENT_RULE, ["NAME", "ENABLED", "ACCEPTED", "DETECTORS", "WHEN", "AGE", "MESSAGE"]),
-            ("det", DETECTOR, ["NAME", "CLOCK", "RULES", "ACCEPTED", "RUNNING", "AGE", "MESSAGE"]),
-            ("apptpl", APPLICATION_TEMPLATE, ["NAME", "KEY", "INSTANCES", "MAX", "ACCEPTED", "AGE", "MESSAGE"]),
+            ("er", EVENT_RULE, ["NAME", "ENABLED", "READY", "DETECTORS", "WHEN", "AGE", "MESSAGE"]),
+            ("det", DETECTOR, ["NAME", "CLOCK", "RULES", "READY", "AGE", "MESSAGE"]),
+            ("apptpl", APPLICATION_TEMPLATE, ["NAME", "KEY", "INSTANCES", "MAX", "READY", "AGE", "MESSAGE"]),
             (
                 "apptask",
                 APPLICATION_TASK,

@@ -72,7 +72,7 @@ def test_columns_tell_what_is_wanted_what_runs_and_what_is_lacking(
     api.delete("ApplicationTask", "one")
     wait_column(control_plane, api, "appinst", NORTH, PHASE="Lingering", MESSAGE="unless a demand comes")
     api.create({**template("other"), "spec": {"manifests": [{"apiVersion": "v1", "kind": "Role", "metadata": {}}]}})
-    wait_column(control_plane, api, "apptpl", "other", ACCEPTED="False", MESSAGE="spec.manifests[0].kind")
+    wait_column(control_plane, api, "apptpl", "other", READY="False", MESSAGE="spec.manifests[0].kind")
 
 
 def test_explain_goes_from_the_event_over_merged_values_to_the_pods(

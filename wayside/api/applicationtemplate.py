@@ -229,7 +229,7 @@ class ApplicationTemplate(Kind):
         {"name": "Key", "type": "string", "jsonPath": ".spec.key"},
         {"name": "Instances", "type": "integer", "jsonPath": ".status.instances"},
         {"name": "Max", "type": "integer", "jsonPath": ".spec.maxInstances"},
-        {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
+        {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},
     ]

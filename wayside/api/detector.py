@@ -297,8 +297,13 @@ class Detector(Kind):
     printer_columns: ClassVar[list[dict[str, str]]] = [
         {"name": "Clock", "type": "string", "jsonPath": ".spec.clock"},
         {"name": "Rules", "type": "integer", "jsonPath": ".status.rules"},
-        {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
-        {"name": "Running", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Running")].status'},
+        {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},
+        {
+            "name": "Running",
+            "type": "string",
+            "jsonPath": '.status.conditions[?(@.type=="Running")].status',
+            "priority": "1",
+        },
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},
     ]

@@ -221,6 +221,9 @@ class EventRuleStatus(Model):
         description="The Detectors that select the rule.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
+    selected_by: str = Field(
+        default="", max_length=1024, description="The names of these Detectors as one text, for tables."
+    )
     conditions: list[Condition] = conditions_field(
         "Accepted, Ready: the rule can be evaluated. Stalled: the rule is invalid and must be corrected."
     )
@@ -233,8 +236,8 @@ class EventRule(Kind):
     short_name: ClassVar[str] = "er"
     printer_columns: ClassVar[list[dict[str, str]]] = [
         {"name": "Enabled", "type": "boolean", "jsonPath": ".spec.enabled"},
-        {"name": "Accepted", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Accepted")].status'},
-        {"name": "Detectors", "type": "string", "jsonPath": ".status.detectors"},
+        {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},
+        {"name": "Detectors", "type": "string", "jsonPath": ".status.selectedBy"},
         {"name": "When", "type": "string", "jsonPath": ".spec.when"},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},

@@ -27,6 +27,8 @@ RULE_INVALID = "RuleInvalid"
 DETECTOR_INVALID = "DetectorInvalid"
 """Reasons of the condition Accepted of what cannot be evaluated."""
 
+_NAMES_LISTED = 5  # in a column of a table
+
 _AS_FAR_AS = "as far as can be told without the message types; what they show to be wrong, the detector's log says"
 
 
@@ -55,12 +57,19 @@ def rule_status(
     return EventRuleStatus(
         observed_generation=generation,
         detectors=[each.name for each in selected],
+        selected_by=_listed([each.name for each in selected]),
         conditions=list(
             concluded(
                 old.conditions, [_rule_aspect(findings, bool(selected))], generation, now, stalled=(RULE_INVALID,)
             )
         ),
     )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The names as one text; of many, the first ones."""
+    more = f", and {len(names) - _NAMES_LISTED} more" if len(names) > _NAMES_LISTED else ""
+    return ", ".join(names[:_NAMES_LISTED]) + more
 
 
 def detector_status(

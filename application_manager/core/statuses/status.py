@@ -98,6 +98,8 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
             ]
             applied_time = applied_time or (since if service.applied else None)
             ready_time = ready_time or (since if done else None)
+        elif find(old.conditions, "Applied") is None:
+            aspects.append(Aspect("Ready", False, "NotReady", f"instance {verdict.instance} does not exist yet"))
     elif not finished:
         aspects.append(Aspect("Ready", False, verdict.reason, verdict.message))
         if verdict.standing is Standing.REFUSED:

@@ -48,6 +48,9 @@ def detector(name: str = "det", stream: str = "pose", site: str = "a", **more: A
 def test_a_rule_that_a_detector_can_evaluate_is_accepted() -> None:
     status = rule_status(rule(), [detector(), detector("other", site="b")], NOW)
     assert status.detectors == ["det"]
+    assert status.selected_by == "det"
+    many = rule_status(rule(), [detector(f"d{number}") for number in range(7)], NOW)
+    assert many.selected_by == "d0, d1, d2, d3, d4, and 2 more"
     assert (status.conditions[0].status, status.conditions[0].observed_generation) == ("True", 3)
 
 

@@ -45,6 +45,14 @@ def test_a_tasks_phases_follow_its_instance() -> None:
     assert phases == [TaskPhase.PENDING, TaskPhase.PENDING, TaskPhase.ACTIVE, TaskPhase.READY]
 
 
+def test_a_task_is_not_ready_while_its_instance_is_not_made_and_keeps_what_was_known_of_it_afterwards() -> None:
+    pending = task_status(task("a"), COUNTS, None, NOW)
+    assert said(pending) == {"Accepted": "True", "Ready": "False"}
+    ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
+    later = task_status(task("a").model_copy(update={"status": ready}), COUNTS, None, NOW + 1)
+    assert said(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
+
+
 def test_a_task_is_no_more_applied_or_ready_than_its_instance_and_keeps_since_when_it_once_was() -> None:
     ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
     served = task("a").model_copy(update={"status": ready})
