@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -67,16 +66,17 @@ class Changes:
             self._parts.append((clients[rows], times[ticks], new, tags[rows, ticks]))
         return Found(rows, ticks, new)
 
-    def by_client(self) -> Iterator[tuple[int, Integers, Doubles, Bytes]]:
-        """Of each client, by its number: the number, and times, values and tags of its changes."""
+    def by_client(self, chosen: Container[int] | None) -> Iterator[tuple[int, Integers, Doubles, Bytes]]:
+        """Of each chosen client (None: of all), its number, and times, values and tags of its changes."""
         if not self._parts:
             return
         clients, times, values, tags = (np.concatenate(part) for part in zip(*self._parts, strict=True))
         order = np.argsort(clients, kind="stable")
         clients, times, values, tags = clients[order], times[order], values[order], tags[order]
         bounds = [0, *(np.flatnonzero(np.diff(clients)) + 1).tolist(), len(clients)]
-        for begin, end in itertools.pairwise(bounds):
-            yield int(clients[begin]), times[begin:end], values[begin:end], tags[begin:end]
+        for client, begin, end in zip(clients[bounds[:-1]].tolist(), bounds, bounds[1:], strict=False):
+            if chosen is None or client in chosen:
+                yield client, times[begin:end], values[begin:end], tags[begin:end]
 
     def _make_room(self, room: int) -> None:
         more = room - len(self._last_tags)

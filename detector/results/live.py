@@ -224,8 +224,10 @@ class LiveView:
                     channel.log(payload, log_time=time)
         for event in shown.events:
             time = event.start_time if event.end_time is None else event.end_time
-            self._episodes.log(msgspec.json.encode(episode_message(event)), log_time=time)
-            self._log_lines.log(log_message(event, time), log_time=time)
+            if EPISODES in topics:
+                self._episodes.log(msgspec.json.encode(episode_message(event)), log_time=time)
+            if LOG in topics:
+                self._log_lines.log(log_message(event, time), log_time=time)
         if SCENE in topics:
             for time, update in self._scene.updates(result):
                 self._scenes.log(update, log_time=time)

@@ -38,7 +38,7 @@ from detector.results.series import (
 )
 from detector.results.witnessing import Witnessed
 from wayside.expressions.columns.values import Tag
-from wayside.names import subject_text
+from wayside.names import parse_subject
 from wayside.rules import CompiledRule, PairSubject
 
 _POINTS = 20_000
@@ -65,9 +65,9 @@ class Tracer:
     def __init__(self, subjects: Mapping[str, Set[str]] | None = None, *, ways: bool = True) -> None:
         """`subjects`: those to trace, by rule, None: all; `ways`: note where clients are."""
         self._subjects = subjects
-        self._client_texts = {text.partition("~")[0] for texts in (subjects or {}).values() for text in texts}
-        self._traced: list[int] = []
-        """Numbers of clients that are traced, where not all subjects are."""
+        self._clients_by_rule = {rule: _clients_of(texts) for rule, texts in (subjects or {}).items()}
+        self._traced: dict[str, set[int]] = {rule: set() for rule in subjects or ()}
+        """By rule, the numbers of the clients that are traced, where not all subjects are."""
         self._with_ways = ways
         self.engine: Engine | None = None
         """That of the replay, for what it counts."""
@@ -152,7 +152,7 @@ class Tracer:
         """The clients of a block that are traced, of those that the rule looks at."""
         if self._subjects is None:
             return slice(None) if looked is None else looked
-        traced = np.isin(numbers, self._traced)
+        traced = np.isin(numbers, [*set().union(*self._traced.values())])
         return traced if looked is None else traced & looked
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
@@ -226,7 +226,7 @@ class Tracer:
         subjects: dict[tuple[str, str | None, int], SubjectTrace] = {}
         for (rule, element, field), changes in self._conditions.items():
             reasons = self._reasons[rule, element, field]
-            for client, times, values, _ in changes.by_client():
+            for client, times, values, _ in changes.by_client(self._traced.get(rule)):
                 clients = () if self._names[client] == FLEET else (self._names[client],)
                 text = Subject(clients, element).text
                 if wanted(rule, text):
@@ -239,7 +239,7 @@ class Tracer:
                 continue
             by_client: dict[int, list[Series]] = {}
             for changes in parts.values():
-                for client, times, values, tags in changes.by_client():
+                for client, times, values, tags in changes.by_client(self._traced.get(rule)):
                     if (rule, element, client) in subjects:
                         by_client.setdefault(client, []).append(_series(times, values, tags, texts))
             for client, series in by_client.items():
@@ -348,13 +348,19 @@ class Tracer:
         if number is None:
             number = self._numbers[client] = len(self._names)
             self._names.append(client)
-            if self._subjects is not None and subject_text((client,)) in self._client_texts:
-                self._traced.append(number)
+            for rule, clients in self._clients_by_rule.items():
+                if client in clients:
+                    self._traced[rule].add(number)
         return number
 
     def _time(self, first: int, last: int) -> None:
         self._begin = first if self._begin is None else min(self._begin, first)
         self._end = max(self._end, last)
+
+
+def _clients_of(subjects: Set[str]) -> Set[str]:
+    """The clients of subjects of one client; FLEET in place of the fleet."""
+    return {clients[0] if clients else FLEET for clients, _ in map(parse_subject, subjects) if len(clients) < 2}
 
 
 def _has_texts(plan: _Plan, block: Block) -> bool:
