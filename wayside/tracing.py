@@ -81,7 +81,7 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
     protocol = next((each for each in PROTOCOLS if environment.get(each)), None)
     if protocol is not None and environment[protocol] != PROTOCOL:
         log.warning(
-            "no traces are sent: %s is %s, and only %s is spoken: set it so, with the collector's port for HTTP (4318)",
+            "no traces are sent: %s is %s, and only %s is supported: set it, with the collector's port for HTTP (4318)",
             protocol,
             environment[protocol],
             PROTOCOL,

@@ -49,7 +49,7 @@ def read_material(access: Access, at: str) -> Material:
             raise AccessError(f"{at}: {problem}")
         ca, certificate, key = before
         return Material(ca, certificate, key, files.verify_name, credentials, tls=True)
-    raise AccessError(f"{at}: {files.certificate or files.ca} keeps changing while it is read; it is read again later")
+    raise AccessError(f"{at}: {files.certificate or files.ca} keeps changing while it is read; reading it again later")
 
 
 def expiry(pem: bytes) -> float:

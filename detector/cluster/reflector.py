@@ -111,14 +111,14 @@ class Reflector:
     def _recovered(self) -> None:
         self.lists += 1
         if self._backoff.failures:
-            _log.info("%s of namespace %s can be read again", self._resource.plural, self._namespace)
+            _log.info("reading the %s of namespace %s again", self._resource.plural, self._namespace)
         self._backoff.succeed()
 
     def _failed(self, error: ApiError) -> float:
         if not self._backoff.failures:
             self.outages += 1
             _log.warning(
-                "cannot read the %s of namespace %s, and try again until I can: %s",
+                "cannot read the %s of namespace %s; retrying with backoff: %s",
                 self._resource.plural,
                 self._namespace,
                 error,

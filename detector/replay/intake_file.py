@@ -66,7 +66,7 @@ def read_intake(path: Path) -> Iterator[Arrival | Control]:
     no intake file.
     """
     if not is_intake_file(path):
-        raise RecordingError(f"{path}: no intake file: give one that `detector run --record-intake` wrote")
+        raise RecordingError(f"{path}: not an intake file: give one that `detector run --record-intake` wrote")
     time = 0
     with path.open("rb") as file:
         channels: dict[int, Channel] = {}

@@ -112,7 +112,7 @@ class IntakeWriter:
         if not self._unmarked and arrivals:
             self._unmarked_since = arrivals[0].received
             if self.error is None:
-                log.error("%s: writing is too slow, samples are left out: its replay will differ", self._path)
+                log.error("%s: writing is too slow; dropping samples, so its replay will differ", self._path)
         self._unmarked += len(arrivals)
         self.lost += len(arrivals)
 
@@ -125,7 +125,7 @@ class IntakeWriter:
         try:
             self._write()
         except Exception as error:  # noqa: BLE001  this thread's edge: whatever it is ends the recording, and is said
-            log.error("%s: writing failed, the recording ends here: %s", self._path, error)
+            log.error("%s: writing failed; the recording ends here: %s", self._path, error)
             with self._changed:
                 self.error = error
                 self._queue.clear()

@@ -125,7 +125,7 @@ def _unpacked(compression: str, data: bytes) -> bytes:
         "zstd": lambda packed: zstandard.ZstdDecompressor().decompressobj().decompress(packed),
     }
     if compression not in unpack:
-        raise ValueError(f"no compression of MCAP is called {compression!r}")
+        raise ValueError(f"unknown MCAP compression {compression!r}")
     return unpack[compression](data)
 
 

@@ -111,7 +111,7 @@ def _frames(path: Path) -> Iterator[_Frame]:
         raise _CutError("the file ends inside a header") from error
     except ValueError as error:
         raise RecordingError(
-            f"{path}: the capture is damaged: {error}; what is whole of it, `editcap` or Wireshark can save"
+            f"{path}: the capture is damaged: {error}; `editcap` or Wireshark can save the intact part"
         ) from error
 
 

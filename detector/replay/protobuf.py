@@ -54,7 +54,7 @@ class Decoders:
             from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415
         except ImportError as error:
             raise RecordingError(
-                f"{self._path}: {topic} is recorded as Protobuf, which an extra reads: pip install 'wayside[protobuf]'"
+                f"{self._path}: {topic} is recorded as Protobuf, which needs an extra: pip install 'wayside[protobuf]'"
             ) from error
         try:
             decode = DecoderFactory().decoder_for(ENCODING, schema)

@@ -38,7 +38,7 @@ def with_recorded_types(detector: Detector, recordings: Sequence[Path]) -> Detec
                 _, before = new.setdefault(recorded.name, (path, definition))
                 if parsed(before) != parsed(definition):
                     raise RecordingError(
-                        f"{path}: {recorded.name} is defined otherwise than in {new[recorded.name][0]}: "
+                        f"{path}: {recorded.name} differs from its definition in {new[recorded.name][0]}: "
                         "replay the recordings one by one"
                     )
     if not new:
@@ -66,10 +66,10 @@ def _definition(path: Path, recorded: RecordedType, types: RosTypes) -> Definiti
     except (DefinitionsError, ValueError) as error:
         if not types.known(recorded.name):
             raise RecordingError(
-                f"{path}: the recorded definition of {recorded.name} cannot be read, "
-                f"give it in the Detector's spec.messages: {error}"
+                f"{path}: cannot read the recorded definition of {recorded.name}: "
+                f"define it in the Detector's spec.messages: {error}"
             ) from error
-        _log.warning("%s: the recorded definition of %s cannot be read, the known one is used", path, recorded.name)
+        _log.warning("%s: cannot read the recorded definition of %s; using the known one", path, recorded.name)
         return None
     same = all(types.known(name) and _like(types.fields(name), fields) for name, (_, fields) in inside.items())
     return None if same else definition

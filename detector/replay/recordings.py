@@ -37,7 +37,7 @@ def open_recordings(
 def check_exists(path: Path) -> None:
     """Raises RecordingError where the recording is missing."""
     if not path.exists():
-        raise RecordingError(f"{path}: there is no such file or folder")
+        raise RecordingError(f"{path}: no such file or folder")
 
 
 def span_of(path: Path) -> tuple[int, int] | None:
@@ -93,27 +93,27 @@ def _reader(path: Path) -> _Read:
     check_exists(path)
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
-            raise RecordingError(f"{path}: a folder without metadata.yaml is no rosbag2: give the recordings in it")
+            raise RecordingError(f"{path}: a folder without metadata.yaml is not a rosbag2: give the recordings in it")
         return read_own_recording if is_own_recording(path) else read_rosbag2
     try:
         with path.open("rb") as file:
             head = file.read(4096)
     except OSError as error:
-        raise RecordingError(f"{path}: it cannot be read: {error.strerror}") from error
+        raise RecordingError(f"{path}: cannot read it: {error.strerror}") from error
     if head.startswith(MCAP_MAGIC):
         return read_mcap
     if head.startswith(ROSBAG1_MAGIC):
         if path.suffix != ".bag":
-            raise RecordingError(f"{path}: a ROS 1 bag is read if its name ends in .bag: rename it")
+            raise RecordingError(f"{path}: the name of a ROS 1 bag must end in .bag: rename it")
         return read_rosbag1
     if head.startswith(PCAP_MAGICS):
         return read_pcap
     if head.startswith(SQLITE_MAGIC):
         if path.suffix != ".db3":
-            raise RecordingError(f"{path}: an SQLite file is read as a rosbag2 if its name ends in .db3")
+            raise RecordingError(f"{path}: the name of an SQLite rosbag2 must end in .db3: rename it")
         return read_rosbag2
     if head.lstrip().startswith(b"{") or (not head and path.suffix in (".jsonl", ".ndjson")):
         return read_json_lines
     if not head:
         raise RecordingError(f"{path}: the file is empty")
-    raise RecordingError(f"{path} is no recording that Wayside reads; it reads {_KINDS}")
+    raise RecordingError(f"{path} is not a recording that Wayside can read; it reads {_KINDS}")

@@ -244,7 +244,7 @@ def replay_intake(
         replay.close()
         outcome.notes += replay.report()
     else:
-        raise RecordingError("the intake file holds nothing: its writer was killed before it began; record again")
+        raise RecordingError("the intake file is empty: its writer was killed before it wrote anything; record again")
     return outcome
 
 

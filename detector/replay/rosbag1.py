@@ -93,7 +93,8 @@ def _converter(path: Path, connections: Sequence[Connection]) -> Callable[[Conne
             cdr = bytes(types.ros1_to_cdr(payload, connection.msgtype))
         except (*DAMAGE, SerdeError) as error:
             raise RecordingError(
-                f"{path}: a message on {connection.topic} is no {connection.msgtype} as the bag defines it: {error}: "
+                f"{path}: a message on {connection.topic} does not match {connection.msgtype} "
+                f"as the bag defines it: {error}: "
                 f"repair the bag with `rosbag fix {path}`, or take the topic out of the Detector's streams"
             ) from error
         return Message(time, key_of(connection.topic), cdr, "cdr", connection.msgtype)

@@ -96,7 +96,7 @@ def messages_of(path: Path, chunk: Chunk, contents: Contents) -> Iterator[Record
 
 def _messages(data: bytes, compression: str, contents: Contents) -> Iterator[Recorded]:
     if compression not in _UNPACK:
-        raise ValueError(f"no compression of bags is called {compression!r}")
+        raise ValueError(f"unknown bag compression {compression!r}")
     inside = _UNPACK[compression](data)
     at = 0
     while (found := _record(inside, at)) is not None:

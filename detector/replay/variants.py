@@ -137,7 +137,7 @@ def _values(option: str, text: str) -> Iterator[Any]:
     try:
         first, last, step = (float(part) for part in span.groups())
     except ValueError:
-        raise VariantError(f"--sweep {option}: {text} is no range of numbers: write first:last:step") from None
+        raise VariantError(f"--sweep {option}: {text} is not a range of numbers: write first:last:step") from None
     if step <= 0 or last < first:
         raise VariantError(f"--sweep {option}: write first:last:step, with a step above 0 and the last not below first")
     for number in range(int((last - first) / step + 1e-9) + 1):

@@ -173,7 +173,7 @@ class Renewal:
     def _run_both(self, first: Membership, second: Membership) -> None:
         """Run both until they are level. Raises NetworkError if the second one receives nothing."""
         if first.connections.any and not second.await_connection(self._stop, _AT_MOST):
-            raise NetworkError(f"zenoh: with the new ones no connection to {[*self._config.connect]} is established")
+            raise NetworkError(f"zenoh: cannot connect with the new ones to {[*self._config.connect]}")
         begin = time.monotonic()
         pairs = [*zip(self._inlets, second.subscriptions, strict=True)]
         while not self._stop.wait(_LOOK_AT_BOTH):

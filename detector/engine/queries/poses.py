@@ -22,12 +22,12 @@ def pose_in(message: Any, at: str = "") -> Pose:
     place = here.get("position", here.get("translation")) if isinstance(here, dict) else None
     turn = here.get("orientation", here.get("rotation")) if isinstance(here, dict) else None
     if not isinstance(place, dict):
-        raise PoseError(f"there is no pose {f'at {at!r}' if at else 'in the message'}: give its path with `at`")
+        raise PoseError(f"no pose {f'at {at!r}' if at else 'in the message'}: give its path with `at`")
     x, y, z = (_number(place, axis, 0.0 if axis == "z" else None) for axis in ("x", "y", "z"))
     if turn is None:
         return Pose((x, y, z), IDENTITY)
     if not isinstance(turn, dict):
-        raise PoseError("the orientation is no map of x, y, z, w")
+        raise PoseError("the orientation is not a map of x, y, z, w")
     quaternion = unit((_number(turn, "x"), _number(turn, "y"), _number(turn, "z"), _number(turn, "w")))
     if quaternion is None:
         raise PoseError("the orientation is a quaternion of length zero")
@@ -51,5 +51,5 @@ def _descended(message: Any, path: str) -> Any:
 def _number(values: dict[str, Any], name: str, default: float | None = None) -> float:
     value = values.get(name, default)
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        raise PoseError(f"{name} of the pose is no number: {value!r:.40}")
+        raise PoseError(f"{name} of the pose is not a number: {value!r:.40}")
     return float(value)

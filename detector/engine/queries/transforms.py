@@ -174,7 +174,7 @@ class _Tree:
                 raise TransformError(f"client {self._client} has no frame {frame!r}: {_hint(frame, frames)}")
         raise TransformError(
             f"frames {target!r} and {source!r} of client {self._client} are not connected: "
-            f"the one ends at {downs[-1]!r}, the other at {ups[-1]!r}"
+            f"one chain ends at {downs[-1]!r}, the other at {ups[-1]!r}"
         )
 
     def _upwards(self, frame: str, stamp: int) -> list[str]:
@@ -182,7 +182,7 @@ class _Tree:
         chain = [frame]
         while (parent := self._parent(chain[-1], stamp)) is not None:
             if parent in chain:
-                raise TransformError(f"the transforms of client {self._client} go in a circle at frame {parent!r}")
+                raise TransformError(f"the transforms of client {self._client} form a cycle at frame {parent!r}")
             chain.append(parent)
         return chain
 

@@ -116,7 +116,7 @@ class CdrSource:
     def loop(self, count: str, body: Callable[[], None]) -> None:
         """Repeats what `body` adds. Raises UnwalkableError."""
         if len(self.indent) >= _MOST_LOOPS:
-            raise UnwalkableError("too many sequences in each other")
+            raise UnwalkableError("sequences are nested too deeply")
         self.rebase(self.at(), 1)
         base = self.base
         self.line(f"for _ in range({count}):")

@@ -156,7 +156,7 @@ def test_a_damaged_bag_is_told(bag: Path, tmp_path: Path) -> None:
         list(messages_in([damaged], vehicles))
     renamed = tmp_path / "drive.ros"
     renamed.write_bytes(whole)
-    with pytest.raises(RecordingError, match=r"ends in \.bag"):
+    with pytest.raises(RecordingError, match=r"must end in \.bag"):
         messages_in([renamed])
 
 
@@ -205,7 +205,7 @@ def test_a_recording_that_is_not_there_is_waited_for(bag: Path, tmp_path: Path) 
     arrivals, tally = Arrivals(), Tally()
     later = tmp_path / "later.bag"
     thread = playing(arrivals, tally, paths=[str(later)], rate=1000)
-    wait_for(lambda: "later.bag: there is no such file" in thread.last_error)
+    wait_for(lambda: "later.bag: no such file" in thread.last_error)
     later.write_bytes(bag.read_bytes())
     wait_for(lambda: thread.state is State.FINISHED)
     assert len(arrivals.seen) == 10

@@ -185,5 +185,5 @@ def test_other_files_are_no_intake_files(tmp_path: Path, content: bytes) -> None
     path = tmp_path / "other"
     path.write_bytes(content)
     assert not is_intake_file(path)
-    with pytest.raises(RecordingError, match="no intake file"):
+    with pytest.raises(RecordingError, match="not an intake file"):
         list(read_intake(path))

@@ -172,7 +172,9 @@ def test_what_is_no_recording_is_refused_at_once(tmp_path: Path) -> None:
     assert "no such file" in refused(tmp_path / "missing.mcap")
     assert "metadata.yaml" in refused(tmp_path)
     assert "empty" in refused(tmp_path / "empty.mcap")
-    assert "text.txt is no recording that Wayside reads; it reads rosbag2 folders" in refused(tmp_path / "text.txt")
+    assert "text.txt is not a recording that Wayside can read; it reads rosbag2 folders" in refused(
+        tmp_path / "text.txt"
+    )
     assert ".db3" in refused(tmp_path / "data.sqlite")
 
 

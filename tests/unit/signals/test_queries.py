@@ -116,8 +116,8 @@ def test_before_the_first_sample_and_after_the_last_there_is_no_pose() -> None:
     [
         ({"speed": 3}, "", "no pose in the message: give its path with `at`"),
         ({"pose": {}}, "pose.pose", "no pose at 'pose.pose'"),
-        ({"position": {"x": 1}}, "", "y of the pose is no number: None"),
-        ({"position": {"x": 1, "y": math.nan}}, "", "y of the pose is no number: nan"),
+        ({"position": {"x": 1}}, "", "y of the pose is not a number: None"),
+        ({"position": {"x": 1, "y": math.nan}}, "", "y of the pose is not a number: nan"),
         ({"position": {"x": 1, "y": 2}, "orientation": dict.fromkeys("xyzw", 0.0)}, "", "a quaternion of length zero"),
     ],
 )
