@@ -121,7 +121,7 @@ class TestApplicationTask:
         ended = api.replace(changed(stored, {"spec.endTime": TIME}))
         for value in ("2026-01-02T04:00:00Z", ABSENT):
             with pytest.raises(
-                ApiError, match=r"spec\.endTime is immutable once set, since an ended demand cannot resume"
+                ApiError, match=r"spec\.endTime: Forbidden: is immutable once set, since an ended demand cannot resume"
             ):
                 api.replace(changed(ended, {"spec.endTime": value}))
 

@@ -53,9 +53,19 @@ WRONG: list[tuple[str, str, Changes, str]] = [
     ("EventRule", "a number as condition", {"spec.when": True}, r"spec\.when: .*must be of type string"),
     ("EventRule", "a duration without unit", {"spec.for": "2"}, r"spec\.for: .*should match"),
     ("EventRule", "a duration as number", {"spec.cooldown": 30}, r"spec\.cooldown: .*must be of type string"),
-    ("EventRule", "evaluation too often", {"spec.evaluation.every": "5ms"}, r"every: give 10ms or more"),
+    (
+        "EventRule",
+        "evaluation too often",
+        {"spec.evaluation.every": "5ms"},
+        r"spec\.evaluation\.every: .*give 10ms or more",
+    ),
     *(
-        ("EventRule", f"evaluation every {zero}", {"spec.evaluation.every": zero}, r"every: give 10ms or more")
+        (
+            "EventRule",
+            f"evaluation every {zero}",
+            {"spec.evaluation.every": zero},
+            r"spec\.evaluation\.every: .*give 10ms or more",
+        )
         for zero in ("0ms", "0s", "0m", "0h")
     ),
     (
@@ -75,13 +85,13 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "EventRule",
         "an aggregate without its window",
         {"spec.signals.0.over": ABSENT},
-        r"spec\.signals\[0\]: .*need a window: give over, e\.g\. over: 5s",
+        r"spec\.signals\[0\]\.over: Required value: .*need a window: give over, e\.g\. over: 5s",
     ),
     (
         "EventRule",
         "a signal without value",
         {"spec.signals.0.value": ABSENT},
-        r"spec\.signals\[0\]: .*give value, e\.g\. value: msg\.speed",
+        r"spec\.signals\[0\]\.value: .*give value, e\.g\. value: msg\.speed",
     ),
     (
         "EventRule",
@@ -121,25 +131,25 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "Detector",
         "accounts of a detector that is no sidecar",
         {"spec.serviceAccountNames": ["vehicle"]},
-        r"spec: .*serviceAccountNames has no effect without mode Sidecar",
+        r"spec\.serviceAccountNames: Forbidden: serviceAccountNames has no effect without mode Sidecar",
     ),
     (
         "Detector",
         "a sidecar on nodes of its own",
         {"spec.mode": "Sidecar", "spec.pod": {"nodeSelector": {"a": "b"}}},
-        r"spec: .*have no effect with mode Sidecar",
+        r"spec\.pod: Forbidden: .*have no effect with mode Sidecar",
     ),
     (
         "Detector",
         "a cdr stream without its type",
         {f"{STREAM}.type": ABSENT},
-        r"spec\.streams\[0\]: .*type is required with encoding cdr, optional with uper",
+        r"spec\.streams\[0\]\.type: .*type is required with encoding cdr, optional with uper",
     ),
     (
         "Detector",
         "a json stream with a type",
         {f"{STREAM}.encoding": "json"},
-        r"spec\.streams\[0\]: .*type is required with encoding cdr",
+        r"spec\.streams\[0\]\.type: .*type is required with encoding cdr",
     ),
     (
         "Detector",
@@ -151,13 +161,13 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "Detector",
         "a key without its client",
         {f"{STREAM}.key": "vehicles/pose"},
-        r"spec\.streams\[0\]: .*key must capture the client, as \$\{client:\*\}, or client must name it",
+        r"spec\.streams\[0\]\.client: .*key must capture the client, as \$\{client:\*\}, or client must name it",
     ),
     (
         "Detector",
         "two clients of one stream",
         {f"{STREAM}.client": "ego"},
-        r"spec\.streams\[0\]: .*key must capture the client.*not both",
+        r"spec\.streams\[0\]\.client: .*key must capture the client.*not both",
     ),
     (
         "Detector",
@@ -169,13 +179,13 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "Detector",
         "the layout of ROS 2 nodes for JSON",
         {f"{STREAM}.layout": "RmwZenoh", f"{STREAM}.encoding": "json", f"{STREAM}.type": None},
-        r"spec\.streams\[0\]: .*layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw",
+        r"spec\.streams\[0\]\.layout: .*layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw",
     ),
     (
         "Detector",
         "a domain without the layout that has one",
         {f"{STREAM}.domain": 7},
-        r"spec\.streams\[0\]: .*domain is for streams with layout RmwZenoh: remove it",
+        r"spec\.streams\[0\]\.domain: Forbidden: domain is for streams with layout RmwZenoh: remove it",
     ),
     (
         "Detector",
@@ -208,19 +218,19 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "Detector",
         "TLS given twice",
         {"spec.zenoh.tls": {"ca": "ca.crt"}, "spec.zenoh.tlsSecret": "zenoh"},
-        r"spec\.zenoh: .*give tls or tlsSecret, not both",
+        r"spec\.zenoh\.tlsSecret: Forbidden: give tls or tlsSecret, not both",
     ),
     (
         "Detector",
         "TLS without a certificate",
         {"spec.zenoh.listen": ["tls/0.0.0.0:7447"]},
-        r"spec\.zenoh: .*needs a certificate: set tls\.certificate",
+        r"spec\.zenoh\.listen: .*needs a certificate: set tls\.certificate",
     ),
     (
         "Detector",
         "half a certificate",
         {"spec.zenoh.tls": {"certificate": "tls.crt"}},
-        r"spec\.zenoh\.tls: .*give both certificate and key, or neither",
+        r"spec\.zenoh\.tls\.certificate: .*give both certificate and key, or neither",
     ),
     (
         "Detector",
@@ -232,7 +242,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "Detector",
         "tokens without their client",
         {"spec.zenoh.liveliness": "alive/*"},
-        r"spec\.zenoh: .*liveliness does not capture the client",
+        r"spec\.zenoh\.liveliness: .*liveliness does not capture the client",
     ),
     ("Detector", "a source without its plugin", {"spec.sources": [{"name": "a"}]}, r"spec\.sources\[0\]\.plugin: Req"),
     (
@@ -259,7 +269,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "ApplicationTemplate",
         "a union of numbers",
         {f"{PARAMETER}.merge": "Union"},
-        r"spec\.parameters\[?.?rateHz\]?: .*merge Union and Intersection need type array",
+        r"spec\.parameters\[?.?rateHz\]?\.merge: .*merge Union and Intersection need type array",
     ),
     (
         "ApplicationTemplate",
@@ -319,19 +329,71 @@ WRONG: list[tuple[str, str, Changes, str]] = [
 TIME = "2026-01-02T03:05:00Z"
 
 UPDATES: list[tuple[str, Changes, str]] = [
-    ("ApplicationTemplate", {"spec.key": "other"}, "spec.key is immutable and can be neither added nor removed"),
-    ("ApplicationTemplate", {"spec.key": ABSENT}, "spec.key is immutable and can be neither added nor removed"),
-    ("ApplicationTask", {"spec.template": "other"}, "only spec.parameters can change, and spec.endTime can be set"),
-    ("ApplicationTask", {"spec.operation": "Suspend"}, "only spec.parameters can change, and spec.endTime can be set"),
-    ("ApplicationTask", {"spec.priority": 4}, "only spec.parameters can change, and spec.endTime can be set"),
-    ("ApplicationTask", {"spec.requester.holder": "other"}, "only spec.parameters can change"),
-    ("ApplicationTask", {"spec.requester.subjects": ["car3"]}, "only spec.parameters can change"),
-    ("ApplicationTask", {"spec.requester": ABSENT}, "only spec.parameters can change"),
-    ("ApplicationTask", {"spec.event": ABSENT}, "only spec.parameters can change"),
-    ("ApplicationTask", {"spec.event.startTime": TIME}, "only spec.parameters can change"),
-    ("ApplicationTask", {"spec.event.classification": {}}, "only spec.parameters can change"),
-    ("ApplicationTask", {"spec.event.classification": ABSENT}, "only spec.parameters can change"),
-    ("ApplicationInstance", {"spec.template": "other"}, "spec.template and spec.key are immutable"),
-    ("ApplicationInstance", {"spec.key": "south"}, "spec.template and spec.key are immutable"),
-    ("ApplicationInstance", {"spec.key": ABSENT}, "spec.template and spec.key are immutable"),
+    (
+        "ApplicationTemplate",
+        {"spec.key": "other"},
+        r"spec\.key: Forbidden: is immutable and can be neither added nor removed",
+    ),
+    (
+        "ApplicationTemplate",
+        {"spec.key": ABSENT},
+        r"spec\.key: Forbidden: is immutable and can be neither added nor removed",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.template": "other"},
+        r"spec\.template: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.operation": "Suspend"},
+        r"spec\.operation: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.priority": 4},
+        r"spec\.priority: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.requester.holder": "other"},
+        r"spec\.requester: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.requester.subjects": ["car3"]},
+        r"spec\.requester: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.requester": ABSENT},
+        r"spec\.requester: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.event": ABSENT},
+        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.event.startTime": TIME},
+        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.event.classification": {}},
+        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationTask",
+        {"spec.event.classification": ABSENT},
+        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
+    ),
+    (
+        "ApplicationInstance",
+        {"spec.template": "other"},
+        r"spec\.template: Forbidden: is immutable: delete this instance",
+    ),
+    ("ApplicationInstance", {"spec.key": "south"}, r"spec\.key: Forbidden: is immutable: delete this instance"),
+    ("ApplicationInstance", {"spec.key": ABSENT}, r"spec\.key: Forbidden: is immutable: delete this instance"),
 ]

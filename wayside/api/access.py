@@ -24,7 +24,7 @@ _ONE = "give exactly one of passwordVariable and passwordFile"
 class Tls(Model):
     """TLS files in PEM format. With all three, both sides authenticate (mTLS)."""
 
-    model_config = validations(("has(self.certificate) == has(self.key)", _BOTH))
+    model_config = validations(("has(self.certificate) == has(self.key)", _BOTH, ".certificate"))
 
     ca: FilePath | None = Field(
         default=None,
@@ -72,8 +72,8 @@ _TLS_ONCE = "give tls or tlsSecret, not both"
 _CREDENTIALS_ONCE = "give credentials or credentialsSecret, not both"
 
 ACCESS_VALIDATIONS = (
-    ("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE),
-    ("!(has(self.credentials) && has(self.credentialsSecret))", _CREDENTIALS_ONCE),
+    ("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE, ".tlsSecret", "Forbidden"),
+    ("!(has(self.credentials) && has(self.credentialsSecret))", _CREDENTIALS_ONCE, ".credentialsSecret", "Forbidden"),
 )
 """For the CRD: what `Access` checks."""
 

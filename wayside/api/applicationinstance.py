@@ -6,14 +6,31 @@ from enum import StrEnum
 from typing import Annotated, ClassVar
 
 from pydantic import Field, field_validator
+from pydantic.config import JsonDict
 
-from wayside.api.base import Condition, Identifier, JsonValue, Kind, Model, TemplateName, Time, conditions_field
+from wayside.api.base import (
+    Condition,
+    Identifier,
+    JsonValue,
+    Kind,
+    Model,
+    TemplateName,
+    Time,
+    conditions_field,
+    immutable,
+    validation,
+)
+
+_IMMUTABLE = "is immutable: delete this instance and create another"
 
 
 class ApplicationInstanceSpec(Model):
     """The template, and the values that result from merging the demands."""
 
-    template: TemplateName = Field(description="The name of the ApplicationTemplate, in the same namespace. Immutable.")
+    template: TemplateName = Field(
+        description="The name of the ApplicationTemplate, in the same namespace. Immutable.",
+        json_schema_extra=immutable(_IMMUTABLE),
+    )
     key: str | None = Field(
         default=None,
         max_length=1024,
@@ -142,13 +159,13 @@ class ApplicationInstance(Kind):
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": ".status.message"},
     ]
-    object_validations: ClassVar[list[dict[str, str]]] = [
-        {
-            "rule": "self.spec.template == oldSelf.spec.template"
-            " && has(self.spec.key) == has(oldSelf.spec.key)"
-            " && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
-            "message": "spec.template and spec.key are immutable: delete this instance and create another",
-        },
+    object_validations: ClassVar[list[JsonDict]] = [
+        validation(
+            "has(self.spec.key) == has(oldSelf.spec.key) && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
+            _IMMUTABLE,
+            ".spec.key",
+            "Forbidden",
+        ),
     ]
 
     kind: str = "ApplicationInstance"

@@ -6,6 +6,7 @@ from enum import StrEnum
 from typing import Annotated, ClassVar
 
 from pydantic import Field
+from pydantic.config import JsonDict
 
 from wayside.api.base import (
     Condition,
@@ -17,6 +18,8 @@ from wayside.api.base import (
     TemplateName,
     Time,
     conditions_field,
+    immutable,
+    validation,
 )
 from wayside.api.classification import Classification
 from wayside.api.operation import MEANING, Operation
@@ -29,6 +32,8 @@ Value = Annotated[
     Field(json_schema_extra={"maxLength": MAXIMUM_PARAMETER_BYTES, "maxItems": 4096, "maxProperties": 1024}),
 ]
 """A JSON value that the API server bounds on its first level: what is deeper inside, no schema of a CRD can."""
+
+_IMMUTABLE = "is immutable; only parameters and endTime can change: end this task and create another"
 
 HOLDER_LABEL = "wayside.dev/holder"
 RULE_DIGEST_ANNOTATION = "wayside.dev/rule-digest"
@@ -80,14 +85,18 @@ class TaskEvent(Model):
 class ApplicationTaskSpec(Model):
     """One demand on an application, and its cause."""
 
-    template: TemplateName = Field(description="The name of the ApplicationTemplate, in the same namespace. Immutable.")
-    operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
+    template: TemplateName = Field(
+        description="The name of the ApplicationTemplate, in the same namespace. Immutable.",
+        json_schema_extra=immutable(_IMMUTABLE),
+    )
+    operation: Operation = Field(default=Operation.DEPLOY, description=MEANING, json_schema_extra=immutable(_IMMUTABLE))
     priority: int = Field(
         default=0,
         ge=-1_000_000,
         le=1_000_000,
         description="The priority of the task; the highest comes first. Ties are ordered by creation time, then by "
         "name. Immutable.",
+        json_schema_extra=immutable(_IMMUTABLE),
     )
     parameters: dict[Identifier, Value] = Field(
         default_factory=dict,
@@ -96,7 +105,9 @@ class ApplicationTaskSpec(Model):
         "live.",
     )
     requester: Requester = Field(
-        default=Requester(), description="The holder that emitted the task, and the clients on whose behalf. Immutable."
+        default=Requester(),
+        description="The holder that emitted the task, and the clients on whose behalf. Immutable.",
+        json_schema_extra=immutable(_IMMUTABLE),
     )
     event: TaskEvent | None = Field(default=None, description="The event that caused the task. Immutable.")
     end_time: Time | None = Field(
@@ -162,12 +173,10 @@ class ApplicationTask(Kind):
         {"name": "Message", "type": "string", "jsonPath": ".status.message"},
     ]
     selectable_fields: ClassVar[list[str]] = [".spec.template", ".spec.requester.detector", ".status.instance"]
-    object_validations: ClassVar[list[dict[str, str]]] = [
-        {
-            "rule": "self.spec.template == oldSelf.spec.template && self.spec.priority == oldSelf.spec.priority"
-            " && self.spec.operation == oldSelf.spec.operation"
-            " && self.spec.requester == oldSelf.spec.requester"
-            " && has(self.spec.event) == has(oldSelf.spec.event)"
+    # CEL does not see event.values, whose items may be of any type.
+    object_validations: ClassVar[list[JsonDict]] = [
+        validation(
+            "has(self.spec.event) == has(oldSelf.spec.event)"
             " && (!has(self.spec.event) || (self.spec.event.id == oldSelf.spec.event.id"
             " && self.spec.event.rule == oldSelf.spec.event.rule"
             " && self.spec.event.action == oldSelf.spec.event.action"
@@ -177,15 +186,16 @@ class ApplicationTask(Kind):
             " && has(self.spec.event.classification) == has(oldSelf.spec.event.classification)"
             " && (!has(self.spec.event.classification)"
             " || self.spec.event.classification == oldSelf.spec.event.classification)))",
-            # CEL does not see event.values, whose items may be of any type.
-            "message": "only spec.parameters can change, and spec.endTime can be set once (spec.event.values is not "
-            "checked): end this task and create another",
-        },
-        {
-            "rule": "!has(oldSelf.spec.endTime)"
-            " || (has(self.spec.endTime) && self.spec.endTime == oldSelf.spec.endTime)",
-            "message": "spec.endTime is immutable once set, since an ended demand cannot resume: create another task",
-        },
+            _IMMUTABLE,
+            ".spec.event",
+            "Forbidden",
+        ),
+        validation(
+            "!has(oldSelf.spec.endTime) || (has(self.spec.endTime) && self.spec.endTime == oldSelf.spec.endTime)",
+            "is immutable once set, since an ended demand cannot resume: create another task",
+            ".spec.endTime",
+            "Forbidden",
+        ),
     ]
 
     kind: str = "ApplicationTask"

@@ -6,6 +6,7 @@ from enum import StrEnum
 from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, field_validator, model_validator
+from pydantic.config import JsonDict
 
 from wayside.api.base import (
     Condition,
@@ -19,6 +20,7 @@ from wayside.api.base import (
     TemplateName,
     Time,
     conditions_field,
+    validation,
     validations,
 )
 from wayside.api.chart import Helm
@@ -59,7 +61,9 @@ FALLBACK_WITHOUT_TIMEOUT = (
 class Lifecycle(Model):
     """The lifetime of instances."""
 
-    model_config = validations(("!has(self.fallback) || has(self.readyTimeout)", FALLBACK_WITHOUT_TIMEOUT))
+    model_config = validations(
+        ("!has(self.fallback) || has(self.readyTimeout)", FALLBACK_WITHOUT_TIMEOUT, ".readyTimeout", "Required")
+    )
 
     linger: Duration = Field(
         default=Duration("30s"), description="How long an instance keeps running after its last demand has ended."
@@ -121,7 +125,7 @@ class ApplicationTemplateSpec(Model):
 
     model_config = validations(
         ("has(self.manifests) != has(self.helm)", _ONE_OF),
-        ("!has(self.baseline) || !has(self.key)", BASELINE_WITH_KEY),
+        ("!has(self.baseline) || !has(self.key)", BASELINE_WITH_KEY, ".baseline", "Forbidden"),
     )
 
     description: str = Field(default="", max_length=1024, description="A description of the application, for people.")
@@ -233,17 +237,19 @@ class ApplicationTemplate(Kind):
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},
     ]
-    object_validations: ClassVar[list[dict[str, str]]] = [
-        {
-            "rule": "has(self.spec.key) == has(oldSelf.spec.key)"
-            " && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
-            "message": "spec.key is immutable and can be neither added nor removed: create another template",
-        },
-        {
-            "rule": "!has(self.spec.lifecycle) || !has(self.spec.lifecycle.fallback)"
+    object_validations: ClassVar[list[JsonDict]] = [
+        validation(
+            "has(self.spec.key) == has(oldSelf.spec.key) && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
+            "is immutable and can be neither added nor removed: create another template",
+            ".spec.key",
+            "Forbidden",
+        ),
+        validation(
+            "!has(self.spec.lifecycle) || !has(self.spec.lifecycle.fallback)"
             " || self.spec.lifecycle.fallback.template != self.metadata.name",
-            "message": "spec.lifecycle.fallback.template is this template itself: name another",
-        },
+            "is this template itself: name another",
+            ".spec.lifecycle.fallback.template",
+        ),
     ]
 
     kind: str = "ApplicationTemplate"

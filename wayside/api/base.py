@@ -194,11 +194,33 @@ JsonValue = Any
 """Any JSON value; the schema has `x-kubernetes-preserve-unknown-fields`."""
 
 
-def validations(*rules: tuple[str, str]) -> ConfigDict:
-    """Model configuration with CEL validations for the CRD: pairs of a rule and the message of its refusal."""
-    return ConfigDict(
-        json_schema_extra={"x-kubernetes-validations": [{"rule": rule, "message": message} for rule, message in rules]}
-    )
+def validation(rule: str, message: str, field: str = "", reason: str = "") -> JsonDict:
+    """A CEL validation for the CRD.
+
+    Args:
+        rule: the CEL source.
+        message: what is wrong, and the remedy.
+        field: the path of the field that the refusal names, relative to the object, e.g. `.over`; empty: the object
+            itself, for rules about several fields of equal standing.
+        reason: Required, Forbidden or Duplicate; empty: Invalid.
+    """
+    made: JsonDict = {"rule": rule, "message": message}
+    return made | ({"fieldPath": field} if field else {}) | ({"reason": f"FieldValue{reason}"} if reason else {})
+
+
+def checked(*rules: tuple[str, str]) -> JsonDict:
+    """The same for one field: what its schema has in addition."""
+    return {"x-kubernetes-validations": [validation(*rule) for rule in rules]}
+
+
+def immutable(message: str) -> JsonDict:
+    """A field that cannot change, with the remedy in the message."""
+    return {"x-kubernetes-validations": [validation("self == oldSelf", message, reason="Forbidden")]}
+
+
+def validations(*rules: tuple[str, str] | tuple[str, str, str] | tuple[str, str, str, str]) -> ConfigDict:
+    """Model configuration with CEL validations for the CRD; each as for `validation`."""
+    return ConfigDict(json_schema_extra={"x-kubernetes-validations": [validation(*rule) for rule in rules]})
 
 
 class OwnerReference(BaseModel):
@@ -268,7 +290,7 @@ class Kind(Model):
     printer_columns: ClassVar[list[dict[str, str]]] = []
     selectable_fields: ClassVar[list[str]] = []
     name_limit: ClassVar[int] = 63
-    object_validations: ClassVar[list[dict[str, str]]] = []
+    object_validations: ClassVar[list[JsonDict]] = []
 
     api_version: str = API_VERSION
     kind: str

@@ -24,10 +24,12 @@ class Helm(Model):
         (
             "self.chart.startsWith('/') ? !has(self.version) && !has(self.repository) : has(self.version)",
             "a chart from a registry or repository needs version; for a path, remove version and repository",
+            ".version",
         ),
         (
             "self.chart.startsWith('/') || self.chart.startsWith('oci://') != has(self.repository)",
             "a chart name needs repository; for oci://…, remove repository",
+            ".repository",
         ),
     )
 

@@ -97,15 +97,19 @@ class DetectorSpec(Model):
     """Streams, buffer, time and rules of a detector."""
 
     model_config = validations(
-        ("has(self.mode) || !has(self.pod)", _POD_WITHOUT_MODE),
+        ("has(self.mode) || !has(self.pod)", _POD_WITHOUT_MODE, ".pod", "Forbidden"),
         (
             "!has(self.serviceAccountNames) || (has(self.mode) && self.mode == 'Sidecar')",
             _ACCOUNTS_WITHOUT_SIDECAR,
+            ".serviceAccountNames",
+            "Forbidden",
         ),
         (
             "!has(self.mode) || self.mode != 'Sidecar' || !has(self.pod) || "
             "!(has(self.pod.nodeSelector) || has(self.pod.tolerations))",
             _SIDECAR_ON_NODES,
+            ".pod",
+            "Forbidden",
         ),
     )
 

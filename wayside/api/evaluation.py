@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from wayside.api.base import Duration, Model, ObjectName, validations
+from wayside.api.base import Duration, Model, ObjectName, checked, validations
 
 DEFAULT_PERIOD = Duration("1s")
 """The default period of a rule."""
@@ -14,24 +14,27 @@ class Evaluation(Model):
     """When the rule is evaluated: at most one of every, onSample and onDemand."""
 
     model_config = validations(
-        ("!has(self.every) || duration(self.every) >= duration('10ms')", "every: give 10ms or more"),
         (
             "[has(self.every), has(self.onSample), has(self.onDemand)].filter(given, given).size() <= 1",
             "give at most one of every, onSample and onDemand",
         ),
-        ("!has(self.onDemand) || self.onDemand", "onDemand: write true, or leave it out"),
     )
 
     every: Duration | None = Field(
         default=None,
         description="Evaluate the rule at whole multiples of this period, 10ms or more. Default: 1s.",
+        json_schema_extra=checked(("duration(self) >= duration('10ms')", "give 10ms or more")),
     )
     on_sample: ObjectName | None = Field(
         default=None,
         description="Evaluate the rule at each sample of this stream, for the subjects of the sample's client, and "
         "whenever a `for`, a cooldown or an unknownTimeout expires.",
     )
-    on_demand: bool | None = Field(default=None, description="If true, evaluate the rule only on request.")
+    on_demand: bool | None = Field(
+        default=None,
+        description="If true, evaluate the rule only on request.",
+        json_schema_extra=checked(("self", "write true, or leave it out")),
+    )
     priority: int = Field(
         default=0,
         ge=-1_000,

@@ -66,14 +66,18 @@ class Signal(Model):
         (
             "self.aggregate in ['Last', 'First', 'Previous', 'Age', 'Active'] || has(self.over)",
             "all aggregates but Last, First, Previous, Age and Active need a window: give over, e.g. over: 5s",
+            ".over",
+            "Required",
         ),
         (
             "has(self.model) || has(self.plugin) || (self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
             "give value, e.g. value: msg.speed, except with the aggregates Count, Age and Active, which use no value",
+            ".value",
         ),
         (
             "self.aggregate != 'Active' || (has(self.rule) && !has(self.over) && !has(self.where))",
             "aggregate Active is for a signal with rule, without over and where",
+            ".aggregate",
         ),
         (
             "[has(self.stream), has(self.rule), has(self.model), has(self.plugin)].filter(given, given).size() == 1",

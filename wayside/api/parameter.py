@@ -69,28 +69,34 @@ class Parameter(Model):
         (
             "!has(self.merge) || !(self.merge in ['Union', 'Intersection']) || self.type == 'array'",
             "merge Union and Intersection need type array",
+            ".merge",
         ),
         (
             "!has(self.merge) || !(self.merge in ['Max', 'Min', 'Sum']) || self.type in ['number', 'integer']",
             "merge Max, Min and Sum need type number or integer",
+            ".merge",
         ),
         (
             "!has(self.merge) || !(self.merge in ['All', 'Any']) || self.type == 'boolean'",
             "merge All and Any need type boolean",
+            ".merge",
         ),
         (
             "(!has(self.minimum) && !has(self.maximum)) || self.type in ['number', 'integer']",
             "minimum and maximum need type number or integer",
+            ".type",
         ),
         (
             "!has(self.minimum) || !has(self.maximum) || self.minimum <= self.maximum",
             "minimum is above maximum: no value is valid",
+            ".minimum",
         ),
-        ("!has(self.items) || self.type == 'array'", "items needs type array"),
+        ("!has(self.items) || self.type == 'array'", "items needs type array", ".items"),
         (
             "!has(self.pattern) || self.type == 'string'"
             " || (self.type == 'array' && has(self.items) && self.items == 'string')",
             "pattern needs type string, or type array with items string",
+            ".pattern",
         ),
     )
 

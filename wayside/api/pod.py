@@ -38,7 +38,7 @@ Amounts = Annotated[
 class DetectorVolume(Model):
     """A volume and its mount path."""
 
-    model_config = validations(("!(has(self.claim) && has(self.size))", _ONE))
+    model_config = validations(("!(has(self.claim) && has(self.size))", _ONE, ".size", "Forbidden"))
 
     path: MountPath = Field(description="The mount path, e.g. /var/lib/wayside.")
     claim: ObjectName | None = Field(
@@ -108,7 +108,7 @@ class DetectorVariable(Model):
 
     model_config = validations(
         ("has(self.value) != has(self.fromSecret)", _ONE_SOURCE),
-        (f"!(self.name in {sorted(RESERVED_VARIABLES)})".replace("'", '"'), _RESERVED),
+        (f"!(self.name in {sorted(RESERVED_VARIABLES)})".replace("'", '"'), _RESERVED, ".name", "Forbidden"),
     )
 
     name: Identifier = Field(description="The name of the variable, e.g. OTEL_RESOURCE_ATTRIBUTES.")
@@ -150,6 +150,7 @@ class DetectorToleration(Model):
             "(has(self.key) || (has(self.operator) && self.operator == 'Exists')) && "
             "!(has(self.value) && has(self.operator) && self.operator == 'Exists')",
             _ANY_KEY,
+            ".operator",
         )
     )
 

@@ -37,7 +37,7 @@ class LabelRequirement(Model):
     """A requirement on one label."""
 
     model_config = validations(
-        ("(self.operator in ['In', 'NotIn']) == (has(self.values) && self.values.size() > 0)", _VALUES)
+        ("(self.operator in ['In', 'NotIn']) == (has(self.values) && self.values.size() > 0)", _VALUES, ".values")
     )
 
     key: LabelKey = Field(description="The key of the label.")

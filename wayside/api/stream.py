@@ -88,28 +88,40 @@ class Stream(Model):
         (
             "self.encoding == 'uper' || (self.encoding == 'cdr') == has(self.type)",
             "type is required with encoding cdr, optional with uper, and not allowed otherwise",
+            ".type",
         ),
         (
             "!has(self.type) || (self.encoding == 'uper') == self.type.startsWith('etsi/')",
             "type must be a ROS 2 message with encoding cdr, and an ETSI ITS message with uper, e.g. etsi/cam",
+            ".type",
         ),
         (
             "self.key.contains('${client:') != has(self.client)",
             "key must capture the client, as ${client:*}, or client must name it; not both",
+            ".client",
         ),
         (
             "!has(self.framePrefix) || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage')",
             "framePrefix is for streams of type tf2_msgs/msg/TFMessage",
+            ".framePrefix",
+            "Forbidden",
         ),
         (
             "self.layout != 'RmwZenoh' || self.encoding in ['cdr', 'raw']",
             "layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw",
+            ".layout",
         ),
         (
             "self.layout != 'RmwZenoh' || self.source == 'zenoh'",
             "layout RmwZenoh is for streams whose source is zenoh: remove one of them",
+            ".layout",
         ),
-        ("!has(self.domain) || self.layout == 'RmwZenoh'", "domain is for streams with layout RmwZenoh: remove it"),
+        (
+            "!has(self.domain) || self.layout == 'RmwZenoh'",
+            "domain is for streams with layout RmwZenoh: remove it",
+            ".domain",
+            "Forbidden",
+        ),
     )
 
     name: ObjectName = Field(description="The name by which rules refer to the stream.")

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.access import ACCESS_VALIDATIONS, Access
-from wayside.api.base import Key, validations
+from wayside.api.base import Key, checked, validations
 
 Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
 """A Zenoh endpoint such as tcp/zenoh:7447."""
@@ -33,11 +33,11 @@ class Zenoh(Access):
 
     model_config = validations(
         *ACCESS_VALIDATIONS,
-        ("!has(self.liveliness) || self.liveliness.contains('${client:')", _NO_CLIENT),
         (
             "!has(self.listen) || !self.listen.exists(e, e.startsWith('tls/') || e.startsWith('quic/')) || "
             "has(self.tlsSecret) || (has(self.tls) && has(self.tls.certificate))",
             _NO_CERTIFICATE,
+            ".listen",
         ),
     )
 
@@ -70,6 +70,7 @@ class Zenoh(Access):
         default=None,
         description="The key expression of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a "
         "token is present even if it sends no data. It is lost as soon as its last token disappears.",
+        json_schema_extra=checked(("self.contains('${client:')", _NO_CLIENT)),
     )
 
     @model_validator(mode="after")

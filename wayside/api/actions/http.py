@@ -67,7 +67,7 @@ class HttpHeader(Model):
 class HttpAccess(Model):
     """Access to an HTTP endpoint. Its certificate is always verified; redirects are never followed."""
 
-    model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE))
+    model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE, ".tlsSecret", "Forbidden"))
 
     headers: list[HttpHeader] = Field(
         default_factory=list,

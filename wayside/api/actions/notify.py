@@ -40,7 +40,8 @@ class NotifyHttp(HttpAccess):
     """An endpoint that receives CloudEvents by POST."""
 
     model_config = validations(
-        ("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE), ("has(self.url) != has(self.urlSecret)", _URL_ONCE)
+        ("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE, ".tlsSecret", "Forbidden"),
+        ("has(self.url) != has(self.urlSecret)", _URL_ONCE),
     )
 
     url: HttpUrl | None = Field(default=None, description="The URL of the endpoint, e.g. https://events.example/city.")
@@ -118,7 +119,7 @@ class Notify(Model):
 
     model_config = validations(
         (f"[{', '.join(f'has(self.{kind})' for kind in _TARGETS)}].filter(given, given).size() == 1", _ONE_TARGET),
-        ("!has(self.alertmanager) || !(has(self.grouping) || has(self.events))", _ALERTS),
+        ("!has(self.alertmanager) || !(has(self.grouping) || has(self.events))", _ALERTS, ".alertmanager", "Forbidden"),
     )
 
     http: NotifyHttp | None = Field(default=None, description="An HTTP endpoint that receives CloudEvents.")

@@ -96,7 +96,7 @@ class TriggerRos2(Model):
 
     model_config = validations(
         ("has(self.start) || has(self.stop)", _CALL),
-        ("!has(self.domain) || !has(self.layout) || self.layout == 'RmwZenoh'", _DOMAIN),
+        ("!has(self.domain) || !has(self.layout) || self.layout == 'RmwZenoh'", _DOMAIN, ".domain", "Forbidden"),
     )
 
     layout: Layout = Field(
@@ -162,7 +162,8 @@ class TriggerHttp(HttpAccess):
     """Requests to an HTTP endpoint, at the start and the end of the episode."""
 
     model_config = validations(
-        ("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE), ("has(self.start) || has(self.stop)", _CALL)
+        ("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE, ".tlsSecret", "Forbidden"),
+        ("has(self.start) || has(self.stop)", _CALL),
     )
 
     start: HttpCall | None = Field(default=None, description="The request at the start of the episode.")
