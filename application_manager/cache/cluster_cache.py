@@ -159,11 +159,11 @@ class ClusterCache:
         bounds = Limits(self._limits.get(name[0], {}), self.limit)
         place = self.places.place(name, bounds, now)
         decision = self._alone(name, now)
-        if decision is not None:
-            decision = placed(decision, place, exists=self.instance(name) is not None, now=now)
         for each in self.turns.turn(name, decision.fallback if decision is not None else None):
             self.places.touch(each)
             self.places.changed(each)
+        if decision is not None:
+            decision = placed(decision, place, exists=self.instance(name) is not None, now=now)
         return decision
 
     def note_limits(self, template: Name) -> None:
@@ -212,10 +212,10 @@ class ClusterCache:
 
     def _alone(self, name: Name, now: float) -> Decision | None:
         """What should become of the instance were there no limits."""
-        instance, own = self.instance(name), self.claims.claims(name)
-        of = self._template_of(name, instance, own)
+        instance, named = self.instance(name), self.claims.claims(name)
+        of = self._template_of(name, instance, named)
         own, borrowed = self.claims.claims(name, of), self._borrowed(name, of, now)
-        if instance is None and not own and not borrowed and not has_baseline(self.template(name)):
+        if instance is None and not named and not borrowed and not has_baseline(self.template(name)):
             self.deadlines.pop(name, None)
             return None
         decision = self._own(name, of, [*own, *borrowed], now)
@@ -257,7 +257,8 @@ class ClusterCache:
             return {name}
         template = (name[0], of)
         own = {template} if has_baseline(self.template(template)) else set()
-        return {name} | own | set(self.instances_of(template)) | self.claims.claimed_of(template)
+        demanded = own | self.claims.claimed_of(template) | self.turns.instances_of(template)
+        return {name} | demanded | set(self.instances_of(template))
 
     def _deadline(self, name: Name, instance: ApplicationInstance) -> float | None:
         uid, decided = self.deadlines.get(name, ("", None))

@@ -37,3 +37,8 @@ class FallbackIndex:
         """The template of an instance that tasks turned to; None where none did."""
         turned = (each for of, each in self._turned.items() if of[0] == instance[0] and instance[1] in each.instances)
         return next((each.template for each in turned), None)
+
+    def instances_of(self, template: Name) -> set[Name]:
+        """The instances of a template that tasks turned to."""
+        turned = (each for of, each in self._turned.items() if (of[0], each.template) == template)
+        return {(template[0], instance) for each in turned for instance in each.instances}

@@ -261,7 +261,7 @@ def test_the_manager_comes_to_the_same_whatever_it_hears_of_first(
     source.shuffle(templates)
     for each in [*templates[:1], *everything[:3], *templates[1:], *everything[3:]]:
         manager.sees(each)
-    said = manager.works()
+    decided = manager.works()
     expected = of(*live, instances=existing, limit=limit)
     wanted = {name for name, each in expected.instances.items() if each.wanted}
-    assert {name for name, (is_wanted, _) in said.items() if is_wanted} == wanted
+    assert {name for name, each in decided.items() if each is not None and each.wanted} == wanted
