@@ -87,7 +87,6 @@ class Assembly:
         self._instances: WorkQueue[Name] = WorkQueue(
             "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures, share=_INSTANCE_SHARE
         )
-        self.cache.places.changed = self._instances.add
         self._statuses: WorkQueue[Name] = WorkQueue(
             "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measures
         )
@@ -167,6 +166,7 @@ class Assembly:
             instances=resources[INSTANCE],
             tasks=resources[TASK],
             again=self._instances.add_at,
+            enqueue=self._instances.add,
             done=self._statuses.add,
             absent=self._absent,
             not_made=self._status_work.tell_why_not_made,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import InitVar, dataclass, field, replace
 from typing import Final, TypeVar
 
@@ -15,13 +15,19 @@ from application_manager.cluster.apply import Applied
 from application_manager.cluster.store import Name, Store
 from application_manager.core.claims.claims import Claim, InvalidTemplate, template_of_all
 from application_manager.core.claims.operations import Verdict
-from application_manager.core.demand.deciding import decide, decide_for_all
+from application_manager.core.demand.deciding import (
+    Decided,
+    decide,
+    decide_without_limits,
+    fallback_claims,
+    has_baseline,
+    request,
+)
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.demand import has_baseline
-from application_manager.core.demand.fallback import Fallback, fallback_of, overdue
+from application_manager.core.demand.fallback import Fallback, fallback_of
 from application_manager.core.demand.lingering import written_deadline
-from application_manager.core.demand.places import Candidate, Limits
-from application_manager.core.demand.placing import candidate, limits, placed
+from application_manager.core.demand.places import Limits, Placement
+from application_manager.core.demand.placing import limits
 from application_manager.core.findings.findings import Findings
 from application_manager.core.holders.leases import HealthyTime, LeaseIndex, LeaseView
 from application_manager.core.holders.policies import TaskPolicy
@@ -103,7 +109,7 @@ class ClusterCache:
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
     turns: FallbackIndex = field(default_factory=FallbackIndex)
     overlap: OverlapIndex = field(default_factory=OverlapIndex)
-    places: PlaceIndex = field(init=False)
+    places: PlaceIndex = field(default_factory=PlaceIndex)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
     exceeded: dict[Name, dict[Name, str]] = field(default_factory=dict)
     _findings: dict[Name, tuple[_Version, Findings]] = field(default_factory=dict)
@@ -111,7 +117,6 @@ class ClusterCache:
     def __post_init__(self, full: Callable[[], bool], tasks: TaskPolicy | None) -> None:
         self.store = Store(OWN_KINDS, full)
         self.claims = ClaimIndex(policy=tasks or TaskPolicy())
-        self.places = PlaceIndex(self._alone_and_candidate, self._known_instances)
 
     def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:
         """The template, also where it is not valid; None where there is none."""
@@ -152,19 +157,27 @@ class ClusterCache:
             and entry.model.spec.template == template[1]
         ]
 
-    def decide(self, name: Name, now: float) -> Decision | None:
-        """What should become of the instance as of `now`, in seconds since 1970; None: no one knows or wants it."""
+    def decide(self, name: Name, now: float) -> Decided:
+        """What should become of the instance as of `now`, in seconds since 1970, and which others to enqueue."""
+        decided = decide(name[1], _NamespaceIndexes(self, name[0]), now)
+        moved = self.turns.moved(name, _fallback(decided))
+        if decided.placement is not None:
+            moved |= decided.placement.moved(self.places.placement(name[0]))
+        return replace(decided, enqueue=frozenset(moved - {name[1]}))
+
+    def note(self, name: Name, decided: Decided) -> None:
+        """Note a decision in the indexes that further decisions read."""
         if template_of_all(name[1]) is not None:
-            return self._decide_for_all(name, self.claims.claims(name), now)
-        bounds = Limits(self._limits.get(name[0], {}), self.limit)
-        place = self.places.place(name, bounds, now)
-        decision = self._alone(name, now)
-        for each in self.turns.turn(name, decision.fallback if decision is not None else None):
-            self.places.touch(each)
-            self.places.changed(each)
-        if decision is not None:
-            decision = placed(decision, place, exists=self.instance(name) is not None, now=now)
-        return decision
+            return
+        instance, fallback = self.instance(name), _fallback(decided)
+        if decided.unlimited is None:
+            self.deadlines.pop(name, None)
+        elif instance is not None:
+            self.deadlines[name] = (instance.metadata.uid, decided.unlimited.release_time)
+        self.places.note(name[0], decided.placement)
+        for each in self.turns.moved(name, fallback):
+            self.places.touch((name[0], each))
+        self.turns.note(name, fallback)
 
     def note_limits(self, template: Name) -> None:
         """Note how many instances a template may have now, and what it falls back to, should it be there."""
@@ -174,81 +187,19 @@ class ClusterCache:
         others = {name: count for name, count in self._limits.get(template[0], {}).items() if name != template[1]}
         self._limits[template[0]] = {**others, **own}
 
-    def _borrowed(self, name: Name, template: str, now: float) -> list[Claim]:
-        """The claims on an instance by tasks of others that are not ready."""
-        found: list[Claim] = []
-        for of in self.turns.falling_to((name[0], template)):
-            for each in self.instances_of(of):
-                instance = self.instance(each)
-                if instance is None or not overdue(instance, self.template(of), now)[0]:
-                    continue
-                decision = self._own(each, of[1], self.claims.claims(each, of[1]), now)
-                claims = decision.fallback.claims if decision.fallback is not None else ()
-                found += [claimed for claimed in claims if claimed.instance == name[1]]
-        return found
-
     def falling_back_to(self, template: Name) -> set[Name]:
         """The instances whose tasks turn to this template when they are not ready."""
         return {each for name in self.turns.falling_to(template) for each in self.instances_of(name)}
 
-    def _template_of(self, name: Name, instance: ApplicationInstance | None, claims: list[Claim]) -> str:
-        if instance is not None:
-            return instance.spec.template
-        return claims[0].template if claims else self.turns.template_of(name) or name[1]
-
-    def _known_instances(self, namespace: str) -> set[Name]:
-        """The instances of a namespace that there are, or that are demanded."""
+    def known_instances(self, namespace: str) -> set[str]:
+        """The names of a namespace's instances that exist, or may be demanded."""
         known = {name for name, _ in self.store.all(INSTANCE)} | {name for name, _ in self.store.all(TEMPLATE)}
         known |= {name for name in self.claims.instances() if template_of_all(name[1]) is None}
-        return {name for name in known if name[0] == namespace}
+        return {name for of, name in known if of == namespace}
 
-    def _alone_and_candidate(self, name: Name, now: float) -> tuple[Decision, Candidate | None] | None:
-        decision = self._alone(name, now)
-        if decision is None:
-            return None
-        template = self.template((name[0], decision.template))
-        being_made = name in self.places.being_made
-        return decision, candidate(decision, self.instance(name), template, being_made=being_made)
-
-    def _alone(self, name: Name, now: float) -> Decision | None:
-        """What should become of the instance were there no limits."""
-        instance, named = self.instance(name), self.claims.claims(name)
-        of = self._template_of(name, instance, named)
-        own, borrowed = self.claims.claims(name, of), self._borrowed(name, of, now)
-        if instance is None and not named and not borrowed and not has_baseline(self.template(name)):
-            self.deadlines.pop(name, None)
-            return None
-        decision = self._own(name, of, [*own, *borrowed], now)
-        if borrowed and decision.overdue:  # what it serves for others it does not hand on
-            decision = replace(decision, fallback=self._own(name, of, own, now).fallback)
-        if instance is not None:
-            self.deadlines[name] = (instance.metadata.uid, decision.release_time)
-        return decision
-
-    def _own(self, name: Name, of: str, claims: list[Claim], now: float) -> Decision:
-        instance, template = self.instance(name), self.template((name[0], of))
-        holders = (each.task.spec.requester.holder for each in claims)
-        other = fallback_of(template)
-        return decide(
-            name[1],
-            of,
-            template=template,
-            claims=claims,
-            instance=instance,
-            deadline=self._deadline(name, instance) if instance is not None else None,
-            leases=self.lease_views(name[0], holders),
-            now=now,
-            other=self.template((name[0], other)) if other is not None else None,
-        )
-
-    def _decide_for_all(self, name: Name, claims: list[Claim], now: float) -> Decision | None:
-        """What is said of tasks that mean all instances of a template, by the name that stands for these."""
-        if not claims:
-            return None
-        template = self.template((name[0], template_of_all(name[1]) or ""))
-        holders = (each.task.spec.requester.holder for each in claims)
-        leases = self.lease_views(name[0], holders)
-        return decide_for_all(name[1], template=template, claims=claims, leases=leases, now=now)
+    def limits(self, namespace: str) -> Limits:
+        """How many instances there may be in a namespace."""
+        return Limits(self._limits.get(namespace, {}), self.limit)
 
     def meant(self, name: Name) -> set[Name]:
         """The instances that a name means, which may stand for all of a template; that name is among them."""
@@ -259,10 +210,6 @@ class ClusterCache:
         own = {template} if has_baseline(self.template(template)) else set()
         demanded = own | self.claims.claimed_of(template) | self.turns.instances_of(template)
         return {name} | demanded | set(self.instances_of(template))
-
-    def _deadline(self, name: Name, instance: ApplicationInstance) -> float | None:
-        uid, decided = self.deadlines.get(name, ("", None))
-        return decided if uid == instance.metadata.uid else written_deadline(instance)
 
     def lease_views(self, namespace: str, holders: Iterable[str | None]) -> dict[str, LeaseView]:
         """The Leases of the holders, by holder."""
@@ -290,6 +237,57 @@ class ClusterCache:
         self._findings.pop(name, None)
         self.exceeded.pop(name, None)
         self.overlap.forget(name)
+
+
+@dataclass(frozen=True, slots=True)
+class _NamespaceIndexes:
+    """The indexes of one namespace, as decisions read them."""
+
+    cache: ClusterCache
+    namespace: str
+
+    def template(self, name: str) -> ApplicationTemplate | InvalidTemplate | None:
+        return self.cache.template((self.namespace, name))
+
+    def instance(self, name: str) -> ApplicationInstance | None:
+        return self.cache.instance((self.namespace, name))
+
+    def claims(self, instance: str, template: str | None = None) -> list[Claim]:
+        return self.cache.claims.claims((self.namespace, instance), template)
+
+    def deadline(self, instance: ApplicationInstance) -> float | None:
+        uid, decided = self.cache.deadlines.get((self.namespace, instance.name), ("", None))
+        return decided if uid == instance.metadata.uid else written_deadline(instance)
+
+    def leases(self, claims: Iterable[Claim]) -> Mapping[str, LeaseView]:
+        return self.cache.lease_views(self.namespace, (each.task.spec.requester.holder for each in claims))
+
+    def fallback_templates(self) -> Iterable[str]:
+        return self.cache.turns.targets(self.namespace)
+
+    def fallbacks(self, template: str, now: float) -> Iterable[Fallback]:
+        for name in self.cache.falling_back_to((self.namespace, template)):
+            instance = self.cache.instance(name)
+            turned = fallback_claims(instance, self, now) if instance is not None else None
+            if turned is not None:
+                yield turned
+
+    def placement(self, name: str, unlimited: Decision | None, now: float) -> Placement | None:
+        limits, places = self.cache.limits(self.namespace), self.cache.places
+        if not limits:
+            return None
+        known = places.placement(self.namespace)
+        names = places.stale(known, self.namespace, now) if known else self.cache.known_instances(self.namespace)
+        decisions = {each: decide_without_limits(each, self, now) for each in names - {name}} | {name: unlimited}
+        requests = {
+            each: request(each, decision, self, being_made=(self.namespace, each) in places.being_made)
+            for each, decision in decisions.items()
+        }
+        return (known or Placement(limits)).updated(requests, limits, now)
+
+
+def _fallback(decided: Decided) -> Fallback | None:
+    return decided.unlimited.fallback if decided.unlimited is not None else None
 
 
 def _version(template: ApplicationTemplate) -> _Version:

@@ -23,20 +23,22 @@ class FallbackIndex:
         """The templates that fall back to this one."""
         return [name for name, other in self._templates.items() if (name[0], other) == template]
 
-    def turn(self, instance: Name, now: Fallback | None) -> set[Name]:
-        """Note what an instance's tasks turn to; returns the instances for which that is news."""
-        before = self._turned.pop(instance, None)
-        if now is not None:
-            self._turned[instance] = now
-        if before == now:
-            return set()
-        names = (before.instances if before else set()) | (now.instances if now else set())
-        return {(instance[0], each) for each in names}
+    def targets(self, namespace: str) -> set[str]:
+        """The templates of a namespace to which others fall back."""
+        return {other for name, other in self._templates.items() if name[0] == namespace}
 
-    def template_of(self, instance: Name) -> str | None:
-        """The template of an instance that tasks turned to; None where none did."""
-        turned = (each for of, each in self._turned.items() if of[0] == instance[0] and instance[1] in each.instances)
-        return next((each.template for each in turned), None)
+    def moved(self, instance: Name, to: Fallback | None) -> set[str]:
+        """The instances that get or lose tasks if those of this instance turn to `to` now."""
+        before = self._turned.get(instance)
+        if before == to:
+            return set()
+        return (before.instances if before else set()) | (to.instances if to else set())
+
+    def note(self, instance: Name, to: Fallback | None) -> None:
+        """Note what an instance's tasks turn to; None where they do not."""
+        self._turned.pop(instance, None)
+        if to is not None:
+            self._turned[instance] = to
 
     def instances_of(self, template: Name) -> set[Name]:
         """The instances of a template that tasks turned to."""

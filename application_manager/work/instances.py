@@ -42,6 +42,7 @@ class InstanceWork:
         instances: where ApplicationInstances live.
         tasks: where ApplicationTasks live.
         again: asks for an instance at a time, in seconds since 1970.
+        enqueue: enqueues an instance.
         done: told when an instance's record is new.
         absent: told what was decided of an instance that neither exists nor should.
         observe: takes an object that was read.
@@ -60,6 +61,7 @@ class InstanceWork:
     instances: Resource
     tasks: Resource
     again: Callable[[Name, float], None]
+    enqueue: Callable[[Name], None]
     done: Callable[[Name], None]
     absent: Callable[[Name, Decision | None], None]
     observe: Callable[[Object], None]
@@ -85,11 +87,15 @@ class InstanceWork:
         if self._is_unsettled(name):
             return  # what runs stays: who demands it is being worked out, and that brings us back
         await self._know_whether_it_was_made(name)
-        if await self._released(name):
-            return
-        # Decided only now: while the tasks were listed, the instance itself may have gone. From here to the first
-        # request nothing is waited for, so what was decided and what there is belong together.
-        instance, decision = self.cache.instance(name), self.cache.decide(name, time.time())
+        decision = self._decide(name)
+        if self._is_over(name, decision):
+            # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
+            await self._list_tasks(name)
+            decision = self._decide(name)  # while the tasks were listed, the instance itself may have gone
+            if decision is not None and self._is_over(name, decision) and await self._released(name, decision):
+                return
+        # From the decision to the first request nothing is awaited, so the decision is about what there is.
+        instance = self.cache.instance(name)
         if decision is not None and decision.next_change is not None:
             self.again(name, decision.next_change)
         if decision is None or (instance is None and not decision.wanted):
@@ -237,18 +243,32 @@ class InstanceWork:
         self.cache.records[name] = Record(uid, decision, applied, digest, since)
         self.done(name)
 
-    async def _released(self, name: Name) -> bool:
-        """Delete the instance if its linger is over and a fresh look at the tasks agrees; whether it was deleted."""
+    def _decide(self, name: Name) -> Decision | None:
+        """Decide, and enqueue the instances that the decision concerns too."""
+        decided = self.cache.decide(name, time.time())
+        self.cache.note(name, decided)
+        for each in decided.enqueue:
+            self.enqueue((name[0], each))
+        return decided.decision
+
+    def _is_over(self, name: Name, decision: Decision | None) -> bool:
+        """Whether the instance goes now: its linger is over, or another has its place."""
         instance = self.cache.instance(name)
-        if instance is None or instance.metadata.deletion_timestamp is not None or self._over(name) is None:
+        if instance is None or instance.metadata.deletion_timestamp is not None or decision is None:
             return False
-        # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
-        fields = f"spec.template={instance.spec.template}"
+        return decision.release_time is not None and decision.release_time <= time.time()
+
+    async def _list_tasks(self, name: Name) -> None:
+        instance = self.cache.instance(name)
+        fields = f"spec.template={instance.spec.template}" if instance is not None else ""
         async for page, _ in self.client.pages(self.tasks, name[0], fields=fields):
             for raw in page:
                 self.observe(raw)
-        over = self._over(name)
-        if over is None:
+
+    async def _released(self, name: Name, over: Decision) -> bool:
+        """Delete the instance, unless claims of tasks are still being worked out; whether it was deleted."""
+        instance = self.cache.instance(name)
+        if instance is None:
             return False
         if self.cache.claims.pending((name[0], instance.spec.template)):
             self.again(name, time.time() + _LOOK_AGAIN)  # one of the tasks that were listed may demand it
@@ -262,11 +282,3 @@ class InstanceWork:
     def _is_unsettled(self, name: Name) -> bool:
         instance = self.cache.instance(name)
         return instance is not None and self.cache.claims.unsettled((name[0], instance.spec.template))
-
-    def _over(self, name: Name) -> Decision | None:
-        """The decision, where it is that the instance goes now: its linger is over, or another has its place."""
-        now = time.time()
-        decision = self.cache.decide(name, now)
-        if decision is None or decision.release_time is None or decision.release_time > now:
-            return None
-        return decision

@@ -51,6 +51,7 @@ def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
         instances=INSTANCES,
         tasks=TASKS,
         again=ignore,
+        enqueue=ignore,
         done=ignore,
         absent=absent,
         observe=router.observe,

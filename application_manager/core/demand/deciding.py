@@ -1,49 +1,155 @@
-"""What should become of one instance: of the tasks that claim it, its status, the Leases and the time. Pure."""
+"""What should become of one instance, from indexes of its namespace and the time. Pure.
+
+`decide` is the one way to a decision: the operator calls it over the indexes of its cache, and `demand` over those of a
+snapshot. It changes nothing. Without limits, a decision follows from the tasks that claim the instance, its status and
+the Leases of their holders. Tasks of instances that are not ready claim it too, where their template falls back to its
+own. Limits are the last step: all instances of the namespace compete for places.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict, settle, waiting_for_any
+from application_manager.core.claims.parameters import baseline
 from application_manager.core.conditions import find, holds
 from application_manager.core.demand import byhand
 from application_manager.core.demand.decisions import Decision, is_managed
-from application_manager.core.demand.fallback import fallback, overdue
+from application_manager.core.demand.fallback import Fallback, fallback, fallback_of, overdue
 from application_manager.core.demand.lingering import linger_of, protected_until
-from application_manager.core.demand.places import BASELINE_RANK
-from application_manager.core.demand.placing import PREEMPTED
+from application_manager.core.demand.places import BASELINE_RANK, Placement, Request
+from application_manager.core.demand.placing import PREEMPTED, candidate, placed
 from application_manager.core.holders.lapses import live_claims
 from application_manager.core.holders.leases import LeaseView
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 
 
-def decide(
-    name: str,
-    template_name: str,
-    *,
-    template: ApplicationTemplate | InvalidTemplate | None,
-    claims: Iterable[Claim],
-    instance: ApplicationInstance | None,
-    deadline: float | None,
-    leases: Mapping[str, LeaseView],
-    now: float,
-    other: ApplicationTemplate | InvalidTemplate | None = None,
-) -> Decision:
-    """What should become of the instance, given the tasks that claim it.
+class Indexes(Protocol):
+    """What decisions read of one namespace. Names are those of objects in it."""
 
-    `other` is the template that its own one falls back to, if there is one of that name.
-    `deadline` is the release time of the decision before this one, None where that was to keep the instance: a
-    linger continues while there is no demand, and restarts after one.
+    def template(self, name: str) -> ApplicationTemplate | InvalidTemplate | None:
+        """The template, also where it is not valid."""
+
+    def instance(self, name: str) -> ApplicationInstance | None:
+        """The instance."""
+
+    def claims(self, instance: str, template: str | None = None) -> list[Claim]:
+        """The claims of tasks on an instance; with its template, also those on all instances of that."""
+
+    def deadline(self, instance: ApplicationInstance) -> float | None:
+        """The release time decided before, in seconds since 1970; None where the instance was to stay."""
+
+    def leases(self, claims: Iterable[Claim]) -> Mapping[str, LeaseView]:
+        """The Leases of the holders of these claims, by holder; one that is missing is not lost."""
+
+    def fallback_templates(self) -> Iterable[str]:
+        """The templates to which others fall back."""
+
+    def fallbacks(self, template: str, now: float) -> Iterable[Fallback]:
+        """`fallback_claims` of each instance whose template falls back to this one."""
+
+    def placement(self, name: str, unlimited: Decision | None, now: float) -> Placement | None:
+        """Who has a place, given the decision about this instance without limits; None where there are no limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """What `decide` returns.
+
+    Attributes:
+        decision: what should become of the instance; None: it does not exist, and nothing demands it.
+        unlimited: the same without limits.
+        placement: who has a place in the namespace now; None where there are no limits.
+        enqueue: the names of other instances to decide again, since this decision changes theirs.
     """
+
+    decision: Decision | None
+    unlimited: Decision | None = None
+    placement: Placement | None = None
+    enqueue: frozenset[str] = frozenset()
+
+
+def decide(name: str, indexes: Indexes, now: float) -> Decided:
+    """What should become of an instance, or of tasks for all instances of a template by the name that stands for these.
+
+    `now` is in seconds since 1970.
+    """
+    if template_of_all(name) is not None:
+        return Decided(_decide_for_all(name, indexes, now))
+    unlimited = decide_without_limits(name, indexes, now)
+    placement = indexes.placement(name, unlimited, now)
+    if unlimited is None or placement is None:
+        return Decided(unlimited, unlimited, placement)
+    exists = indexes.instance(name) is not None
+    return Decided(placed(unlimited, placement.given.get(name), exists=exists, now=now), unlimited, placement)
+
+
+def decide_without_limits(name: str, indexes: Indexes, now: float) -> Decision | None:
+    """What should become of an instance if there were no limits; None: it does not exist, and nothing demands it."""
+    instance, named = indexes.instance(name), indexes.claims(name)
+    template = _template_of(name, instance, named, indexes, now)
+    borrowed = _borrowed(name, template, indexes, now)
+    if instance is None and not named and not borrowed and not has_baseline(indexes.template(name)):
+        return None
+    own = indexes.claims(name, template)
+    decision = _decide_one(name, template, [*own, *borrowed], indexes, now)
+    if borrowed and decision.overdue:  # what it serves for others it does not hand on
+        return replace(decision, fallback=_decide_one(name, template, own, indexes, now).fallback)
+    return decision
+
+
+def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_made: bool = False) -> Request:
+    """What an instance requests of the limits; `being_made`: the API server may have it already."""
+    if unlimited is None:
+        return Request(None, None)
+    template = indexes.template(unlimited.template)
+    asked = candidate(unlimited, indexes.instance(name), template, being_made=being_made)
+    return Request(asked, unlimited.next_change)
+
+
+def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float) -> Fallback | None:
+    """What the tasks of an instance turn to while it is not ready in time; None where they do not."""
+    of = instance.spec.template
+    if not overdue(instance, indexes.template(of), now)[0]:
+        return None
+    return _decide_one(instance.name, of, indexes.claims(instance.name, of), indexes, now).fallback
+
+
+def has_baseline(template: ApplicationTemplate | InvalidTemplate | None) -> bool:
+    """Whether the template demands its instance, which has its name, by itself."""
+    return isinstance(template, ApplicationTemplate) and baseline(template) is not None
+
+
+def _template_of(
+    name: str, instance: ApplicationInstance | None, claims: list[Claim], indexes: Indexes, now: float
+) -> str:
+    if instance is not None:
+        return instance.spec.template
+    if claims:
+        return claims[0].template
+    named = (each for each in indexes.fallback_templates() if name == each or name.startswith(f"{each}-"))
+    return next((each for each in named if _borrowed(name, each, indexes, now)), name)
+
+
+def _borrowed(name: str, template: str, indexes: Indexes, now: float) -> list[Claim]:
+    """The claims on an instance by tasks of others that are not ready."""
+    return [each for turned in indexes.fallbacks(template, now) for each in turned.claims if each.instance == name]
+
+
+def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes: Indexes, now: float) -> Decision:
+    """What should become of an instance, given the tasks that claim it."""
     ordered = sorted(claims, key=lambda each: precedence(each.task))
+    template, instance = indexes.template(template_name), indexes.instance(name)
     paused = instance is not None and byhand.is_paused(instance)
     if instance is not None and not is_managed(instance):
         return _left_alone(instance, ordered)
     if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
         key = instance.spec.key if instance else None
         return Decision(name, template_name, key, None, (), {}, None, None, paused)
-    live, verdicts, changes = live_claims(ordered, template, leases, now)
+    live, verdicts, changes = live_claims(ordered, template, indexes.leases(ordered), now)
     settled = settle(name, template, live, instance is not None)
     kept = instance.spec.key if instance else None
     key = next((each.key for each in live if each.task.name in settled.tasks[:1]), kept)  # all that deploy it agree
@@ -52,8 +158,10 @@ def decide(
     release_time = None
     if not wanted and instance is not None and not paused and not byhand.is_held(instance):
         linger = linger_of(instance, template).seconds  # from when we see that no demand is left
+        deadline = indexes.deadline(instance)  # of a linger that continues; it restarts after a demand
         release_time = max(now + linger if deadline is None else deadline, protected_until(instance, template))
         changes.append(release_time)
+    other = indexes.template(fallback_of(template) or "")
     late, change = overdue(instance, template, now) if instance is not None else ("", None)
     changes += [change] if change is not None else []
     served = [each for each in live if each.task.name in settled.tasks]
@@ -100,21 +208,17 @@ def _was_served(task: ApplicationTask) -> bool:
     return applied or holds(conditions, "Applied") or (accepted is not None and accepted.reason == PREEMPTED)
 
 
-def decide_for_all(
-    name: str,
-    *,
-    template: ApplicationTemplate | InvalidTemplate | None,
-    claims: Iterable[Claim],
-    leases: Mapping[str, LeaseView],
-    now: float,
-) -> Decision:
+def _decide_for_all(name: str, indexes: Indexes, now: float) -> Decision | None:
     """The verdicts of tasks that mean all instances of a template, as far as these do not matter (see `gathered`).
 
-    It makes nothing run; `name` is what `all_instances` gives.
+    It makes nothing run; `name` is what `all_instances` gives. None where there are no such tasks.
     """
-    ordered = sorted(claims, key=lambda each: precedence(each.task))
+    template = indexes.template(template_of_all(name) or "")
+    ordered = sorted(indexes.claims(name), key=lambda each: precedence(each.task))
+    if not ordered:
+        return None
     usable = template if isinstance(template, ApplicationTemplate) else None
-    live, verdicts, changes = live_claims(ordered, usable, leases, now)
+    live, verdicts, changes = live_claims(ordered, usable, indexes.leases(ordered), now)
     verdicts |= {each.task.name: waiting_for_any(each) for each in live}
     return Decision(
         name=name,

@@ -2,16 +2,14 @@
 
 `demand` looks at one namespace: its templates, tasks, instances with their status, the Leases of its holders and the
 time. The result does not depend on the order in which anything arrived. It falls into independent parts: each task
-claims an instance by itself (`claims`), and `decide` looks at one instance and the tasks that claim it. The operator
-calls just these parts for what changed; `demand` is their sum. Only where there are limits, the parts of a namespace
-are looked at together (`places`), and what is beyond a limit waits or goes (`placing`); and the tasks of an instance
-that does not become ready claim one of another template (`fallback`).
+claims an instance by itself (`claims`), and `decide` (`deciding`) determines what becomes of one instance. The operator
+calls `decide` for what changed, over the indexes of its cache. `demand` calls it for all, over those of a snapshot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from application_manager.core.claims.claims import (
     Claim,
@@ -22,13 +20,18 @@ from application_manager.core.claims.claims import (
     template_of_all,
 )
 from application_manager.core.claims.operations import Standing, Verdict, gathered
-from application_manager.core.claims.parameters import baseline
-from application_manager.core.demand.deciding import decide, decide_for_all
+from application_manager.core.demand.deciding import (
+    decide,
+    decide_without_limits,
+    fallback_claims,
+    has_baseline,
+    request,
+)
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.fallback import fallback_of, turned
+from application_manager.core.demand.fallback import Fallback, fallback_of, turned
 from application_manager.core.demand.lingering import written_deadline
-from application_manager.core.demand.places import places
-from application_manager.core.demand.placing import candidate, limits, placed
+from application_manager.core.demand.places import Placement
+from application_manager.core.demand.placing import limits
 from application_manager.core.holders.leases import LeaseView
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 
@@ -66,81 +69,111 @@ def demand(
         now: seconds since 1970.
         limit: how many instances the namespace may have; None: any number.
     """
-    by_name: dict[str, ApplicationTemplate | InvalidTemplate] = {each.name: each for each in templates}
-    existing = {each.name: each for each in instances}
-    claimed: dict[str, list[Claim]] = {}
     verdicts: dict[str, Verdict] = {}
+    claims: list[Claim] = []
+    by_name = {each.name: each for each in templates}
     for task in {each.name: each for each in tasks}.values():
-        verdict = claim_or_verdict(by_name.get(task.spec.template), task)
-        if isinstance(verdict, Claim):
-            claimed.setdefault(verdict.instance, []).append(verdict)
+        claimed = claim_or_verdict(by_name.get(task.spec.template), task)
+        if isinstance(claimed, Claim):
+            claims.append(claimed)
         else:
-            verdicts[task.name] = verdict
-    to_all = {name: claimed.pop(name) for name in list(claimed) if template_of_all(name)}
-    always = {name for name, each in by_name.items() if has_baseline(each)}
-
-    def decided(name: str, template: str, claims: list[Claim]) -> Decision:
-        instance, of = existing.get(name), by_name.get(template)
-        return decide(
-            name,
-            template,
-            template=of,
-            claims=[*claims, *to_all.get(all_instances(template), [])],
-            instance=instance,
-            deadline=written_deadline(instance) if instance else None,
-            leases=leases,
-            now=now,
-            other=by_name.get(fallback_of(of) or ""),
-        )
-
-    turns = {
-        name: decided(name, each.spec.template, claimed.get(name, [])).fallback
-        for name, each in existing.items()
-        if fallback_of(by_name.get(each.spec.template)) is not None
-    }
-    for each in (claim_ for turn in turns.values() if turn is not None for claim_ in turn.claims):
-        claimed.setdefault(each.instance, []).append(each)
-    decisions: dict[str, Decision] = {}
-    for name in sorted(claimed.keys() | existing.keys() | always):
-        instance, claims = existing.get(name), claimed.get(name, [])
-        template = instance.spec.template if instance else claims[0].template if claims else name
-        decisions[name] = replace(decided(name, template, claims), fallback=turns.get(name))
-    bounds = limits(by_name.values(), limit)
-    if bounds:
-        asking = (candidate(each, existing.get(name), by_name.get(each.template)) for name, each in decisions.items())
-        given = places((each for each in asking if each is not None), bounds, now)
-        decisions = {
-            name: placed(each, given.get(name), exists=name in existing, now=now) for name, each in decisions.items()
-        }
+            verdicts[task.name] = claimed
+    indexes = _Snapshot(by_name, {each.name: each for each in instances}, claims, leases, limit)
+    found = {name: decide(name, indexes, now).decision for name in indexes.names(now)}
+    decisions = {name: each for name, each in found.items() if each is not None}
     for settled in decisions.values():
         own = {name: each for name, each in settled.verdicts.items() if name not in settled.borrowed}
         verdicts |= {name: _turned(each, name, settled, decisions) for name, each in own.items()}
     changes = [each.next_change for each in decisions.values() if each.next_change is not None]
-    for name, claims in to_all.items():
-        of = template_of_all(name) or ""
-        alone = decide_for_all(name, template=by_name.get(of), claims=claims, leases=leases, now=now)
-        for each in claims:
+    for name in {each.instance for each in claims if template_of_all(each.instance) is not None}:
+        alone = decide(name, indexes, now).decision
+        if alone is None:
+            continue
+        for each in indexes.claims(name):
             parts = {
                 decision.name: decision.verdicts[each.task.name]
                 for decision in decisions.values()
-                if decision.template == of and each.task.name in decision.verdicts
+                if decision.template == each.template and each.task.name in decision.verdicts
             }
             verdicts[each.task.name] = gathered(each, parts, alone.verdicts[each.task.name])
         if alone.next_change is not None:
             changes.append(alone.next_change)
-    shown = {name: each for name, each in decisions.items() if each.wanted or name in existing}
+    shown = {name: each for name, each in decisions.items() if each.wanted or indexes.instance(name) is not None}
     waiting = {name: each for name, each in decisions.items() if name not in shown}
     return Outcome(shown, verdicts, min(changes, default=None), waiting)
+
+
+class _Snapshot:
+    """The indexes of one namespace, of all its objects at one time."""
+
+    def __init__(
+        self,
+        templates: Mapping[str, ApplicationTemplate | InvalidTemplate],
+        instances: Mapping[str, ApplicationInstance],
+        claims: Iterable[Claim],
+        leases: Mapping[str, LeaseView],
+        limit: int | None,
+    ) -> None:
+        self._templates = templates
+        self._instances = instances
+        self._leases = leases
+        self._limits = limits(templates.values(), limit)
+        self._claims: dict[str, list[Claim]] = {}
+        for each in claims:
+            self._claims.setdefault(each.instance, []).append(each)
+        self._fallbacks: dict[str, list[Fallback]] = {}
+        self._placement: Placement | None = None
+
+    def names(self, now: float) -> list[str]:
+        """The instances that exist, or are demanded."""
+        own = {each for each in self._claims if template_of_all(each) is None}
+        always = {name for name, each in self._templates.items() if has_baseline(each)}
+        turned = {
+            each for to in self.fallback_templates() for turn in self.fallbacks(to, now) for each in turn.instances
+        }
+        return sorted(own | always | turned | self._instances.keys())
+
+    def template(self, name: str) -> ApplicationTemplate | InvalidTemplate | None:
+        return self._templates.get(name)
+
+    def instance(self, name: str) -> ApplicationInstance | None:
+        return self._instances.get(name)
+
+    def claims(self, instance: str, template: str | None = None) -> list[Claim]:
+        of_all = self._claims.get(all_instances(template), []) if template is not None else []
+        return [*self._claims.get(instance, []), *of_all]
+
+    def deadline(self, instance: ApplicationInstance) -> float | None:
+        return written_deadline(instance)
+
+    def leases(self, claims: Iterable[Claim]) -> Mapping[str, LeaseView]:
+        del claims
+        return self._leases
+
+    def fallback_templates(self) -> set[str]:
+        return {other for each in self._templates.values() if (other := fallback_of(each)) is not None}
+
+    def fallbacks(self, template: str, now: float) -> list[Fallback]:
+        if template not in self._fallbacks:
+            of = [each for each in self._instances.values() if self._falls_to(each.spec.template) == template]
+            turned = (fallback_claims(each, self, now) for each in of)
+            self._fallbacks[template] = [each for each in turned if each is not None]
+        return self._fallbacks[template]
+
+    def _falls_to(self, template: str) -> str | None:
+        return fallback_of(self._templates.get(template))
+
+    def placement(self, name: str, unlimited: Decision | None, now: float) -> Placement | None:
+        del name, unlimited
+        if self._placement is None and self._limits:
+            requests = {each: request(each, decide_without_limits(each, self, now), self) for each in self.names(now)}
+            self._placement = Placement(self._limits).updated(requests, self._limits, now)
+        return self._placement
 
 
 def _turned(verdict: Verdict, task: str, settled: Decision, decisions: Mapping[str, Decision]) -> Verdict:
     other = decisions.get(settled.fallback.instance_of(task) or "") if settled.fallback is not None else None
     return turned(verdict, task, settled.fallback, other.verdicts if other is not None else {})
-
-
-def has_baseline(template: ApplicationTemplate | InvalidTemplate | None) -> bool:
-    """Whether the template demands its instance, which has its name, by itself."""
-    return isinstance(template, ApplicationTemplate) and baseline(template) is not None
 
 
 def claim_or_verdict(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Verdict:

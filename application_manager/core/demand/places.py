@@ -10,9 +10,10 @@ An instance is counted until it is gone. So what gets the place of another waits
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 Rank = tuple[int, str, str]
 """Of a demand's first task: its priority negated, its creation, its name."""
@@ -94,6 +95,63 @@ class Place:
     def starts(self) -> bool:
         """Whether it may run now."""
         return self.given and not self.awaits
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What an instance requests of the limits.
+
+    Attributes:
+        candidate: None where it takes no place.
+        next_change: when that changes by itself, in seconds since 1970; None: not at all.
+    """
+
+    candidate: Candidate | None
+    next_change: float | None
+
+
+_NOTHING = Request(None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Who has a place in one namespace, and the requests that this follows from, by name of the instance.
+
+    Attributes:
+        until: when places change by themselves, in seconds since 1970.
+    """
+
+    limits: Limits
+    requests: Mapping[str, Request] = field(default_factory=dict)
+    given: Mapping[str, Place] = field(default_factory=dict)
+    until: float = -math.inf
+
+    def due(self, now: float) -> set[str]:
+        """The instances whose request has changed by itself; `now` in seconds since 1970."""
+        times = ((name, each.next_change) for name, each in self.requests.items())
+        return {name for name, when in times if when is not None and when <= now}
+
+    def updated(self, requests: Mapping[str, Request], limits: Limits, now: float) -> Placement:
+        """The placement with these requests in place of the instances' former ones."""
+        news = {name: each for name, each in requests.items() if self.requests.get(name, _NOTHING) != each}
+        stale = now >= self.until or limits != self.limits
+        if not news and not stale:
+            return self
+        merged = {name: each for name, each in {**self.requests, **news}.items() if each != _NOTHING}
+        if not stale and all(
+            self.requests.get(name, _NOTHING).candidate == each.candidate for name, each in news.items()
+        ):
+            return replace(self, requests=merged)
+        candidates = [each.candidate for each in merged.values() if each.candidate is not None]
+        ends = [each.protected_until for each in candidates if now < each.protected_until]
+        return Placement(limits, merged, places(candidates, limits, now), min(ends, default=math.inf))
+
+    def moved(self, before: Placement | None) -> set[str]:
+        """The instances whose place is another than before."""
+        then: Mapping[str, Place] = before.given if before is not None else {}
+        if then is self.given:
+            return set()
+        return {name for name in self.given.keys() | then.keys() if self.given.get(name) != then.get(name)}
 
 
 def places(candidates: Iterable[Candidate], limits: Limits, now: float) -> dict[str, Place]:

@@ -33,9 +33,10 @@ def claim(cache: ClusterCache, wanted: ApplicationTask) -> None:
 
 
 def decided(cache: ClusterCache, at: float) -> Decision:
-    decision = cache.decide(NAME, NOW + at)
-    assert decision is not None
-    return decision
+    found = cache.decide(NAME, NOW + at)
+    cache.note(NAME, found)
+    assert found.decision is not None
+    return found.decision
 
 
 def test_a_deadline_holds_from_when_it_was_decided_though_no_status_says_it_yet() -> None:
@@ -74,5 +75,7 @@ def test_the_deadline_of_what_is_gone_is_forgotten() -> None:
     entry = cache.store.get(INSTANCE, NAME)
     assert entry is not None
     cache.store.remove(entry.raw)
-    assert cache.decide(NAME, NOW + 11) is None
+    found = cache.decide(NAME, NOW + 11)
+    cache.note(NAME, found)
+    assert found.decision is None
     assert cache.deadlines == {}

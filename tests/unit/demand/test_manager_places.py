@@ -62,7 +62,6 @@ class Manager:
     def __init__(self, limit: int | None) -> None:
         self.cache = ClusterCache(Policy(), limit)
         self.enqueued: set[Name] = set()
-        self.cache.places.changed = self.enqueued.add
         ask: Any = lambda _: None  # noqa: E731
         applier = Applier(cast("Client", None), self.cache.store, {})
         self.router = Router(self.cache, applier, self.enqueued.add, ask, ask, ask, ask)
@@ -85,7 +84,11 @@ class Manager:
         decided: dict[str, Decision | None] = {}
         while self.enqueued:
             name = self.enqueued.pop()
-            decided[name[1]] = self.cache.decide(name, NOW)
+            found = self.cache.decide(name, NOW)
+            assert self.cache.decide(name, NOW) == found  # it changes nothing
+            self.cache.note(name, found)
+            self.enqueued |= {(name[0], each) for each in found.enqueue}
+            decided[name[1]] = found.decision
         return decided
 
     def demand(self, limit: int | None) -> Outcome:

@@ -88,6 +88,7 @@ def work_on(cache: ClusterCache, server: object, absent: list[Name]) -> Instance
         instances=INSTANCES,
         tasks=TASKS,
         again=lambda name, at: None,
+        enqueue=lambda name: None,
         done=lambda name: None,
         absent=lambda name, decision: absent.append(name),
         observe=cache.store.put,
