@@ -13,19 +13,18 @@ from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TE
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.chartdesk import ChartDesk
-from application_manager.cluster.apply import Applier
 from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
-from application_manager.cluster.store import Name
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.objects.policy import KindKey
+from application_manager.core.objects.policy import KindKey, Name
 from application_manager.headroom import Headroom
 from application_manager.measures import Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.tracing import LostSpans, TaskTraces
 from application_manager.options import Options
 from application_manager.watching.router import Router
+from application_manager.work.applying import Applier
 from application_manager.work.configurations import ConfigurationWork
 from application_manager.work.detectors import DetectorWork
 from application_manager.work.instances import InstanceWork

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 
-from application_manager.cluster.store import Name
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.placing import LIMIT_REACHED
 from application_manager.core.holders.policies import TaskPolicy
+from application_manager.core.objects.policy import Name
 from wayside.api import ApplicationTask
 
 _Age = tuple[str, Name]

@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from application_manager.cache.budget_index import BudgetIndex
-from application_manager.cluster.store import Entry, Name
+from application_manager.cache.store import Entry
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, all_instances, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.holders.policies import TaskPolicy
+from application_manager.core.objects.policy import Name
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 Claims = Callable[[ApplicationTemplate | InvalidTemplate | None, ApplicationTask], Claim | Verdict | None]

@@ -11,8 +11,7 @@ from application_manager.cache.fallback_index import FallbackIndex
 from application_manager.cache.overlap_index import OverlapIndex
 from application_manager.cache.place_index import PlaceIndex
 from application_manager.cache.pod_index import PodIndex
-from application_manager.cluster.apply import Applied
-from application_manager.cluster.store import Name, Store
+from application_manager.cache.store import Store
 from application_manager.core.claims.claims import Claim, InvalidTemplate, template_of_all
 from application_manager.core.claims.operations import Verdict
 from application_manager.core.demand.deciding import (
@@ -31,7 +30,8 @@ from application_manager.core.demand.placing import limits
 from application_manager.core.findings.findings import Findings
 from application_manager.core.holders.leases import HealthyTime, LeaseIndex, LeaseView
 from application_manager.core.holders.policies import TaskPolicy
-from application_manager.core.objects.policy import KindKey, Policy
+from application_manager.core.objects.ownership import Applied
+from application_manager.core.objects.policy import KindKey, Name, Policy
 from application_manager.core.statuses.status import Service
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.findings import ignored_by

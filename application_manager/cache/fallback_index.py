@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from application_manager.cluster.store import Name
 from application_manager.core.demand.fallback import Fallback
+from application_manager.core.objects.policy import Name
 
 
 class FallbackIndex:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-from application_manager.cluster.store import Name
+from application_manager.core.objects.policy import Name
 from wayside.api.applicationtemplate import TemplateManager
 
 ANSWER = 5.0

@@ -7,8 +7,8 @@ nothing.
 
 from __future__ import annotations
 
-from application_manager.cluster.store import Name
 from application_manager.core.demand.places import Placement
+from application_manager.core.objects.policy import Name
 
 
 class PlaceIndex:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.helm import Helm, HelmError
 from application_manager.charts.rendering import failed, rendered, unavailable
-from application_manager.cluster.store import Name
 from application_manager.core.objects.charts import (
     FAILED,
     ChartFailure,
@@ -26,6 +25,7 @@ from application_manager.core.objects.charts import (
     ChartRequest,
     ChartSource,
 )
+from application_manager.core.objects.policy import Name
 
 FIRST_PAUSE = 5.0  # s after a failure, doubled with each further one
 LONGEST_PAUSE = 300.0  # s

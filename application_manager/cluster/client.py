@@ -23,6 +23,7 @@ from kubernetes.aio.client import ApiClient, Configuration
 
 from application_manager.cluster.fence import FencedRequest, writing
 from application_manager.cluster.pacing import Pacing
+from application_manager.core.objects.ownership import FIELD_MANAGER
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.objects.rights import REMEDY
 from application_manager.measures import NO_ANSWER, Measures
@@ -30,7 +31,6 @@ from application_manager.measures import NO_ANSWER, Measures
 Object = dict[str, Any]
 """A Kubernetes object, as JSON."""
 
-FIELD_MANAGER = "wayside"
 _APPLY = "application/apply-patch+yaml"
 _MERGE = "application/merge-patch+json"
 _STRATEGIC = "application/strategic-merge-patch+json"

@@ -16,9 +16,9 @@ from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from application_manager.cache.cluster_cache import ClusterCache, Record
-from application_manager.cluster.store import Name
 from application_manager.core.claims.operations import Standing
 from application_manager.core.conditions import changed, find, holds
+from application_manager.core.objects.policy import Name
 from application_manager.measures import PREFIX
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import TRACEPARENT_ANNOTATION, ApplicationTaskStatus

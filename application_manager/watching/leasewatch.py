@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import LEASES, ApiError, Client, Resource, Unreachable
-from application_manager.cluster.store import Name
 from application_manager.core.holders.leases import HolderKey
+from application_manager.core.objects.policy import Name
 from wayside.leases import lease_name
 
 LOOK_EVERY = 1.0  # s

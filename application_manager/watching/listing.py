@@ -9,10 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
+from application_manager.cache.store import name_of
 from application_manager.cluster.client import LEASES, ApiError, Client, Resource, Unreachable
 from application_manager.cluster.starting import until_answered
-from application_manager.cluster.store import Name, name_of
 from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.policy import Name
 from application_manager.measures import Measures
 from application_manager.watching.router import Router
 

@@ -10,11 +10,12 @@ import logging
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.apply import Applier, controller_uid
 from application_manager.cluster.client import ApiError, Client, Object, Resource
-from application_manager.cluster.store import Name
 from application_manager.core.objects import following
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
+from application_manager.core.objects.ownership import controller_uid
+from application_manager.core.objects.policy import Name
+from application_manager.work.applying import Applier
 from application_manager.work.publishing import Publisher
 from wayside.api import ApplicationInstance
 

@@ -14,14 +14,14 @@ from dataclasses import dataclass, field, replace
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.cluster.apply import controller_uid, our_fields
 from application_manager.cluster.client import ApiError, Client, Object, Resource
-from application_manager.cluster.store import Name
 from application_manager.core.conditions import Aspect
 from application_manager.core.findings.rulefindings import detector_findings
 from application_manager.core.health.refusals import reason_of, with_remedy
 from application_manager.core.objects.detectors import KINDS, Manifest, detector_objects
+from application_manager.core.objects.ownership import controller_uid, our_fields
 from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
 from application_manager.core.statuses.running import NOT_ACCEPTED, NOT_RUN, RUNNING, carried, running
 from application_manager.work.sidecars import SidecarNews

@@ -14,17 +14,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from application_manager.cache.cluster_cache import ClusterCache, Record
-from application_manager.cluster.apply import Applied, Applier, Known, ObjectKey, references
-from application_manager.cluster.attempts import Attempts
 from application_manager.cluster.client import ApiError, Client, Object, Resource
-from application_manager.cluster.store import Name
 from application_manager.core.claims.sizes import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.health.refusals import reason_of, with_remedy
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
+from application_manager.core.objects.ownership import Applied, Known, ObjectKey, references
+from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering, object_key
+from application_manager.work.applying import Applier
+from application_manager.work.attempts import Attempts
 from application_manager.work.recorder import Reason, Recorder
 from application_manager.work.suspending import Suspending
 from wayside.api import ApplicationInstance

@@ -12,11 +12,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache, Record, Served
-from application_manager.cluster.apply import Applied, Applier, ObjectKey
 from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
-from application_manager.cluster.store import Name
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand.byhand import PAUSE_ANNOTATION
 from application_manager.core.demand.decisions import Decision
@@ -25,7 +23,10 @@ from application_manager.core.health.placement import is_placed, misplaced
 from application_manager.core.health.pods import Trouble, summary
 from application_manager.core.health.readiness import is_unseen, not_ready
 from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
+from application_manager.core.objects.ownership import Applied, ObjectKey
+from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import Service, difference, instance_status, suspension_aspect
+from application_manager.work.applying import Applier
 from application_manager.work.recorder import Reason, Recorder
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus

@@ -22,7 +22,7 @@ from pathlib import Path
 import zenoh
 
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.store import Name
+from application_manager.core.objects.policy import Name
 
 _ALL = "wayside/instances/*/*/configuration"
 _RETRIES = (0.2, 0.5, 1.0, 2.0)

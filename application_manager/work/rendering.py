@@ -13,10 +13,10 @@ from collections.abc import Callable
 from functools import partial
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.store import Name
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
 from application_manager.core.objects.charts import ChartFailure, ChartOutcome, ChartRequest, Charts
+from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering
 from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.jobs import Problem, RenderJob

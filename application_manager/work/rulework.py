@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
+from application_manager.cache.store import Entry
 from application_manager.cache.surroundings import surroundings
 from application_manager.cluster.client import ApiError, Client, Object, Resource
-from application_manager.cluster.store import Entry, Name
-from application_manager.core.objects.policy import KindKey
+from application_manager.core.objects.policy import KindKey, Name
 from application_manager.core.statuses.rulestatus import DETECTOR_INVALID, RULE_INVALID, unreadable_status
 from application_manager.core.statuses.status import difference
 from application_manager.work.recorder import Recorder

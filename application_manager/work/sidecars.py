@@ -13,8 +13,8 @@ from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.cluster.store import Name
 from application_manager.core.findings.injections import injection
+from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
 from application_manager.work.recorder import Reason, Recorder
 from wayside.api import Detector

@@ -10,10 +10,11 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager.cluster.apply import Applier, controller_uid
 from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.core.objects.ownership import controller_uid
 from application_manager.core.objects.rendering import Rendering
 from application_manager.core.objects.suspension import ObjectKey
+from application_manager.work.applying import Applier
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import SuspendedReplicas
 

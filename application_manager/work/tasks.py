@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import ApiError, Client, Object, Resource
-from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict, gathered
 from application_manager.core.conditions import changed
 from application_manager.core.demand.demand import finished
 from application_manager.core.demand.fallback import FALLEN_BACK, turned
 from application_manager.core.objects import trimming
+from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import Service, difference, finished_since, task_status, together
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces

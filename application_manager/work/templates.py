@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from application_manager.cache.cluster_cache import TEMPLATE, ClusterCache
 from application_manager.cache.overlap_index import Turn
 from application_manager.cluster.client import ApiError, Client, Object, Resource
-from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
+from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import difference, template_status
 from application_manager.work.recorder import Reason, Recorder
 from application_manager.workers.jobs import TemplateJob

@@ -14,13 +14,11 @@ from typing import Any
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, Refused
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished, refused
+from application_manager.core.objects.policy import Name
 from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.jobs import ClaimJob
 from application_manager.workers.plain import claims_are_plain
 from wayside.api import ApplicationTask, ApplicationTemplate
-
-Name = tuple[str, str]
-"""Namespace and name."""
 
 
 class Claiming:

@@ -11,14 +11,13 @@ from collections.abc import Callable
 import pytest
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.apply import Applier
 from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.connection import load_configuration
-from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.policy import Name, Policy
 from application_manager.watching.router import Router
+from application_manager.work.applying import Applier
 from application_manager.work.instances import InstanceWork
 from application_manager.work.recorder import Recorder
 from application_manager.work.suspending import Suspending

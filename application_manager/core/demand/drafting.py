@@ -9,12 +9,10 @@ from application_manager.core.conditions import Aspect
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.lingering import LINGER_ANNOTATION, linger_of
 from application_manager.core.objects.charts import ChartRequest
+from application_manager.core.objects.policy import Name
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationinstance import ApplicationInstanceSpec
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
-
-Name = tuple[str, str]
-"""Namespace and name."""
 
 TemplateState = ApplicationTemplate | InvalidTemplate | None
 

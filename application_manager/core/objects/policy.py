@@ -15,6 +15,9 @@ from application_manager.core.objects.podspecs import NamedAccount, PodSpec, pod
 KindKey = tuple[str, str]
 """apiVersion and kind."""
 
+Name = tuple[str, str]
+"""Namespace and name."""
+
 SECRET: KindKey = ("v1", "Secret")
 
 PLURALS: Mapping[KindKey, str] = {

@@ -9,8 +9,8 @@ from typing import Any
 from kubernetes.aio.client import Configuration
 
 from application_manager.cache.cluster_cache import ClusterCache
+from application_manager.cache.store import Entry
 from application_manager.cluster.client import LEASES, ApiError, Client, Resource
-from application_manager.cluster.store import Entry
 from application_manager.core.holders.leases import (
     RAREST_LOOK,
     HealthyTime,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from application_manager.cache.cluster_cache import INSTANCE, ClusterCache
-from application_manager.cluster.store import Entry
+from application_manager.cache.store import Entry
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import Policy
 from tests.unit.manager_objects import NOW, instance, task, template

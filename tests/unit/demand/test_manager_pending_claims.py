@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from application_manager.cache.claim_index import ClaimIndex
-from application_manager.cluster.store import Entry
+from application_manager.cache.store import Entry
 from application_manager.core.claims.claims import Claim, Refused
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict

@@ -8,14 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from application_manager.cache.cluster_cache import INSTANCE, TASK, TEMPLATE, ClusterCache
-from application_manager.cluster.apply import Applier
 from application_manager.cluster.client import Client
-from application_manager.cluster.store import Name
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.demand import Outcome, demand
-from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.policy import Name, Policy
 from application_manager.watching.router import Router
+from application_manager.work.applying import Applier
 from tests.unit.demand.test_limits import limited
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind

@@ -7,10 +7,10 @@ from copy import deepcopy
 from typing import cast
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.apply import Applier
+from application_manager.cache.store import Entry
 from application_manager.cluster.client import ApiError, Client, Object, Resource
-from application_manager.cluster.store import Entry, Name
-from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.policy import Name, Policy
+from application_manager.work.applying import Applier
 from application_manager.work.instances import InstanceWork
 from application_manager.work.recorder import Recorder
 from application_manager.work.suspending import Suspending

@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from application_manager.cluster.store import Store
+from application_manager.cache.store import Store
 
 KIND = ("v1", "ConfigMap")
 NAME = ("site", "x")

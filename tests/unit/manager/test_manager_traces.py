@@ -9,8 +9,8 @@ from typing import cast
 import pytest
 
 from application_manager.cache.cluster_cache import ClusterCache
+from application_manager.cache.store import Entry
 from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.store import Entry
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces
 from application_manager.work.recorder import Recorder

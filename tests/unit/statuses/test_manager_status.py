@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from application_manager.cache.claim_index import ClaimIndex
-from application_manager.cluster.store import Entry
+from application_manager.cache.store import Entry
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import Aspect, changed, updated
 from application_manager.core.statuses.status import Service, difference, finished_since, task_status

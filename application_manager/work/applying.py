@@ -9,16 +9,13 @@ our controller reference and with their uid as a precondition.
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
-from application_manager.cluster.client import FIELD_MANAGER, ApiError, Client, Object, Resource
-from application_manager.cluster.store import Store
+from application_manager.cache.store import Store
+from application_manager.cluster.client import ApiError, Client, Object, Resource
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.refusals import (
     ADMISSION_REFUSED,
@@ -27,59 +24,24 @@ from application_manager.core.health.refusals import (
     reason_of,
     with_remedy,
 )
+from application_manager.core.objects.ownership import (
+    Applied,
+    Known,
+    ObjectKey,
+    Obstacle,
+    controller_uid,
+    foreign,
+    our_fields,
+    references,
+)
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.objects.rendering import Manifest, Rendering, object_key, owned
-from wayside.api import API_VERSION, ApplicationInstance
-from wayside.api.applicationinstance import ObjectReference
-
-ObjectKey = tuple[str, str, str]
-"""apiVersion, kind and name."""
+from wayside.api import ApplicationInstance
 
 _WORST_FIRST = ("ObjectExists", APPLY_REFUSED, ADMISSION_REFUSED, QUOTA_EXCEEDED, "Waiting")
 _WORKLOADS = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod"})
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Known:
-    """What was applied before.
-
-    Attributes:
-        digest: of the rendering that was last applied in full.
-        objects: the uids of what belongs to the instance; None where it may not have been applied.
-    """
-
-    digest: str | None = None
-    objects: Mapping[ObjectKey, str | None] = field(default_factory=dict)
-
-    @classmethod
-    def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> Known:
-        """What references say, as `references` makes them."""
-        return cls(digest, {(each.api_version, each.kind, each.name): each.uid for each in references})
-
-
-@dataclass(frozen=True, slots=True)
-class Applied:
-    """What came of it.
-
-    Attributes:
-        aspect: the condition Applied.
-        objects: what belongs to the instance now.
-        complete: whether everything is as rendered.
-        took: when applying began and ended, in nanoseconds since the epoch; None where nothing was applied.
-    """
-
-    aspect: Aspect
-    objects: tuple[ObjectReference, ...]
-    complete: bool
-    took: tuple[int, int] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Problem:
-    reason: str
-    message: str
 
 
 class Applier:
@@ -169,7 +131,7 @@ class Applier:
         recorded = dict(known.objects)
         supporting = [each for each in manifests if each["kind"] not in _WORKLOADS]
         workloads = [each for each in manifests if each["kind"] in _WORKLOADS]
-        results: list[Object | _Problem | BaseException] = []
+        results: list[Object | Obstacle | BaseException] = []
         for phase in (supporting, workloads):
             results += await asyncio.gather(
                 *(self._apply_one(instance, each, recorded, looked) for each in phase), return_exceptions=True
@@ -181,7 +143,7 @@ class Applier:
         for result in results:
             if isinstance(result, dict):
                 uids[object_key(result)] = result["metadata"]["uid"]
-        problems = [result for result in results if isinstance(result, _Problem)]
+        problems = [result for result in results if isinstance(result, Obstacle)]
         if problems:
             there = references({**dict.fromkeys(wanted), **uids})
             return Applied(_refused(problems), there, complete=False, took=(began, time.time_ns()))
@@ -199,13 +161,13 @@ class Applier:
         manifest: Manifest,
         recorded: Mapping[ObjectKey, str | None],
         looked: Mapping[ObjectKey, Object | None],
-    ) -> Object | _Problem:
+    ) -> Object | Obstacle:
         key = object_key(manifest)
         what = f"{key[1]} {key[2]}"
         live = self.live(instance.namespace, key) or looked.get(key)
         body = owned(manifest, instance)
         if live is not None:
-            problem = _foreign(live, instance, recorded.get(key), what)
+            problem = foreign(live, instance, recorded.get(key), what)
             if problem is not None:
                 return problem
             body["metadata"]["uid"] = live["metadata"]["uid"]
@@ -213,11 +175,11 @@ class Applier:
             raw = await self._client.apply(await self.resource(key), body)
         except ApiError as error:
             if error.code == 409:  # vanished or replaced since we looked
-                return _Problem("Waiting", f"{what} changed hands while it was applied; looking again")
+                return Obstacle("Waiting", f"{what} changed hands while it was applied; looking again")
             if not error.permanent or error.terminating:
                 raise
             reason = reason_of(error.code, error.message)
-            return _Problem(reason, with_remedy(reason, f"{what}: {_readable(error.message)}"))
+            return Obstacle(reason, with_remedy(reason, f"{what}: {_readable(error.message)}"))
         uid = raw["metadata"]["uid"]
         self._fields[uid] = our_fields(raw)
         self._drifted.discard(uid)
@@ -246,50 +208,9 @@ class Applier:
         return self._resources[kind]
 
 
-def controller_uid(live: Mapping[str, Any]) -> str | None:
-    """The uid of the object's controller."""
-    controller = _controller(live)
-    return None if controller is None else str(controller["uid"])
-
-
-def _controller(live: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    owners: list[Mapping[str, Any]] = live["metadata"].get("ownerReferences") or []
-    return next((each for each in owners if each.get("controller")), None)
-
-
-def _foreign(live: Object, instance: ApplicationInstance, recorded: str | None, what: str) -> _Problem | None:
-    """Why the object may not be applied over, or None if it is the instance's own."""
-    if live["metadata"].get("deletionTimestamp"):
-        return _Problem("Waiting", f"{what} is being deleted; it is applied again once it is gone")
-    controller = _controller(live)
-    if controller is None:
-        if live["metadata"]["uid"] == recorded:
-            return None
-    elif controller["uid"] == instance.metadata.uid:
-        return None
-    elif (controller["apiVersion"], controller["kind"], controller["name"]) == (
-        API_VERSION,
-        instance.kind,
-        instance.name,
-    ):
-        return _Problem("Waiting", f"{what} of the previous instance of this name is still being removed")
-    owner = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
-    return _Problem(
-        "ObjectExists",
-        f"{what} exists already, {owner} and is left alone: delete or rename it, or give another name in the template",
-    )
-
-
-def _refused(problems: Sequence[_Problem]) -> Aspect:
+def _refused(problems: Sequence[Obstacle]) -> Aspect:
     worst = min(problems, key=lambda each: _WORST_FIRST.index(each.reason))
     return Aspect("Applied", False, worst.reason, "; ".join(each.message for each in problems))
-
-
-def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:
-    """The objects as a status lists them, in one order."""
-    return tuple(
-        ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid) for key, uid in sorted(uids.items())
-    )
 
 
 def _readable(message: str) -> str:
@@ -305,11 +226,3 @@ def _readable(message: str) -> str:
 
 def _counted(count: int) -> str:
     return "1 object is as the template says" if count == 1 else f"{count} objects are as the template says"
-
-
-def our_fields(raw: Mapping[str, Any]) -> str:
-    """The fields that are ours; an update by somebody else takes those that it changes."""
-    for each in raw["metadata"].get("managedFields") or []:
-        if each.get("manager") == FIELD_MANAGER and each.get("operation") == "Apply" and not each.get("subresource"):
-            return json.dumps(each.get("fieldsV1"), sort_keys=True)
-    return ""

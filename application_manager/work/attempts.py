@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass
 
-from application_manager.cluster.store import Name
+from application_manager.core.objects.policy import Name
 
 FIRST_PAUSE = 1.0  # s, doubled with every refusal of the same
 LONGEST_PAUSE = 30.0  # s

@@ -9,20 +9,15 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass
-from typing import Any
 
-from application_manager.cluster.client import FIELD_MANAGER
+from application_manager.cluster.client import Object
 from application_manager.core.claims.parameters import size_problem
 from application_manager.core.objects import trimming
-from application_manager.core.objects.policy import KindKey
+from application_manager.core.objects.ownership import FIELD_MANAGER
+from application_manager.core.objects.policy import KindKey, Name
 from wayside.api import ApplicationTask
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
-
-Object = dict[str, Any]
-
-Name = tuple[str, str]
-"""Namespace and name."""
 
 _TOMBSTONES = 10_000  # uids of deleted objects that are remembered; the oldest are forgotten
 

@@ -1,0 +1,110 @@
+"""What belongs to whom: the objects of an owner, told from those of others by their controller and uid. Pure."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from application_manager.core.conditions import Aspect
+from wayside.api import API_VERSION, ApplicationInstance
+from wayside.api.applicationinstance import ObjectReference
+
+FIELD_MANAGER = "wayside"
+"""The manager's name in server-side apply."""
+
+ObjectKey = tuple[str, str, str]
+"""apiVersion, kind and name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What was applied before.
+
+    Attributes:
+        digest: of the rendering that was last applied in full.
+        objects: the uids of what belongs to the instance; None where it may not have been applied.
+    """
+
+    digest: str | None = None
+    objects: Mapping[ObjectKey, str | None] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> Known:
+        """What references say, as `references` makes them."""
+        return cls(digest, {(each.api_version, each.kind, each.name): each.uid for each in references})
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What came of it.
+
+    Attributes:
+        aspect: the condition Applied.
+        objects: what belongs to the instance now.
+        complete: whether everything is as rendered.
+        took: when applying began and ended, in nanoseconds since the epoch; None where nothing was applied.
+    """
+
+    aspect: Aspect
+    objects: tuple[ObjectReference, ...]
+    complete: bool
+    took: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """What keeps an object from being applied, as a condition gives it."""
+
+    reason: str
+    message: str
+
+
+def controller_uid(live: Mapping[str, Any]) -> str | None:
+    """The uid of the object's controller."""
+    controller = _controller(live)
+    return None if controller is None else str(controller["uid"])
+
+
+def _controller(live: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    owners: list[Mapping[str, Any]] = live["metadata"].get("ownerReferences") or []
+    return next((each for each in owners if each.get("controller")), None)
+
+
+def foreign(live: Mapping[str, Any], instance: ApplicationInstance, recorded: str | None, what: str) -> Obstacle | None:
+    """Why the object may not be applied over, or None if it is the instance's own."""
+    if live["metadata"].get("deletionTimestamp"):
+        return Obstacle("Waiting", f"{what} is being deleted; it is applied again once it is gone")
+    controller = _controller(live)
+    if controller is None:
+        if live["metadata"]["uid"] == recorded:
+            return None
+    elif controller["uid"] == instance.metadata.uid:
+        return None
+    elif (controller["apiVersion"], controller["kind"], controller["name"]) == (
+        API_VERSION,
+        instance.kind,
+        instance.name,
+    ):
+        return Obstacle("Waiting", f"{what} of the previous instance of this name is still being removed")
+    owner = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
+    return Obstacle(
+        "ObjectExists",
+        f"{what} exists already, {owner} and is left alone: delete or rename it, or give another name in the template",
+    )
+
+
+def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:
+    """The objects as a status lists them, in one order."""
+    return tuple(
+        ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid) for key, uid in sorted(uids.items())
+    )
+
+
+def our_fields(raw: Mapping[str, Any]) -> str:
+    """The fields that are ours; an update by somebody else takes those that it changes."""
+    for each in raw["metadata"].get("managedFields") or []:
+        if each.get("manager") == FIELD_MANAGER and each.get("operation") == "Apply" and not each.get("subresource"):
+            return json.dumps(each.get("fieldsV1"), sort_keys=True)
+    return ""
