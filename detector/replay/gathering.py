@@ -33,8 +33,9 @@ _OVERLAP = 10**9
 
 _DATE = re.compile(r"\d{4}(?:[-_]\d\d){5}|\d{14}")
 _NUMBERED = re.compile(r"(.*?)(\d+)([_.-]*)")
-_TEXT = (".jsonl", ".ndjson")
-_BINARY = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
+TEXT = (".jsonl", ".ndjson")
+BINARY = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
+"""By what the names of recordings end."""
 
 
 def recordings_of(given: Sequence[Path], *, as_one: bool = False) -> list[Recording]:
@@ -80,7 +81,7 @@ def _expanded(path: Path) -> Iterator[Path]:
     elif path.is_dir() and not _is_bag(path):
         inside = list(_inside(path))
         if not inside:
-            kinds = ", ".join((*_BINARY, *_TEXT))
+            kinds = ", ".join((*BINARY, *TEXT))
             raise RecordingError(f"{path}: the folder holds no recording: give one with {kinds} or rosbag2 folders")
         yield from inside
     else:
@@ -94,7 +95,7 @@ def _inside(folder: Path) -> Iterator[Path]:
             continue
         if path.is_dir():
             yield from (path,) if _is_bag(path) else _inside(path)
-        elif path.suffix in (*_BINARY, *_TEXT):
+        elif path.suffix in (*BINARY, *TEXT):
             yield path
 
 

@@ -48,8 +48,9 @@ def play(
     watch: Watch = lambda batches: batches,
     onlooker: Callable[[str], Onlooker | None] = lambda _: None,
     clips: Clips | None = None,
+    holder: str | None = None,
 ) -> Played:
-    """What each recording came to. Without `plugins` they run in this process.
+    """What each recording came to. Without `plugins` they run in this process. `holder` is by default the Detector.
 
     Of several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
     task names differ even if all begin at the same time. `onlooker` gives who looks on at the recording of that name.
@@ -66,8 +67,8 @@ def play(
     for number, recording in enumerate(recordings, start=1):
         name = name_of(recording)
         try:
-            holder = detector.name if number == 1 else f"{detector.name}.{number}"
-            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, holder, onlooker(name), clips)
+            of = (holder or detector.name) + (f".{number}" if number > 1 else "")
+            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, of, onlooker(name), clips)
         except RecordingError as error:
             errors.append(error)
             continue

@@ -22,6 +22,8 @@ FIXED = (
     "duration", "reason", "dry_run",
 )  # fmt: skip
 TIMES = ("onset_time", "start_time", "end_time")
+_KINDS: Mapping[type, str] = {bool: "boolean", float: "number", type(None): "null"}
+"""Of columns, by the type of a value; all others are text."""
 
 
 @dataclass(slots=True)
@@ -153,8 +155,30 @@ def _text(value: Plain) -> Plain:
 
 def write_parquet(path: Path, episodes: Sequence[Episode]) -> None:
     """Write the table as Parquet: times as timestamps in UTC to the nanosecond, subjects as a list."""
-    import pyarrow as pa  # noqa: PLC0415  an extra
-    import pyarrow.parquet as pq  # noqa: PLC0415
+    import pyarrow.parquet as pq  # noqa: PLC0415  an extra
+
+    pq.write_table(table_of(episodes, kinds_of(episodes)), path, compression="zstd")
+
+
+def kinds_of(episodes: Iterable[Episode]) -> dict[str, str]:
+    """By the names of the values, sorted: `number`, `boolean`, `text` (also for a mixture), or `null`."""
+    found: dict[str, str] = {}
+    for each in episodes:
+        for name, value in each.values.items():
+            found[name] = merged_kind(found.get(name, "null"), _KINDS.get(type(value), "text"))
+    return dict(sorted(found.items()))
+
+
+def merged_kind(one: str, other: str) -> str:
+    """That of a column with values of both kinds."""
+    if "null" in (one, other):
+        return one if other == "null" else other
+    return one if one == other else "text"
+
+
+def table_of(episodes: Sequence[Episode], kinds: Mapping[str, str]) -> Any:
+    """The episodes as a pyarrow.Table, with a column for each value that has a kind."""
+    import pyarrow as pa  # noqa: PLC0415
 
     text, time = pa.string(), pa.timestamp("ns", tz="UTC")
     types = {
@@ -162,17 +186,13 @@ def write_parquet(path: Path, episodes: Sequence[Episode]) -> None:
         "episode": text, **dict.fromkeys(TIMES, time), "duration": pa.float64(), "reason": text, "dry_run": pa.bool_(),
     }  # fmt: skip
     columns = {name: pa.array([_cell(each, name) for each in episodes], types[name]) for name in FIXED}
-    for name in columns_of(episodes):
+    of_kind = {"boolean": pa.bool_(), "number": pa.float64(), "null": pa.float64(), "text": text}
+    for name, kind in kinds.items():
         values = [each.values.get(name) for each in episodes]
-        kinds = {type(value) for value in values if value is not None}
-        if kinds == {bool}:
-            columns[name] = pa.array(values, pa.bool_())
-        elif kinds <= {float}:
-            columns[name] = pa.array(values, pa.float64())
-        else:
-            texts = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
-            columns[name] = pa.array(texts, text)
-    pq.write_table(pa.table(columns), path, compression="zstd")
+        if kind == "text":
+            values = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
+        columns[name] = pa.array(values, of_kind[kind])
+    return pa.table(columns)
 
 
 def _cell(each: Episode, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Whether the packages of the extra `results` are installed."""
+"""Whether the packages of an extra are installed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class MissingExtraError(InputError, RuntimeError):
     """A result needs a package that is not installed."""
 
 
-def check_package(package: str, option: str) -> None:
+def check_package(package: str, option: str, extra: str = "results") -> None:
     """Raises MissingExtraError where the package is missing that the option needs."""
     if find_spec(package) is None:
-        raise MissingExtraError(f"{option} needs {package}: pip install 'wayside[results]'")
+        raise MissingExtraError(f"{option} needs {package}: pip install 'wayside[{extra}]'")

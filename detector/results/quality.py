@@ -77,6 +77,12 @@ class Arrivals:
             seen.last = time
             seen.count += 1
 
+    @property
+    def span(self) -> tuple[int, int]:
+        """The times of the first and of the last arrival, nanoseconds since the epoch; (0, 0) where there is none."""
+        keys = self._keys.values()
+        return min((key.first for key in keys), default=0), max((key.last for key in keys), default=0)
+
     def by_stream(self, engine: Engine) -> list[StreamQuality]:
         """What came on each stream of the Detector, in its order; the engine is the replay's."""
         counters = engine.counters

@@ -1,0 +1,160 @@
+"""What `detector mine` runs: many recordings in, one dataset out."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from detector.assembly import lasting_problems
+from detector.mining.mining import Run, Share, run_mining
+from detector.mining.sources import sampled, sources_of
+from detector.mining.summary import Summary, show, summary_of
+from detector.mining.workers import Pool, Workers
+from detector.results.installed import check_package
+from detector.rules.files import load_rules
+from wayside.commandline import refuse
+
+_WIDTH = 160
+"""Columns of a table that goes into a pipe or a file."""
+_ERRORS = 20
+"""How many errors are printed."""
+_NAMES = 8
+"""How many rules are named."""
+
+
+def mine_recordings(
+    given: Sequence[str],
+    output: Path,
+    detector: Path,
+    rules: Sequence[Path],
+    *,
+    processes: int | None = None,
+    record: bool = False,
+    sample: int | None = None,
+    limit: int | None = None,
+    share: str | None = None,
+) -> None:
+    """Mine recordings, write the dataset, and print a summary.
+
+    Exits with 1 where a recording or a rule has an error.
+
+    Args:
+        given: files, folders, patterns, URLs, and lists as @FILE.
+        output: the folder of the dataset, made where it is missing.
+        detector: a file with one Detector.
+        rules: files or folders with EventRules.
+        processes: how many work side by side; None: one for each core that this process may use.
+        record: run the rules' record actions.
+        sample: mine this many recordings, chosen by chance, the same ones each time.
+        limit: mine the first of them only.
+        share: as NUMBER/OF: do this part of the work, counted from 0, and leave the rest to others.
+
+    Raises:
+        MissingExtraError: a package is not installed.
+        DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text gives the reason.
+    """
+    check_package("pyarrow", "detector mine", "mining")
+    part = None if share is None else _share(share)
+    loaded = load_rules(detector, rules, lasting_problems)
+    for warning in loaded.warnings:
+        typer.echo(warning, err=True)
+    if not loaded.rule_set.rules:
+        refuse("no rule is given that the Detector selects: give --rules FILE")
+    sources = sources_of(given)
+    if sample is not None:
+        sources = sampled(sources, sample)
+    sources = sources[:limit]
+    workers: Workers = Pool(processes or len(os.sched_getaffinity(0)))
+    console = Console(stderr=True)
+    try:
+        with _Bar(console) as bar:
+            run = run_mining(
+                sources,
+                output,
+                loaded.rule_set.detector,
+                loaded.rule_set.rules,
+                workers,
+                bar,
+                record=record,
+                share=part,
+            )
+    finally:
+        workers.close()
+    if not run.complete:
+        typer.echo(f"{_did(run)}; others have not done their share yet: {output}", err=True)
+        return
+    summary = summary_of(output)
+    show(console if console.is_terminal else Console(stderr=True, width=_WIDTH), summary)
+    _finish(run, summary, output)
+
+
+def _finish(run: Run, summary: Summary, output: Path) -> None:
+    """Print the errors and the last line."""
+    for error in summary.errors[:_ERRORS]:
+        what = "" if error["kind"] == "unreadable" else f"{error['kind']}: "
+        typer.echo(f"{error['recording']}: {what}{error['message']}", err=True)
+    kinds = Counter(error["kind"] for error in summary.errors)
+    if len(summary.errors) > _ERRORS:
+        typer.echo(f"and {len(summary.errors) - _ERRORS} more: errors.parquet has all", err=True)
+    episodes = sum(rule.episodes for rule in summary.rules)
+    parts = [f"{run.recordings} recordings", f"{summary.seconds / 3600:.1f} hours", f"{summary.samples} samples"]
+    parts += [f"{episodes} episodes", *(f"{count} {kind}" for kind, count in sorted(kinds.items()))]
+    typer.echo(f"{', '.join(parts)}; {_did(run)}: {output}", err=True)
+    if kinds - Counter(cut=len(summary.errors)):
+        raise typer.Exit(1)
+
+
+def _did(run: Run) -> str:
+    if not run.mined:
+        return "nothing was left to do"
+    rules = f"{len(run.rules_run)} rules" if len(run.rules_run) > _NAMES else ", ".join(sorted(run.rules_run))
+    return f"{run.mined} mined now, with {rules}"
+
+
+def _share(text: str) -> Share:
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    if found is None or int(found[1]) >= int(found[2]):
+        refuse(f"--share {text}: give NUMBER/OF, counted from 0, e.g. 0/8 to 7/8")
+    return Share(int(found[1]), int(found[2]))
+
+
+class _Bar:
+    """Progress on a terminal; nothing in a pipe."""
+
+    def __init__(self, console: Console) -> None:
+        self._recordings = 0
+        self._progress = Progress(
+            TextColumn("mining"),
+            BarColumn(),
+            TextColumn("{task.fields[done]} of {task.fields[recordings]} recordings, {task.percentage:.0f}%, about"),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+            speed_estimate_period=600,
+        )
+        self._task = self._progress.add_task("", total=None, done=0, recordings="?")
+
+    def __enter__(self) -> _Bar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def expect(self, recordings: int, amount: int) -> None:
+        """See `mining.Watch`."""
+        self._progress.update(self._task, total=amount, recordings=recordings)
+
+    def done(self, amount: int) -> None:
+        """See `mining.Watch`."""
+        self._recordings += 1
+        self._progress.update(self._task, advance=amount, done=self._recordings)

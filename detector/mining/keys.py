@@ -1,0 +1,60 @@
+"""What a result is known by: the content of the recording, and a digest of all that decides what a rule makes of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from detector.replay.clips import RECORD
+from wayside.api import Detector, EventRule
+
+_LAYOUT = 1
+"""Counts the layouts of what is kept: what an earlier version kept is not read."""
+
+
+def rule_keys(detector: Detector, rules: Sequence[EventRule], *, record: bool) -> dict[str, str]:
+    """By rule, a digest of it, of the rules that it looks at, of its models, the Detector and this version.
+
+    `record`: whether record actions run; that makes another key for rules that have one.
+    """
+    named = {rule.name: rule for rule in rules}
+    common = [_LAYOUT, version("wayside"), detector.name, detector.namespace, detector.spec.model_dump(mode="json")]
+    keys = {}
+    for rule in rules:
+        seen = sorted(with_dependencies([rule.name], named))
+        whole = [*common, [_document(named[name]) for name in seen], record and records(rule)]
+        keys[rule.name] = hashlib.blake2b(json.dumps(whole, sort_keys=True).encode(), digest_size=16).hexdigest()
+    return keys
+
+
+def records(rule: EventRule) -> bool:
+    """Whether the rule has a record action."""
+    return any(action.field == RECORD for action in rule.spec.actions)
+
+
+def with_dependencies(names: Iterable[str], rules: Mapping[str, EventRule]) -> set[str]:
+    """The rules, and those that their signals look at, directly or not. What is not there is left out."""
+    found: set[str] = set()
+    left = [*names]
+    while left:
+        name = left.pop()
+        if name in rules and name not in found:
+            found.add(name)
+            left += [signal.rule for signal in rules[name].spec.signals if signal.rule is not None]
+    return found
+
+
+def _document(rule: EventRule) -> object:
+    """All of the rule that decides something, with the content of its models."""
+    files = [signal.model.file for signal in rule.spec.signals if signal.model is not None]
+    return [rule.name, rule.spec.model_dump(mode="json"), [_digest(Path(file)) for file in files]]
+
+
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+    except OSError as error:
+        return str(error)  # the rule is refused

@@ -1,0 +1,265 @@
+"""A whole run: what is left to do is done by the workers, then the dataset is written from all that is kept.
+
+Content, rules and version alone decide what is left. So a run may be killed and begun again, and several runs may share
+the work in one folder: each writes what it does, and the one that finds everything done writes the dataset.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import msgspec
+
+from detector.mining.cache import Cache, Entry, job_digest, mined_in, read_entry
+from detector.mining.dataset import EPISODES, TABLES, MinedRecording, write_dataset
+from detector.mining.keys import records, rule_keys, with_dependencies
+from detector.mining.sources import Seen, Source, look, stamp_of
+from detector.mining.work import Flaw, Job, Mined, mine
+from detector.mining.workers import Call, Lost, Workers
+from wayside.api import Detector, EventRule
+
+CLIPS = "clips"
+CACHE = ".cache"
+_READERS = 8
+"""Threads that look at recordings."""
+
+
+class Share(NamedTuple):
+    """A part of the work: what others do is left to them."""
+
+    number: int
+    """From 0."""
+    of: int
+
+    def takes(self, content: str) -> bool:
+        """Whether the recording of this content is part of it."""
+        return int(content[:8], 16) % self.of == self.number
+
+
+class Watch(Protocol):
+    """Sees how far a run is."""
+
+    def expect(self, recordings: int, amount: int) -> None:
+        """What is left to do: recordings, and their bytes."""
+
+    def done(self, amount: int) -> None:
+        """One is done."""
+
+
+@dataclass
+class Run:
+    """What a run did."""
+
+    recordings: int
+    mined: int = 0
+    """Those for which something was left to do."""
+    rules_run: set[str] = field(default_factory=set)
+    complete: bool = True
+    """Whether the dataset was written, or is as it would be written; else others have not done their share yet."""
+    changed: bool = False
+    """Whether it was written."""
+
+
+def run_mining(
+    sources: Sequence[Source],
+    output: Path,
+    detector: Detector,
+    rules: Sequence[EventRule],
+    workers: Workers,
+    watch: Watch,
+    *,
+    record: bool = False,
+    share: Share | None = None,
+) -> Run:
+    """Mine what is left of the recordings, and write the dataset.
+
+    Args:
+        sources: the recordings, in the order in which the dataset has them.
+        output: its folder, made where it is missing.
+        detector: with its rules.
+        rules: those that it selects.
+        workers: where the work is done.
+        watch: sees how far it is.
+        record: whether record actions run.
+        share: the part that is done here; None: all.
+
+    Raises:
+        OSError: the output cannot be written.
+    """
+    cache = Cache(output / CACHE)
+    work = _Work(
+        output, detector, {rule.name: rule for rule in rules}, rule_keys(detector, rules, record=record), record
+    )
+    seen = _look_at(sources, cache)
+    entries = _Entries(cache, work.keys)
+    jobs: dict[str, tuple[Job, int]] = {}
+    for source in sources:
+        found = seen[source]
+        if isinstance(found, Seen) and found.content not in jobs and (left := entries.left(found.content)):
+            jobs[found.content] = work.job(source, found.content, left), found.bytes
+    own = {content: each for content, each in jobs.items() if share is None or share.takes(content)}
+    run = Run(len(sources), len(own), {name for job, _ in own.values() for name in job.wanted})
+    watch.expect(len(own), sum(size for _, size in own.values()))
+    # The longest first: the last one decides when all are done.
+    ordered = sorted(own.values(), key=lambda each: (-each[1], each[0].content))
+    for call, result in workers.run(Call(mine, job) for job, _ in ordered):
+        job = call.argument
+        cache.put(job.content, work.entry(job, result))
+        watch.done(own[job.content][1])
+    entries = _Entries(cache, work.keys)
+    run.complete = not any(entries.left(content, failed_too=True) for content in jobs)
+    if run.complete:
+        run.changed = _write(output, sources, seen, entries, work)
+    return run
+
+
+class _Work(NamedTuple):
+    """What is done to each recording."""
+
+    output: Path
+    detector: Detector
+    rules: Mapping[str, EventRule]
+    keys: Mapping[str, str]
+    record: bool
+
+    def job(self, source: Source, content: str, wanted: frozenset[str]) -> Job:
+        evaluated = [self.rules[name] for name in sorted(with_dependencies(wanted, self.rules))]
+        clips = None
+        if self.record and any(records(self.rules[name]) for name in wanted):
+            clips = str((self.output / CLIPS / self._folder(content, wanted)).resolve())
+        return Job(source, content, self.detector, evaluated, wanted, clips)
+
+    def entry(self, job: Job, result: bytes | Lost) -> Entry:
+        """What is kept of a result."""
+        if isinstance(result, Lost):
+            result = msgspec.msgpack.encode(Mined(flaws=[Flaw("failed", result.reason)]))
+        keys = {name: self.keys[name] for name in sorted(job.wanted)}
+        clips = None if job.clips is None else Path(job.clips).name
+        entry = Entry(keys, result, clips)
+        entry.failed = mined_in(entry).is_failed
+        return entry
+
+    def _folder(self, content: str, wanted: frozenset[str]) -> str:
+        return f"{content[:12]}-{job_digest({name: self.keys[name] for name in wanted})[:8]}"
+
+
+class _Entries:
+    """What is kept of each recording, and which rules of which entry count."""
+
+    def __init__(self, cache: Cache, keys: Mapping[str, str]) -> None:
+        self._keys = keys
+        self._by_content: dict[str, dict[Path, frozenset[str]]] = {}
+        self._failed: set[Path] = set()
+        for content, paths in cache.entries().items():
+            covered: set[str] = set()
+            for path in paths:  # those that failed come after those of the same rules that did not, by their names
+                entry = read_entry(path)
+                if entry is None:
+                    continue
+                own = {name for name, key in entry.keys.items() if keys.get(name) == key} - covered
+                if own:
+                    self._by_content.setdefault(content, {})[path] = frozenset(own)
+                    if entry.failed:
+                        self._failed.add(path)
+                    else:
+                        covered |= own
+
+    def left(self, content: str, *, failed_too: bool = False) -> frozenset[str]:
+        """The rules that have not been run over it; `failed_too`: those that failed count as run."""
+        done = self._by_content.get(content, {})
+        return frozenset(self._keys).difference(
+            *(names for path, names in done.items() if failed_too or path not in self._failed)
+        )
+
+    def used(self, content: str) -> dict[Path, frozenset[str]]:
+        """The entries that count, each with its rules: of each rule, one; a failure only where nothing else is."""
+        done = self._by_content.get(content, {})
+        good = {path: names for path, names in done.items() if path not in self._failed}
+        covered = frozenset[str]().union(*good.values())
+        bad = {path: names - covered for path, names in done.items() if path in self._failed and names - covered}
+        return good | bad
+
+
+def _look_at(sources: Sequence[Source], cache: Cache) -> dict[Source, Seen | Flaw]:
+    """What each recording is known by, or why it cannot be read."""
+
+    def seen(source: Source) -> tuple[str | None, Seen | Flaw, bool]:
+        try:
+            stamp = stamp_of(source)
+            known = cache.seen(source, stamp) if stamp is not None else None
+            return stamp, known or look(source), known is None
+        except OSError as error:
+            return None, Flaw("unreadable", f"it cannot be read: {error.strerror or error}"), False
+
+    with ThreadPoolExecutor(_READERS) as pool:
+        looks = dict(zip(sources, pool.map(seen, sources), strict=True))
+    cache.note_seen(
+        (source, stamp, found) for source, (stamp, found, new) in looks.items() if new and isinstance(found, Seen)
+    )
+    return {source: found for source, (_, found, _) in looks.items()}
+
+
+def _write(
+    output: Path, sources: Sequence[Source], seen: Mapping[Source, Seen | Flaw], entries: _Entries, work: _Work
+) -> bool:
+    """Write the dataset unless it is there; returns whether it was written."""
+    used = {source: entries.used(found.content) if isinstance(found, Seen) else {} for source, found in seen.items()}
+    state = [
+        [source.name, str(seen[source]), sorted((path.name, sorted(names)) for path, names in used[source].items())]
+        for source in sources
+    ]
+    digest = hashlib.blake2b(json.dumps([state, sorted(work.keys.items()), work.record]).encode()).hexdigest()
+    written = output / CACHE / "written"
+    there = all((output / f"{name}.parquet").exists() for name in TABLES) and (output / EPISODES).is_dir()
+    if there and written.exists() and written.read_text() == digest:
+        return False
+    written.unlink(missing_ok=True)
+    if work.record:
+        _forget_clips(output / CLIPS, {path for of_one in used.values() for path in of_one})
+    recordings = [_recording(source, seen[source], used[source]) for source in sources]
+    write_dataset(output, recordings, sorted(work.rules), with_clips=work.record)
+    partial = written.with_name(f"written.{os.getpid()}")
+    partial.write_text(digest)
+    partial.replace(written)
+    return True
+
+
+def _forget_clips(folder: Path, used: Iterable[Path]) -> None:
+    """Remove the clips that no episode of the dataset has any more."""
+    kept = {entry.clips for path in used if (entry := read_entry(path)) is not None}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.name not in kept:
+            shutil.rmtree(path)
+
+
+def _recording(source: Source, seen: Seen | Flaw, used: Mapping[Path, frozenset[str]]) -> MinedRecording:
+    if isinstance(seen, Flaw):
+        return MinedRecording(source.name, "", lambda: [Mined(flaws=[seen])])
+    return MinedRecording(source.name, seen.content, _reader(used))
+
+
+def _reader(used: Mapping[Path, frozenset[str]]) -> Callable[[], Sequence[Mined]]:
+    def parts() -> list[Mined]:
+        found = []
+        for path, names in used.items():
+            entry = read_entry(path)
+            if entry is None:
+                continue
+            mined = mined_in(entry)
+            folder = "" if entry.clips is None else f"{CLIPS}/{entry.clips}/"
+            mined.episodes = [episode for episode in mined.episodes if episode.rule in names]
+            mined.counts = [count for count in mined.counts if count.rule in names]
+            mined.flaws = [flaw for flaw in mined.flaws if flaw.rule is None or flaw.rule in names]
+            mined.clips = {each: [folder + name for name in names] for each, names in mined.clips.items()}
+            found.append(mined)
+        return found
+
+    return parts

@@ -1,0 +1,189 @@
+"""What a worker process does: one recording, some rules; what comes of it is plain data that any process can keep."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from detector.actions.record.description import DESCRIPTION
+from detector.actions.record.destination import finished
+from detector.memory import tune_garbage_collection
+from detector.mining.sources import Source, fetched
+from detector.plugins.outages import Outages
+from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
+from detector.replay.clips import Clips
+from detector.replay.gathering import Recording
+from detector.replay.playing import play
+from detector.replay.replaying import Outcome
+from detector.results.episodes import Episode
+from detector.results.quality import Arrivals, StreamQuality
+from detector.results.result import Result, result_of
+from detector.results.tracing import Tracer
+from wayside.api import Detector, EventRule
+from wayside.inputerror import InputError
+
+_DIGITS = 12
+"""Of the content's digest, in the name of the holder: ids of episodes differ even if recordings begin alike."""
+
+
+class Flaw(msgspec.Struct, frozen=True, order=True):
+    """What is wrong with a recording, or with a rule over it."""
+
+    kind: str
+    """`unreadable`: nothing was mined; `cut`: its end is missing; `refused`: a rule does not fit; `failed`: mining it
+    failed for a reason that may pass, so that the next run tries again."""
+    message: str
+    rule: str | None = None
+
+
+class RuleCount(msgspec.Struct, frozen=True):
+    """How the evaluations of a rule went."""
+
+    rule: str
+    evaluations: int
+    unknown: int
+    errors: int
+
+
+class Mined(msgspec.Struct):
+    """What a recording came to, for some rules."""
+
+    episodes: list[Episode] = []
+    """In order of the rules, then of their starts; they name no recording."""
+    counts: list[RuleCount] = []
+    streams: list[StreamQuality] = []
+    flaws: list[Flaw] = []
+    clips: dict[str, list[str]] = {}
+    """By episode, the folders of its clips, in that of the job."""
+    samples: int = 0
+    begin: int = 0
+    end: int = 0
+    """When the first and the last sample were received, nanoseconds since the epoch; 0: there is none."""
+
+    @property
+    def is_failed(self) -> bool:
+        """Whether another attempt may come to something else."""
+        return any(flaw.kind == "failed" for flaw in self.flaws)
+
+
+class Job(NamedTuple):
+    """One recording, and the rules to run over it."""
+
+    source: Source
+    content: str
+    detector: Detector
+    rules: Sequence[EventRule]
+    """All that are evaluated."""
+    wanted: frozenset[str]
+    """Those whose episodes are kept: the others are there because these look at their episodes."""
+    clips: str | None
+    """The folder for clips of this job alone; None: no clips."""
+
+
+def mine(job: Job) -> bytes:
+    """Mine one recording; returns a `Mined` as msgpack. What is wrong with the recording is part of it."""
+    _tune()
+    return msgspec.msgpack.encode(_mined(job))
+
+
+@cache
+def _tune() -> None:
+    tune_garbage_collection()  # once: it takes all that is there for what stays
+
+
+def read(data: bytes) -> Mined:
+    """The inverse. Raises msgspec.DecodeError where another version wrote it."""
+    return msgspec.msgpack.decode(data, type=Mined)
+
+
+def _mined(job: Job) -> Mined:
+    recording: Recording = ()
+    try:
+        with fetched(job.source) as recording:
+            return _replayed(job, recording)
+    except (InputError, ExceptionGroup) as error:
+        causes = error.exceptions if isinstance(error, ExceptionGroup) else (error,)
+        return Mined(flaws=[Flaw("unreadable", "; ".join(_plain(str(each), recording) for each in causes))])
+    except OSError as error:
+        return Mined(flaws=[Flaw("failed", _plain(str(error), recording))])
+    except Exception as error:  # noqa: BLE001  one recording of thousands must not stop the others
+        return Mined(flaws=[Flaw("failed", f"{type(error).__name__}: {error}: run `detector replay` to see where")])
+
+
+def _plain(text: str, recording: Recording) -> str:
+    """The text with the names of files alone: it is the same wherever they lie."""
+    for path in recording:
+        text = text.replace(str(path), path.name)
+    return text
+
+
+def _replayed(job: Job, recording: Recording) -> Mined:
+    tracer, arrivals = Tracer(job.wanted, ways=False), Arrivals()
+    clips = None if job.clips is None else _clips(Path(job.clips))
+    played = play(
+        [recording],
+        job.detector,
+        job.rules,
+        lambda: closing(ProcessHost(Outages(lambda: ()), wait=True, patience=REPLAY_PATIENCE)),
+        arrivals.watch_batches,
+        lambda _: tracer,
+        clips,
+        holder_of(job),
+    )
+    (outcome,) = played.outcomes.values()
+    result = result_of(job.source.name, outcome, tracer, arrivals)
+    # The last tick of one rule must not decide about the statistics of another: which rules run together may differ.
+    mined = mined_of(replace(result, trace=replace(result.trace, end=outcome.end)), job.wanted)
+    mined.begin, mined.end = arrivals.span
+    mined.flaws = sorted(_flaws(outcome, job, recording))
+    mined.clips = {} if clips is None else _clips_by_episode(clips.folder)
+    return mined
+
+
+def holder_of(job: Job) -> str:
+    """Under whose name the job's episodes are."""
+    return f"{job.detector.name}.{job.content[:_DIGITS]}"
+
+
+def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
+    """What is kept of a replay; flaws and clips come later."""
+    episodes = [each for each in result.episodes if each.rule in wanted]
+    for each in episodes:
+        each.recording = ""
+    return Mined(
+        episodes=sorted(episodes, key=lambda each: (each.rule, each.start_time, each.subject)),
+        counts=[RuleCount(name, *counts) for name, counts in sorted(result.counts.items()) if name in wanted],
+        streams=[*result.streams],
+        samples=result.samples,
+    )
+
+
+def _flaws(outcome: Outcome, job: Job, recording: Recording) -> list[Flaw]:
+    cuts = [Flaw("cut", _plain(str(cut), recording)) for cut in outcome.cuts]
+    refusals = [
+        Flaw("refused", str(refusal), refusal.rule.name)
+        for refusal in outcome.refusals
+        if refusal.rule.name in job.wanted
+    ]
+    return [*cuts, *refusals]
+
+
+def _clips(folder: Path) -> Clips:
+    """Raises OSError."""
+    shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was killed
+    return Clips(folder)
+
+
+def _clips_by_episode(folder: Path) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for kept in finished(folder):
+        description = msgspec.json.decode((kept.path / DESCRIPTION).read_bytes())
+        found.setdefault(str(description["episode"]), []).append(kept.path.relative_to(folder).as_posix())
+    return {episode: sorted(names) for episode, names in sorted(found.items())}

@@ -1,0 +1,178 @@
+"""`detector mine`: one dataset from many recordings, whatever happens to the processes that work on it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow.parquet as pq
+import pytest
+
+from detector.cli import app
+from detector.commands.replay import replay_files
+from detector.mining.workers import Call, Lost, Pool
+from detector.results.kinds import Kind
+from tests.cluster.waiting import wait_until
+from tests.fleets import HARSH, write_fleet
+from wayside import commandline
+
+RECORDINGS, BROKEN = 6, 3
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a Detector, rules and recordings, and their dataset `out`, made by two processes."""
+    folder = tmp_path_factory.mktemp("fleet")
+    write_fleet(folder, RECORDINGS, 40.0, BROKEN)
+    assert f"{RECORDINGS + BROKEN} mined now" in mine(folder, "out", "--processes", "2")
+    return folder
+
+
+def command(folder: Path, output: str, *options: str, rules: str = "rules.yaml", drives: str = "drives") -> list[str]:
+    given = ["mine", drives, "--detector", "detector.yaml", "--rules", rules, "--output", output]
+    return [sys.executable, "-m", "detector.cli", *given, *options]
+
+
+def mine(folder: Path, output: str, *options: str, **more: Any) -> str:
+    """Runs it here, with processes of its own; what it prints."""
+    said = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stderr(said):
+        commandline.run(app, "detector", (), command(folder, output, *options, **more)[3:])
+    return said.getvalue()
+
+
+def files(dataset: Path) -> dict[str, bytes]:
+    """The dataset, byte by byte."""
+    return {
+        str(path.relative_to(dataset)): path.read_bytes()
+        for path in sorted(dataset.rglob("*.parquet"))
+        if ".cache" not in path.parts
+    }
+
+
+def asked(folder: Path, question: str) -> list[tuple[Any, ...]]:
+    """What DuckDB answers in that folder."""
+    with duckdb.connect() as database:
+        table = database.sql(re.sub("'(?=[a-z]+/)", f"'{folder}/", question)).to_arrow_table()
+        return [tuple(row.values()) for row in table.to_pylist()]
+
+
+def test_episodes_are_those_of_a_replay_of_each_recording(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(fleet)
+    paths = sorted(Path("drives").glob("car-*"))
+    replay_files(
+        paths,
+        Path("replayed"),
+        Path("detector.yaml"),
+        [Path("rules.yaml")],
+        as_one=False,
+        kinds=frozenset({Kind.EPISODES}),
+    )
+    names = pq.read_schema(fleet / "replayed/episodes.parquet").names
+    columns = ", ".join(f'"{name}"' for name in names if name != "episode")  # the holder differs
+    order = "ORDER BY recording, rule, start_time, subject"
+    expected = asked(fleet, f"SELECT {columns} FROM 'replayed/episodes.parquet' {order}")
+    found = asked(fleet, f"SELECT {columns} FROM 'out/episodes/*/*.parquet' WHERE recording LIKE '%car-%' {order}")
+    assert len(expected) > 100
+    assert found == expected
+    assert asked(fleet, "SELECT count(DISTINCT episode), count(*) FROM 'out/episodes/*/*.parquet'") == [
+        (len(asked(fleet, "FROM 'out/episodes/*/*.parquet'")),) * 2
+    ]
+
+
+def test_the_question_of_the_guide_is_answered(fleet: Path) -> None:
+    guide = (Path(__file__).parents[2] / "docs/mining.md").read_text()
+    (question,) = re.findall(r"```sql\n(.*?);\n```", guide, re.DOTALL)
+    rows = asked(fleet, question)
+    assert [name for name, *_ in rows] == [name for name, _, _ in sorted(rows, key=lambda row: (-row[1], row[0]))]
+    ((fast, longest),) = asked(fleet, "SELECT count(*), max(\"speed.max\") FROM 'out/episodes/rule=too-fast/*.parquet'")
+    ((hours,),) = asked(fleet, "SELECT sum(duration) / 3600 FROM 'out/recordings.parquet'")
+    assert sum(row[1] for row in rows) == pytest.approx(fast / hours, rel=0.01)
+    assert max(row[2] for row in rows) == round(longest, 1)
+
+
+def test_broken_recordings_are_set_apart_with_their_reason(fleet: Path) -> None:
+    found = asked(fleet, "SELECT recording, kind, message FROM 'out/errors.parquet'")
+    assert [(name, kind) for name, kind, _ in found] == [
+        ("drives/broken-000-drive.mcap", "unreadable"),
+        ("drives/broken-001-drive.jsonl", "unreadable"),
+        ("drives/broken-002-drive.mcap", "cut"),
+    ]
+    assert "is no recording that Wayside reads" in found[0][2]
+    assert "broken-001-drive.jsonl:" in found[1][2]
+    assert re.search(r"the recording is cut \(.*\): [1-9]\d* messages", found[2][2])
+    assert asked(fleet, "SELECT count(*) FROM 'out/recordings.parquet' WHERE samples > 0") == [(RECORDINGS + 1,)]
+    assert asked(fleet, "SELECT count(*), sum(samples) > 0 FROM 'out/streams.parquet'") == [(RECORDINGS + 1, True)]
+
+
+def test_one_process_and_shares_give_the_same_bytes(fleet: Path) -> None:
+    mine(fleet, "one", "--processes", "1")
+    assert files(fleet / "one") == files(fleet / "out")
+    first = mine(fleet, "shared", "--processes", "1", "--share", "0/2")
+    assert "others have not done their share yet" in first
+    assert not files(fleet / "shared")
+    mine(fleet, "shared", "--processes", "1", "--share", "1/2")
+    assert files(fleet / "shared") == files(fleet / "out")
+
+
+def test_a_second_run_does_nothing_and_a_changed_rule_runs_alone(fleet: Path) -> None:
+    def times() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in (fleet / "out").rglob("*")}
+
+    before = times()
+    assert "nothing was left to do" in mine(fleet, "out")
+    assert times() == before
+    changed = (fleet / "rules.yaml").read_text().replace("cooldown: 2s", "cooldown: 3s")
+    assert changed.count("cooldown: 3s") == 1
+    (fleet / "changed.yaml").write_text(changed)
+    mine(fleet, "again")
+    ran = mine(fleet, "again", rules="changed.yaml")
+    assert f"{RECORDINGS + BROKEN} mined now, with harsh:" in ran
+    mine(fleet, "fresh", rules="changed.yaml")
+    assert files(fleet / "again") == files(fleet / "fresh")
+    different = [name for name, data in files(fleet / "again").items() if data != files(fleet / "out")[name]]
+    assert different == ["episodes/rule=harsh/part-0.parquet", "rules.parquet"]
+    (fleet / "harsh.yaml").write_text(HARSH)
+    assert "nothing was left to do" in mine(fleet, "again", rules="harsh.yaml")
+    assert [name for name in files(fleet / "again") if "rule=" in name] == ["episodes/rule=harsh/part-0.parquet"]
+
+
+def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:
+    run = subprocess.Popen(command(fleet, "killed", "--processes", "2"), cwd=fleet, stderr=subprocess.PIPE, text=True)
+    mined = fleet / "killed" / ".cache" / "mined"
+    wait_until(lambda: mined.is_dir() and [*map(str, mined.iterdir())], bool, what="a recording is mined")
+    os.kill(workers_of(run.pid)[0], signal.SIGKILL)
+    _, said = run.communicate(timeout=300)
+    assert f"{RECORDINGS + BROKEN} mined now" in said
+    assert files(fleet / "killed") == files(fleet / "out")
+
+
+def workers_of(process: int) -> list[int]:
+    """The processes that it spawned to work."""
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    return [int(child) for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
+
+
+def end(number: int) -> int:
+    """Ends the process that calls it, for one of the numbers."""
+    if number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_a_call_that_kills_its_process_takes_no_other_with_it() -> None:
+    pool = Pool(2)
+    try:
+        found = {call.argument: result for call, result in pool.run(Call(end, number) for number in range(8))}
+    finally:
+        pool.close()
+    assert isinstance(found.pop(3), Lost)
+    assert found == {number: number for number in range(8) if number != 3}
