@@ -237,6 +237,10 @@ def mine(
     processes: Annotated[
         int | None, typer.Option(min=1, help="How many recordings are mined at once. Default: one for each core.")
     ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Let a Dask cluster do the work, e.g. tcp://127.0.0.1:8786."),
+    ] = None,
     record: Annotated[
         bool, typer.Option("--record", help="Run the rules' record actions, into the folder clips of the output.")
     ] = False,
@@ -264,6 +268,7 @@ def mine(
         detector,
         rules,
         processes=processes,
+        dask=dask,
         record=record,
         sample=sample,
         limit=limit,

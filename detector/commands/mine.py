@@ -36,6 +36,7 @@ def mine_recordings(
     rules: Sequence[Path],
     *,
     processes: int | None = None,
+    dask: str | None = None,
     record: bool = False,
     sample: int | None = None,
     limit: int | None = None,
@@ -51,12 +52,14 @@ def mine_recordings(
         detector: a file with one Detector.
         rules: files or folders with EventRules.
         processes: how many work side by side; None: one for each core that this process may use.
+        dask: the address of a Dask scheduler, whose workers do the work; None: processes of this machine.
         record: run the rules' record actions.
         sample: mine this many recordings, chosen by chance, the same ones each time.
         limit: mine the first of them only.
         share: as NUMBER/OF: do this part of the work, counted from 0, and leave the rest to others.
 
     Raises:
+        ClusterError: the Dask cluster cannot be used.
         MissingExtraError: a package is not installed.
         DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text gives the reason.
     """
@@ -71,7 +74,7 @@ def mine_recordings(
     if sample is not None:
         sources = sampled(sources, sample)
     sources = sources[:limit]
-    workers: Workers = Pool(processes or len(os.sched_getaffinity(0)))
+    workers = _workers(processes, dask)
     console = Console(stderr=True)
     try:
         with _Bar(console) as bar:
@@ -116,6 +119,18 @@ def _did(run: Run) -> str:
         return "nothing was left to do"
     rules = f"{len(run.rules_run)} rules" if len(run.rules_run) > _NAMES else ", ".join(sorted(run.rules_run))
     return f"{run.mined} mined now, with {rules}"
+
+
+def _workers(processes: int | None, dask: str | None) -> Workers:
+    """Raises ClusterError."""
+    if dask is None:
+        return Pool(processes or len(os.sched_getaffinity(0)))
+    if processes is not None:
+        refuse("--processes is for this machine, and a Dask cluster has workers of its own: remove one of both")
+    check_package("distributed", "--dask", "dask")
+    from detector.mining.dask import DaskWorkers  # noqa: PLC0415  an extra
+
+    return DaskWorkers(dask)
 
 
 def _share(text: str) -> Share:

@@ -114,7 +114,7 @@ def _listed(item: str) -> list[str]:
 
 
 def _on_disk(recording: Recording) -> Source:
-    return Source(name_of(recording), tuple(map(str, recording)))
+    return Source(name_of(recording), tuple(str(path.absolute()) for path in recording))
 
 
 def _files(path: Path) -> Iterator[Path]:

@@ -15,14 +15,18 @@ from typing import Any
 import duckdb
 import pyarrow.parquet as pq
 import pytest
+from distributed import LocalCluster
 
 from detector.cli import app
 from detector.commands.replay import replay_files
+from detector.mining.dask import DaskWorkers
 from detector.mining.workers import Call, Lost, Pool
 from detector.results.kinds import Kind
 from tests.cluster.waiting import wait_until
 from tests.fleets import HARSH, write_fleet
 from wayside import commandline
+
+pytestmark = pytest.mark.xdist_group("mining")  # one fleet for all
 
 RECORDINGS, BROKEN = 6, 3
 
@@ -153,6 +157,26 @@ def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:
     _, said = run.communicate(timeout=300)
     assert f"{RECORDINGS + BROKEN} mined now" in said
     assert files(fleet / "killed") == files(fleet / "out")
+
+
+def test_a_dask_cluster_of_which_a_worker_is_killed_gives_the_same(fleet: Path) -> None:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        calls = [Call(end_once, str(fleet / "ended"))] + [Call(end, number) for number in range(3)]
+        workers = DaskWorkers(cluster.scheduler_address)
+        assert sorted(result for _, result in workers.run(calls)) == [-1, 0, 1, 2]
+        ((_, lost),) = workers.run([Call(end, 3)])
+        assert isinstance(lost, Lost)
+        workers.close()
+        assert f"{RECORDINGS + BROKEN} mined now" in mine(fleet, "dask", "--dask", cluster.scheduler_address)
+    assert files(fleet / "dask") == files(fleet / "out")
+
+
+def end_once(path: str) -> int:
+    """Ends the process that calls it first."""
+    if not Path(path).exists():
+        Path(path).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return -1
 
 
 def workers_of(process: int) -> list[int]:
