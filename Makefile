@@ -58,6 +58,7 @@ unit: $(BIN)/.installed-dev ## the tests of what is pure, and of files
 
 process: $(BIN)/.installed-dev ## the tests with a detector's processes, Zenoh, MQTT, HTTP and a database's server
 	@$(BIN)/python -m tests.mongodb
+	@$(BIN)/python -m tests.s3
 	@$(BIN)/python -m tests.helm
 	@$(WAITING) tests/process
 

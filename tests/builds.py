@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from rich.console import Console
 
-from tests import helm, kstatus, mongodb
+from tests import helm, kstatus, mongodb, s3
 from tests.cluster import binaries
 from tests.e2e import programs
 from tests.e2e.images import ImageError, lasting_layers
@@ -34,7 +34,15 @@ def image() -> int:
     return 0
 
 
-BUILDS: tuple[Callable[[], int], ...] = (binaries.main, programs.main, image, helm.main, kstatus.main, mongodb.main)
+BUILDS: tuple[Callable[[], int], ...] = (
+    binaries.main,
+    programs.main,
+    image,
+    helm.main,
+    kstatus.main,
+    mongodb.main,
+    s3.main,
+)
 """Each prints what it provides, or why it cannot, and returns an exit code."""
 
 

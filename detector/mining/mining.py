@@ -196,6 +196,8 @@ def _look_at(sources: Sequence[Source], cache: Cache) -> dict[Source, Seen | Fla
             stamp = stamp_of(source)
             known = cache.seen(source, stamp) if stamp is not None else None
             return stamp, known or look(source), known is None
+        except FileNotFoundError:
+            return None, Flaw("unreadable", "it is not there: correct the name"), False
         except OSError as error:
             return None, Flaw("unreadable", f"it cannot be read: {error.strerror or error}"), False
 

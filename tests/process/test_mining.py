@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +26,7 @@ from detector.commands.replay import replay_files
 from detector.mining.dask import DaskWorkers
 from detector.mining.workers import Call, Lost, Pool
 from detector.results.kinds import Kind
+from tests import s3
 from tests.cluster.waiting import wait_until
 from tests.fleets import HARSH, write_fleet
 from wayside import commandline
@@ -65,7 +70,7 @@ def files(dataset: Path) -> dict[str, bytes]:
 def asked(folder: Path, question: str) -> list[tuple[Any, ...]]:
     """What DuckDB answers in that folder."""
     with duckdb.connect() as database:
-        table = database.sql(re.sub("'(?=[a-z]+/)", f"'{folder}/", question)).to_arrow_table()
+        table = database.sql(re.sub("'(?=[a-z0-9]+/)", f"'{folder}/", question)).to_arrow_table()
         return [tuple(row.values()) for row in table.to_pylist()]
 
 
@@ -177,6 +182,45 @@ def end_once(path: str) -> int:
         Path(path).touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return -1
+
+
+def test_recordings_behind_urls_are_mined_as_those_on_disk(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = 'subject, start_time, end_time, reason, rule, "speed.max"'
+    expected = asked(fleet, f"SELECT {columns} FROM 'out/episodes/*/*.parquet' ORDER BY ALL")
+    drives = [*sorted((fleet / "drives").iterdir())]
+    with s3.running() as environment:
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        for path in drives:
+            s3.put(environment, f"2026/{path.name}", path.read_bytes())
+        url = f"s3://{s3.BUCKET}/2026"
+        assert f"{len(drives)} mined now" in mine(fleet, "s3", drives=f"{url}/*")
+        assert asked(fleet, f"SELECT {columns} FROM 's3/episodes/*/*.parquet' ORDER BY ALL") == expected
+        names = [row[0] for row in asked(fleet, "SELECT recording FROM 's3/recordings.parquet'")]
+        assert names == [f"{url}/{path.name}" for path in drives]
+        assert "nothing was left to do" in mine(fleet, "s3", drives=url)
+        s3.put(environment, f"2026/{drives[0].name}", drives[-1].read_bytes())
+        assert "1 mined now" in mine(fleet, "s3", drives=url)
+    with serving(fleet) as address:
+        (fleet / "list.txt").write_text("".join(f"{address}/drives/{path.name}\n" for path in drives))
+        (fleet / "list.txt").open("a").write(f"{address}/drives/none.mcap\n")
+        assert "none.mcap: it is not there" in mine(fleet, "http", drives="@list.txt")
+        assert "nothing was left to do" in mine(fleet, "http", drives=f"{address}/drives/")
+    assert asked(fleet, f"SELECT {columns} FROM 'http/episodes/*/*.parquet' ORDER BY ALL") == expected
+
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    """A web server of the folder; its address."""
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
 
 
 def workers_of(process: int) -> list[int]:

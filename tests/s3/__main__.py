@@ -1,0 +1,5 @@
+import sys
+
+from tests.s3 import main
+
+sys.exit(main())
