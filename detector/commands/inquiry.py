@@ -6,6 +6,9 @@ A command imports what it runs when it runs, so that `--help` need not.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +18,8 @@ from wayside.beginning import importing
 from wayside.commandline import refuse
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from detector.streams.querying import Reply
     from wayside.api.zenoh import Zenoh
 
@@ -43,10 +48,23 @@ def status(
     subject: Annotated[
         str | None, typer.Option(help=("With --rule: the subject, e.g. car1, car1+car2 or ~fleet. Default: the first."))
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each detector.")] = False,
+    everything: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="Add up all detectors: those of the file, which may hold several, else every detector."
+        ),
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON, a line for each detector; with --all one line.")
+    ] = False,
     timeout: Timeout = 3.0,
 ) -> None:
     """Show what running detectors receive, evaluate and lose; for a rule also its values, and what is unknown."""
+    if everything:
+        if name is not None or subject is not None:
+            refuse(f"--all adds up every detector: leave out {'--name' if name is not None else '--subject'}")
+        _show_total(detector, connect, rule, timeout, as_json)
+        return
     if subject is not None and rule is None:
         refuse("--subject requires --rule")
     given = {"rule": rule, "subject": subject, "wait": f"{min(timeout * 0.6, 99):.3f}"} if rule is not None else {}
@@ -58,16 +76,99 @@ def status(
             typer.echo(json.dumps(json.loads(answer.payload)))
         return
     with importing():
-        from rich.console import Console
-
         from detector.status.model import read_status
         from detector.status.table import status_view
+
+    for answer in answers:
+        _print_view(status_view(read_status(answer.payload)))
+
+
+def _show_total(
+    detector: Path | None, connect: list[str] | None, rule: str | None, timeout: float, as_json: bool
+) -> None:
+    """Print the sum. Ends with exit code 1 where a detector of the file does not answer."""
+    with importing():
+        from detector.status.model import read_status, to_json
+        from detector.status.table import total_view
+        from detector.status.total import only_rule, total
+
+    answers, missing = _inquire_all(detector, connect, timeout)
+    added = total(map(read_status, answers), missing)
+    if rule is not None:
+        if all(each.name != rule for each in added.rules):
+            known = ", ".join(sorted(each.name for each in added.rules)) or "none"
+            refuse(f"--rule {rule}: no detector has this rule; the rules are {known}")
+        added = only_rule(added, rule)
+    if as_json:
+        typer.echo(to_json(added))
+    else:
+        _print_view(total_view(added))
+    for holder, why in missing.items():
+        typer.echo(f"detector: the sums lack {holder}: {why}", err=True)
+    if missing:
+        raise typer.Exit(1)
+
+
+def _inquire_all(
+    detector: Path | None, connect: list[str] | None, timeout: float
+) -> tuple[list[bytes], dict[str, str]]:
+    """The statuses of all detectors of the file, else of every detector; and who of the file does not answer, and why.
+
+    Each network of the file's Detectors is queried by itself: regions may have networks of their own.
+
+    Raises:
+        NoAnswerError: nobody answers.
+        NetworkError: without a file: no session.
+        DocumentError: the file is wrong, or holds no Detector.
+    """
+    if detector is None:
+        return [answer.payload for answer in inquire("status", {}, None, None, connect, timeout)], {}
+    with importing():
+        from detector.rules.files import load_detectors
+        from detector.streams.querying import NetworkError, NoAnswerError, query_detectors
+        from wayside.api.pod import DetectorMode
+
+    networks: list[tuple[Zenoh, list[str]]] = []
+    for each in load_detectors(detector):
+        holder = f"{each.name}.*" if each.spec.mode is DetectorMode.SIDECAR else each.name
+        config = _through(_reaching(each.spec.zenoh), connect)
+        for known, holders in networks:
+            if known == config:
+                holders.append(holder)
+                break
+        else:
+            networks.append((config, [holder]))
+    payloads: list[bytes] = []
+    missing: dict[str, str] = {}
+    for config, holders in networks:
+        where = ", ".join(config.connect) or "the local network"
+        why = f"no response at {where} within {timeout:g} s: is it running, and is this its Zenoh network?"
+        replies: list[Reply] = []
+        try:
+            replies = query_detectors(config, "*", "status", {}, timeout, complete=partial(_all_answer, holders))
+        except NoAnswerError:
+            pass
+        except NetworkError as error:
+            why = str(error)
+        payloads += [reply.payload for reply in replies if any(fnmatchcase(reply.holder, each) for each in holders)]
+        missing |= {each: why for each in holders if not _all_answer([each], replies)}
+    if not payloads:
+        raise NoAnswerError("no detector answers: " + "; ".join(f"{each}: {why}" for each, why in missing.items()))
+    return payloads, missing
+
+
+def _all_answer(holders: Iterable[str], replies: Sequence[Reply]) -> bool:
+    return all(any(fnmatchcase(reply.holder, each) for reply in replies) for each in holders)
+
+
+def _print_view(view: RenderableType) -> None:
+    with importing():
+        from rich.console import Console
 
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
-    for answer in answers:
-        console.print(status_view(read_status(answer.payload)), highlight=False, markup=False)
+    console.print(view, highlight=False, markup=False)
 
 
 def evaluate(
@@ -95,7 +196,7 @@ def resume(
 
 def _print_replies(what: str, rule: str, answers: list[Reply]) -> None:
     for answer in answers:
-        typer.echo(f"{answer.key.split('/')[2]}: rule {rule} {what}d", err=True)
+        typer.echo(f"{answer.holder}: rule {rule} {what}d", err=True)
 
 
 def inquire(
@@ -120,11 +221,19 @@ def inquire(
         sidecars = given_detector.spec.mode is DetectorMode.SIDECAR  # each in a pod, which its holder names
         holder = f"{given_detector.name}.$*" if sidecars else given_detector.name
         config = _reaching(given_detector.spec.zenoh)
-    if connect:
-        config = config.model_copy(update={"connect": connect, "scouting": False, "mode": ZenohMode.CLIENT})
+    config = _through(config, connect)
     if not config.connect and not config.scouting:
         refuse("give --connect ENDPOINT, or --detector FILE with the endpoints in spec.zenoh")
     return query_detectors(config, name or holder, what, given, timeout, payload)
+
+
+def _through(zenoh: Zenoh, connect: list[str] | None) -> Zenoh:
+    """The way into the network by these endpoints, if any are given."""
+    from wayside.api.zenoh import ZenohMode
+
+    return (
+        zenoh.model_copy(update={"connect": connect, "scouting": False, "mode": ZenohMode.CLIENT}) if connect else zenoh
+    )
 
 
 def _reaching(zenoh: Zenoh) -> Zenoh:

@@ -66,6 +66,18 @@ def load_rules(detector: str | Path, rules: Iterable[str | Path], check: Check =
     return _selected(detectors[0], documents)
 
 
+def load_detectors(given: str | Path) -> list[Detector]:
+    """Read all Detectors of a file or folder, at least one. Raises DocumentError."""
+    problems: list[Problem] = []
+    documents = _load([given], problems)
+    detectors = [document.object for document in documents if isinstance(document.object, Detector)]
+    if not problems and not detectors:
+        problems.extend(_not_one(str(given), []))
+    if problems:
+        raise DocumentError(problems)
+    return detectors
+
+
 def _selected(detector: Document, documents: dict[str, Document]) -> FileRules:
     assert isinstance(detector.object, Detector)  # noqa: S101  the caller picked it
     candidates = [document.object for document in documents.values() if isinstance(document.object, EventRule)]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from detector.status.model import Explanation, Histogram, RuleStatus, Status
+from detector.status.model import ActionStatus, Drops, Explanation, Histogram, RuleStatus, Status, StreamStatus
+from detector.status.total import Total
 
 _CLIENTS = 20
 _DEMANDS = 10
@@ -18,6 +19,61 @@ _DEMANDS = 10
 def status_view(status: Status) -> RenderableType:
     """A status as a few tables."""
     return Group(*_parts(status))
+
+
+def total_view(total: Total) -> RenderableType:
+    """The sum of several statuses as a few tables, and a line for each detector."""
+    return Group(*_sums(total))
+
+
+def _sums(total: Total) -> Iterator[RenderableType]:
+    least = "" if total.clients_complete else "at least "
+    shared = f" ({least}{total.shared_client_count} of them known to several)" if total.shared_client_count else ""
+    yield (
+        f"{len(total.detectors)} detectors, {total.client_count} clients{shared}, {total.demand_count} demands, "
+        f"buffer {_size(total.buffered_bytes)} of {_size(total.maximum_bytes)}, {total.gaps} gaps"
+    )
+    each = _table(
+        "detector",
+        "version",
+        "up",
+        "connected",
+        "clients",
+        "per s",
+        "size",
+        "evaluated up to",
+        "open",
+        "demands",
+        "lost",
+    )
+    for detector in total.detectors:
+        each.add_row(
+            detector.holder,
+            detector.version,
+            f"{detector.uptime:.0f} s",
+            "yes" if detector.connected else "no",
+            str(detector.clients),
+            f"{detector.rate:.1f}",
+            _size(detector.buffered_bytes),
+            _ago(detector.behind),
+            str(detector.open),
+            str(detector.demands),
+            str(detector.lost),
+        )
+    yield each
+    yield _streams(total.streams)
+    yield _rules(total.rules)
+    for rule in total.rules:
+        yield from _remarks(rule)
+    yield from _acting(total.actions)
+    yield from _lost(total.drops)
+    if total.shared_clients:
+        more = total.shared_client_count - _CLIENTS
+        yield f"known to several: {', '.join(total.shared_clients[:_CLIENTS])}" + (
+            f" and {more} more" if more > 0 else ""
+        )
+    if total.missing_count:
+        yield f"missing: {total.missing_count} expected clients"
 
 
 def _parts(status: Status) -> Iterator[RenderableType]:
@@ -31,53 +87,23 @@ def _parts(status: Status) -> Iterator[RenderableType]:
         f"{status.gaps} gaps; evaluated up to {_ago(status.taken - status.now)}"
     )
     yield from _proving(status)
-    streams = _table("stream", "samples", "per s", "clients", "newest", "buffered", "size", "latency")
-    for stream in status.streams:
-        streams.add_row(
-            stream.name,
-            str(stream.samples),
-            f"{stream.rate:.1f}",
-            str(stream.clients),
-            "none" if stream.age is None else _ago(stream.age),
-            str(stream.buffered_samples),
-            _size(stream.buffered_bytes),
-            _median(stream.latency),
-        )
     if status.explanation is None:
-        yield streams
+        yield _streams(status.streams)
         for source in status.sources:
             error = f"; last error: {source.last_error}" if source.last_error else ""
             yield f"source {source.name} ({source.plugin}): {source.state}, {source.messages} messages{error}"
-    rules = _table("rule", "state", "evaluations", "time", "latency", "unknowns", "errors", "open", "started", "ended")
-    for rule in status.rules:
-        rules.add_row(
-            rule.name,
-            rule.state.value,
-            str(rule.evaluations),
-            f"{rule.time:.3f} s",
-            _median(rule.latency),
-            str(rule.unknowns),
-            str(rule.errors),
-            str(rule.open),
-            str(rule.started),
-            str(rule.ended),
-        )
-    yield rules
+    yield _rules(status.rules)
     for rule in status.rules:
         yield from _remarks(rule)
-    yield from _acting(status)
+    of_rules = {rule.name for rule in status.rules}
+    yield from _acting([each for each in status.actions if each.rule in of_rules or status.explanation is None])
     if status.explanation is None and status.demand_count:
         more = status.demand_count - _DEMANDS
         yield f"demands: {', '.join(status.demands[:_DEMANDS])}" + (f" and {more} more" if more > 0 else "")
     if status.explanation is not None:
         yield from _explained(status.explanation)
         return
-    if any(drops.count for drops in status.drops):
-        lost = _table("lost", "count", "the last")
-        for drops in status.drops:
-            if drops.count:
-                lost.add_row(drops.what, str(drops.count), drops.last)
-        yield lost
+    yield from _lost(status.drops)
     if status.clients:
         shown = ", ".join(f"{client.name} ({_ago(client.age)})" for client in status.clients[:_CLIENTS])
         more = status.client_count - _CLIENTS
@@ -98,10 +124,52 @@ def _proving(status: Status) -> Iterator[RenderableType]:
         yield f"new certificates not in use: {certificate.problem}"
 
 
-def _acting(status: Status) -> Iterator[RenderableType]:
-    """The outcomes of the actions of the rules shown."""
-    shown = {rule.name for rule in status.rules}
-    actions = [each for each in status.actions if each.rule in shown or status.explanation is None]
+def _streams(streams: Sequence[StreamStatus]) -> Table:
+    table = _table("stream", "samples", "per s", "clients", "newest", "buffered", "size", "latency")
+    for stream in streams:
+        table.add_row(
+            stream.name,
+            str(stream.samples),
+            f"{stream.rate:.1f}",
+            str(stream.clients),
+            "none" if stream.age is None else _ago(stream.age),
+            str(stream.buffered_samples),
+            _size(stream.buffered_bytes),
+            _median(stream.latency),
+        )
+    return table
+
+
+def _rules(rules: Sequence[RuleStatus]) -> Table:
+    table = _table("rule", "state", "evaluations", "time", "latency", "unknowns", "errors", "open", "started", "ended")
+    for rule in rules:
+        table.add_row(
+            rule.name,
+            rule.state.value,
+            str(rule.evaluations),
+            f"{rule.time:.3f} s",
+            _median(rule.latency),
+            str(rule.unknowns),
+            str(rule.errors),
+            str(rule.open),
+            str(rule.started),
+            str(rule.ended),
+        )
+    return table
+
+
+def _lost(drops: Sequence[Drops]) -> Iterator[RenderableType]:
+    counted = [each for each in drops if each.count]
+    if not counted:
+        return
+    table = _table("lost", "count", "the last")
+    for each in counted:
+        table.add_row(each.what, str(each.count), each.last)
+    yield table
+
+
+def _acting(actions: Sequence[ActionStatus]) -> Iterator[RenderableType]:
+    """The outcomes of the actions."""
     if not actions:
         return
     table = _table("action", "kind", "running", "done", "failed", "samples", "missing", "size", "files")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import zenoh
@@ -28,11 +28,25 @@ class Reply:
     key: str
     payload: bytes
 
+    @property
+    def holder(self) -> str:
+        """Who answers."""
+        return self.key.split("/")[2]
+
 
 def query_detectors(
-    config: Zenoh, holder: str, what: str, given: Mapping[str, str], timeout: float, payload: bytes | None = None
+    config: Zenoh,
+    holder: str,
+    what: str,
+    given: Mapping[str, str],
+    timeout: float,
+    payload: bytes | None = None,
+    complete: Callable[[Sequence[Reply]], bool] = bool,
 ) -> list[Reply]:
     """The answers of all detectors of that name (`*`: of any), within `timeout` seconds.
+
+    Until the answers are `complete`, by default until there is one, the query is repeated. At the timeout, those of the
+    last query are returned.
 
     Raises:
         NetworkError: no session.
@@ -52,12 +66,13 @@ def query_detectors(
                     answers.append(Reply(str(ok.key_expr), ok.payload.to_bytes()))
                 elif (error := reply.err) is not None:
                     refusals.append(error.payload.to_string())
-            if answers:
+            last = time.monotonic() + _PATIENCE >= end
+            if complete(answers) or (answers and last):
                 return sorted(answers, key=lambda answer: answer.key)
-            if any("Timeout" not in text for text in refusals):
+            if not answers and any("Timeout" not in text for text in refusals):
                 raise NoAnswerError("; ".join(sorted({text for text in refusals if "Timeout" not in text})))
             # A peer has just connected, and may not know the queryables yet.
-            if time.monotonic() + _PATIENCE >= end:
+            if last:
                 where = ", ".join(config.connect) or "the local network"
                 raise NoAnswerError(
                     f"no response from detector {holder} at {where} within {timeout:g} s: is it running, "
