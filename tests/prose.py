@@ -33,6 +33,7 @@ CLEAN = (
     "docs/placement.md",
     "docs/plugins.md",
     "docs/recording.md",
+    "docs/regions.md",
     "docs/rules.md",
     "docs/scopes.md",
     "docs/templates.md",

@@ -1,3 +1,26 @@
+{{/* The Detectors of the values as {"detectors": […]}, one with regions as one Detector for each region, in whose spec
+{region} stands for the name of the region. */}}
+{{- define "wayside.detectors" -}}
+{{- $found := list -}}
+{{- range $d := .Values.detectors -}}
+{{- if not $d.regions -}}{{- $found = append $found $d -}}{{- end -}}
+{{- $streams := dict -}}
+{{- range $region := $d.regions -}}
+{{- $own := deepCopy (omit $d "regions") -}}
+{{- $_ := set $own "spec" (mergeOverwrite $own.spec (deepCopy (default dict $region.spec))) -}}
+{{- $own = $own | toJson | replace "{region}" $region.name | fromJson -}}
+{{- $_ := set $own "name" (printf "%s-%s" $d.name $region.name) -}}
+{{- $seen := $own.spec.streams | toJson -}}
+{{- with get $streams $seen -}}
+{{- fail (printf "detectors: %s: the regions %s and %s have the same streams, so both would see every vehicle: write {region} into the keys of spec.streams, and give each region a name of its own" $d.name . $region.name) -}}
+{{- end -}}
+{{- $_ := set $streams $seen $region.name -}}
+{{- $found = append $found $own -}}
+{{- end -}}
+{{- end -}}
+{{- dict "detectors" $found | toJson -}}
+{{- end -}}
+
 {{/* The spec of a Detector of the values: without a mode, and unless run is false, the manager is to run it.
 Of a list: the root, and the Detector. */}}
 {{- define "wayside.detectorSpec" -}}
