@@ -11,7 +11,7 @@ NOTHING = object()
 """Unknown."""
 
 
-def aggregated(name: str, window: list[tuple[int, Any]]) -> Any:
+def aggregated(name: str, window: list[tuple[int, Any]], quantile: float | None = None) -> Any:
     """Of (time, value) from the oldest on; a value that is unknown is NOTHING."""
     values = [value for _, value in window]
     if name == "Count":
@@ -32,7 +32,9 @@ def aggregated(name: str, window: list[tuple[int, Any]]) -> Any:
     numbers = [(time, value) for time, value in known if isinstance(value, int | float) and not isinstance(value, bool)]
     if not numbers:
         return NOTHING
-    result = _calculated(name, numbers)
+    result = (
+        _quantile([number for _, number in numbers], quantile) if quantile is not None else _calculated(name, numbers)
+    )
     return NOTHING if result is NOTHING or math.isnan(result) else result
 
 
@@ -48,6 +50,16 @@ def _calculated(name: str, numbers: list[tuple[int, Any]]) -> Any:
         return _double(sum(map(Fraction, plain), Fraction()) / (1 if name == "Sum" else len(plain)))
     if name == "StdDev":
         return math.nan if infinite else statistics.pstdev(plain)
+    if name == "Slope":
+        if numbers[0][0] == numbers[-1][0]:
+            return NOTHING
+        if infinite:
+            return math.nan
+        seconds = [Fraction(time - numbers[0][0], 10**9) for time, _ in numbers]
+        values = [Fraction(number) for number in plain]
+        middle, mean = sum(seconds) / len(seconds), sum(values) / len(values)
+        both = sum(((s - middle) * (v - mean) for s, v in zip(seconds, values, strict=True)), Fraction())
+        return _double(both / sum(((s - middle) ** 2 for s in seconds), Fraction()))
     (first_time, first), (last_time, last) = numbers[0], numbers[-1]
     if len(numbers) < 2 or (name == "Rate" and first_time == last_time):
         return NOTHING
@@ -55,6 +67,15 @@ def _calculated(name: str, numbers: list[tuple[int, Any]]) -> Any:
         return float(last) - float(first)
     change = Fraction(last) - Fraction(first)
     return _double(change if name == "Delta" else change / Fraction(last_time - first_time, 10**9))
+
+
+def _quantile(numbers: list[Any], quantile: float) -> Any:
+    ordered = sorted(numbers)
+    place = Fraction(quantile) * (len(ordered) - 1)
+    low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
+    if math.isinf(low) or math.isinf(high):
+        return float(low) + 0.0 if low == high or place.denominator == 1 else float(low) + float(high)
+    return _double(Fraction(low) + (Fraction(high) - Fraction(low)) * (place - math.floor(place)))
 
 
 def _double(exact: Fraction) -> float:

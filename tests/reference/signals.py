@@ -80,7 +80,7 @@ class Sources:
             if self.world.floor is not None:
                 after = max(after, self.world.floor)
             window = [item for item in window if item.time > after]
-        return aggregated(aggregate, [(item.time, _value(signal, item)) for item in window])
+        return aggregated(aggregate, [(item.time, _value(signal, item)) for item in window], signal.get("quantile"))
 
     def _age(self, signal: dict[str, Any], client: str, now: int, ticks: list[int]) -> float:
         if "where" not in signal and "stream" in signal:

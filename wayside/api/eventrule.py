@@ -42,6 +42,8 @@ class Aggregate(StrEnum):
     RATE = "Rate"
     DELTA = "Delta"
     STD_DEV = "StdDev"
+    QUANTILE = "Quantile"
+    SLOPE = "Slope"
     ALL = "All"
     ANY = "Any"
     DISTINCT = "Distinct"
@@ -57,6 +59,9 @@ WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE, Aggregate.ACTIVE})
 
 WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE, Aggregate.ACTIVE}
 """The aggregates that need `over`."""
+
+
+_QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95, and other aggregates have none"
 
 
 class Signal(Model):
@@ -83,6 +88,7 @@ class Signal(Model):
             "[has(self.stream), has(self.rule), has(self.model), has(self.plugin)].filter(given, given).size() == 1",
             "give exactly one of stream, rule, model and plugin",
         ),
+        ("(self.aggregate == 'Quantile') == has(self.quantile)", _QUANTILE),
         (
             "!(has(self.model) || has(self.plugin)) || !(has(self.where) || has(self.over) || has(self.value))",
             "the signal of a model or plugin has no value, where or over: remove them",
@@ -121,15 +127,26 @@ class Signal(Model):
     aggregate: Aggregate = Field(
         default=Aggregate.LAST,
         description="How the samples become one value. Last, Previous, First: the newest, the second newest, the "
-        "oldest value. Min, Max, Mean, Sum, StdDev (of the population): of numbers. Delta: last - first. Rate: Delta "
-        "per second. All, Any: of booleans. Distinct: the list of distinct values. Count: the number of samples. Age: "
+        "oldest value. Min, Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: last - first. "
+        "Rate: Delta per second. Slope: of the line of least squares, per second. All, Any: of booleans. Distinct: "
+        "the list of distinct values. Count: the number of samples. Age: "
         "seconds since the last sample was received. Active (only for a rule): whether an episode is open.",
+    )
+
+    quantile: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Of the aggregate Quantile: 0.5 is the median, 0.95 the value that 95 % of the values do not "
+        "exceed. Between two values, it is interpolated linearly.",
     )
 
     @model_validator(mode="after")
     def _complete(self) -> Signal:
         if sum(source is not None for source in (self.stream, self.rule, self.model, self.plugin)) != 1:
             raise ValueError("give exactly one of stream, rule, model and plugin")
+        if (self.aggregate is Aggregate.QUANTILE) != (self.quantile is not None):
+            raise ValueError(_QUANTILE)
         if self.model is not None or self.plugin is not None:
             if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
                 raise ValueError("the signal of a model or plugin has no value, where, over or aggregate: remove them")

@@ -30,6 +30,8 @@ class CompiledSignal:
     """The rule whose episode starts are the samples; None where they come from a stream."""
     element: CompiledElement | None = None
     """The element that it is computed for, where value or where read it."""
+    quantile: float | None = None
+    """Of the aggregate Quantile, in [0, 1]."""
 
     @property
     def place(self) -> str:

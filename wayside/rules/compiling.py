@@ -165,7 +165,9 @@ class _RuleCompiler:
                     f"{signal.over} is longer than the {kept / 1e9:g} s that Detector {self.detector.name} keeps of "
                     f"stream {stream.name}: shorten it, or raise the stream's buffer.duration",
                 )
-        return CompiledSignal(signal.name, signal.stream, signal.aggregate, value, where, over, self.parameters)
+        return CompiledSignal(
+            signal.name, signal.stream, signal.aggregate, value, where, over, self.parameters, quantile=signal.quantile
+        )
 
     def _episode_signal(self, at: FieldPath, signal: Signal, rule: str) -> CompiledSignal:
         """A signal whose samples are the episode starts of another rule."""
@@ -178,8 +180,9 @@ class _RuleCompiler:
                 self.problem((*at, field), f"{text} (msg is an episode's start)")
         over = None if signal.over is None else signal.over.ns
         return CompiledSignal(
-            signal.name, episode_stream(rule), signal.aggregate, value, where, over, self.parameters, rule
-        )
+            signal.name, episode_stream(rule), signal.aggregate, value, where, over, self.parameters, rule,
+            quantile=signal.quantile,
+        )  # fmt: skip
 
     def _actions(self, *, deploy: bool) -> list[tuple[int, Action]]:
         """The actions that deploy, or those that do not, with their places."""

@@ -29,6 +29,7 @@ class Key(NamedTuple):
     used: Used
     over: int | None
     aggregate: Aggregate
+    quantile: float | None = None
 
 
 class SignalColumns:
@@ -82,7 +83,8 @@ class SignalColumns:
             None if signal.value is None else Reading(signal.value, signal.parameters, element),
             None if signal.where is None else Reading(signal.where, signal.parameters, element),
         )
-        at = self._keys.setdefault(Key(signal.stream, used, signal.over_ns, signal.aggregate), len(self._users))
+        key = Key(signal.stream, used, signal.over_ns, signal.aggregate, signal.quantile)
+        at = self._keys.setdefault(key, len(self._users))
         if at == len(self._users):
             self._users.append([])
         self._users[at].append((row, signal))
@@ -243,7 +245,7 @@ class SignalColumns:
             found = misfits(key.aggregate, rows)
             if found is not None:
                 self._note_misfits(block, at, key, rows, *found)
-            column = aggregated_ranges(key.aggregate, rows, self._context.tables.texts)
+            column = aggregated_ranges(key.aggregate, rows, self._context.tables.texts, key.quantile)
         if key.aggregate in _ALWAYS_KNOWN:
             return column
         fresh = block.fresh[key.stream].ravel()

@@ -24,6 +24,9 @@ Tags = NDArray[np.uint8]
 
 EXTREMES: Final = frozenset({Aggregate.MIN, Aggregate.MAX})
 
+_ONE_BY_ONE: Final = frozenset({Aggregate.RATE, Aggregate.STD_DEV, Aggregate.QUANTILE, Aggregate.SLOPE})
+"""Aggregates of numbers that are computed for each range by itself."""
+
 _HUGE = 1e290
 """Sums of numbers up to here do not overflow."""
 
@@ -84,8 +87,11 @@ def extremes(aggregate: Aggregate, values: Numbers, lows: Sequence[Integers], hi
     return columns
 
 
-def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Column:
-    """The aggregate of each range, flat. Values that the aggregate does not take are left out: see `misfits`."""
+def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts, quantile: float | None = None) -> Column:
+    """The aggregate of each range, flat. Values that the aggregate does not take are left out: see `misfits`.
+
+    `quantile` is of the aggregate Quantile.
+    """
     low, high = rows.low.ravel(), rows.high.ravel()
     count = high - low
     match aggregate:
@@ -98,7 +104,7 @@ def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Colum
     if aggregate is Aggregate.DISTINCT or (
         wanted is Tag.NUMBER and tags is not None and rows.others is not None and _has_integers(rows)
     ):
-        return _each(aggregate, rows, texts)
+        return _each(aggregate, rows, texts, quantile)
     if tags is None and wanted is Tag.BOOLEAN:
         tags = np.full(len(rows.values), Tag.NUMBER, np.uint8)
     if tags is not None and (odd := tags != wanted).any():
@@ -108,8 +114,8 @@ def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Colum
         count = high - low
     if wanted is Tag.BOOLEAN:
         return _truth(aggregate, rows.values, low, high)
-    if aggregate in (Aggregate.RATE, Aggregate.STD_DEV):
-        return _each(aggregate, rows, texts)
+    if aggregate in _ONE_BY_ONE:
+        return _each(aggregate, rows, texts, quantile)
     some = count > (1 if aggregate is Aggregate.DELTA else 0)
     if aggregate in EXTREMES:
         return extremes(aggregate, rows.values, [rows.low], rows.high)[0]
@@ -179,7 +185,7 @@ def _truth(aggregate: Aggregate, values: Numbers, low: Integers, high: Integers)
     return Column(((holds == high - low) & (high > low)).astype(float), tags, None)
 
 
-def _each(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Column:
+def _each(aggregate: Aggregate, rows: Ranges, texts: Texts, quantile: float | None = None) -> Column:
     """By the function for one window, once for each range that differs from the one before."""
     found: list[Any] = []
     before: tuple[int, int] | None = None
@@ -193,7 +199,7 @@ def _each(aggregate: Aggregate, rows: Ranges, texts: Texts) -> Column:
                 result = distinct([value for _, value in window if not isinstance(value, Unknown)])
             else:
                 numbers = [(time, value) for time, value in window if is_number(value)]
-                result = calculated(aggregate, cast("list[Timed]", numbers))
+                result = calculated(aggregate, cast("list[Timed]", numbers), quantile)
         found.append(result)
     return _column(found)
 
@@ -264,6 +270,7 @@ def _sums(values: Numbers, low: Integers, high: Integers) -> Numbers | None:
 NUMERIC: Final = frozenset(
     {
         Aggregate.MIN, Aggregate.MAX, Aggregate.MEAN, Aggregate.SUM, Aggregate.RATE, Aggregate.DELTA, Aggregate.STD_DEV,
+        Aggregate.QUANTILE, Aggregate.SLOPE,
     }
 )  # fmt: skip
 """The aggregates that take numbers only."""

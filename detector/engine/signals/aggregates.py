@@ -5,7 +5,8 @@ numbers only. Sums and differences are exact before they are rounded once, so th
 counter of nanoseconds near 1e18 costs digits; beyond the range of a double they are infinite, as in IEEE 754.
 
 Rate and Delta are (last - first)/(time between) and last - first (see docs/rules.md). StdDev is the population's
-(divided by n, so that of one value is 0), in two passes.
+(divided by n, so that of one value is 0), in two passes. Slope is that of the line of least squares, per second.
+Quantile interpolates linearly between the two values that are next to it.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def calculated(aggregate: Aggregate, window: Sequence[Timed]) -> Number | Unknown:
-    """Min, Max, Mean, Sum, Rate, Delta or StdDev of the window; unknown with too few samples, or where it is NaN."""
+def calculated(aggregate: Aggregate, window: Sequence[Timed], quantile: float | None = None) -> Number | Unknown:
+    """An aggregate that takes numbers; unknown with too few samples, or where it is NaN. `quantile` is of Quantile."""
     if not window:
         return UNKNOWN
-    result = _CALCULATED[aggregate](window)
+    result = _CALCULATED[aggregate](window) if quantile is None else _quantile(window, quantile)
     return UNKNOWN if result is UNKNOWN or result != result else result  # noqa: PLR0124 (NaN differs from itself)
 
 
@@ -95,6 +96,35 @@ def _deviation(window: Sequence[Timed]) -> Number:
     return scale * math.sqrt(math.fsum((number - mean) ** 2 for number in scaled) / len(scaled))
 
 
+def _slope(window: Sequence[Timed]) -> Number | Unknown:
+    """Exact before it is rounded: in whole nanoseconds and whole fractions of a common denominator."""
+    first, count = window[0][0], len(window)
+    if first == window[-1][0]:
+        return UNKNOWN
+    if any(math.isinf(number) for _, number in window):
+        return math.nan
+    ratios = [number.as_integer_ratio() for _, number in window]
+    common = max(below for _, below in ratios)  # all are powers of two
+    times = [time - first for time, _ in window]
+    values = [above * (common // below) for above, below in ratios]
+    products = sum(time * value for time, value in zip(times, values, strict=True))
+    squares = sum(time * time for time in times)
+    total = sum(times)
+    above = _SECOND * (count * products - total * sum(values))
+    return _double(Fraction(above, common * (count * squares - total * total)))
+
+
+def _quantile(window: Sequence[Timed], quantile: float) -> Number:
+    numbers = sorted(float(number) for _, number in window)
+    place = quantile * (len(numbers) - 1)
+    below = math.floor(place)
+    part, low = place - below, numbers[below]
+    if part == 0:
+        return low + 0.0
+    high = numbers[below + 1]
+    return low + 0.0 if low == high else low * (1 - part) + high * part + 0.0
+
+
 def _delta(window: Sequence[Timed]) -> Number | Unknown:
     if len(window) < 2:
         return UNKNOWN
@@ -145,4 +175,5 @@ _CALCULATED: Final[Mapping[Aggregate, Callable[[Sequence[Timed]], Number | Unkno
     Aggregate.RATE: _rate,
     Aggregate.DELTA: _delta,
     Aggregate.STD_DEV: _deviation,
+    Aggregate.SLOPE: _slope,
 }

@@ -232,7 +232,7 @@ def aggregated(
                 return any(truths)
             return all(truths) if truths else UNKNOWN
     numbers = _fitting(signal, client, known, is_number, "numbers", counters)
-    return calculated(aggregate, cast("list[Timed]", numbers))
+    return calculated(aggregate, cast("list[Timed]", numbers), signal.quantile)
 
 
 def _fitting(

@@ -48,6 +48,7 @@ DETECTOR = a_detector()
 _SIGNALS = [
     {"name": f"s{at}", "stream": "speed", "aggregate": each.value, "over": "1s"}
     | ({} if each is Aggregate.COUNT else {"value": "msg.v"})
+    | ({"quantile": 0.3} if each is Aggregate.QUANTILE else {})
     for at, each in enumerate(AGGREGATES)
 ]
 SIGNALS = {each.aggregate: each for each in compiled(DETECTOR, a_rule(signals=_SIGNALS, when="true"))[0].signals}
@@ -69,7 +70,7 @@ def test_aggregates_of_ranges_are_those_of_windows(
             rows.picked(np.array(taken, bool)[rows.begin : rows.begin + len(rows.values)])
         wrong = misfits(aggregate, rows)
         errors = np.zeros(len(windows)) if wrong is None else wrong[0]
-        result = in_columns(aggregate, rows, texts)
+        result = in_columns(aggregate, rows, texts, SIGNALS[aggregate].quantile)
         for at, (begin, end) in enumerate(windows):
             seen = [(samples[row], values[row]) for row in range(begin, end) if taken is None or taken[row]]
             newest_first = seen if aggregate is Aggregate.FIRST else seen[::-1]

@@ -102,7 +102,9 @@ _message = st.builds(
     _places,
 )
 
-_WINDOWED = ("Min", "Max", "Mean", "Sum", "Count", "Rate", "Delta", "StdDev", "All", "Any", "Distinct")
+_WINDOWED = (
+    "Min", "Max", "Mean", "Sum", "Count", "Rate", "Delta", "StdDev", "Quantile", "Slope", "All", "Any", "Distinct"
+)  # fmt: skip
 _OF_A_SAMPLE = ("Last", "First", "Previous")
 
 
@@ -119,6 +121,8 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
     else:
         signal["stream"] = draw(st.sampled_from(("speed", "speed", "speed", "pose", "rare")))
     signal["aggregate"] = aggregate
+    if aggregate == "Quantile":
+        signal["quantile"] = draw(st.sampled_from((0.0, 0.25, 0.5, 1.0)))
     if aggregate not in ("Count", "Age"):
         field = "msg.values.s" if of_rule else "msg.v"
         signal["value"] = draw(st.sampled_from((field, field, f"{field} > 1", "sample.received > 0")))

@@ -8,6 +8,7 @@ import statistics
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,6 +46,21 @@ def test_the_standard_deviation_is_that_of_the_population(values: list[float]) -
     assert math.isclose(found, statistics.pstdev(map(Fraction, values)), rel_tol=1e-9, abs_tol=1e-9)
 
 
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1), st.sampled_from([0.0, 0.1, 0.5, 0.95, 1.0]))
+def test_a_quantile_is_interpolated_linearly(values: list[float], quantile: float) -> None:
+    found = calculated(Aggregate.QUANTILE, timed(values), quantile)
+    assert isinstance(found, float)
+    assert math.isclose(found, np.quantile(values, quantile), rel_tol=1e-9, abs_tol=1e-9)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=2), st.integers(10**6, 10**10))
+def test_a_slope_is_that_of_the_line_of_least_squares(values: list[float], every: int) -> None:
+    found = calculated(Aggregate.SLOPE, timed(values, every))
+    assert isinstance(found, float)
+    exact = statistics.linear_regression([at * every / SECOND for at in range(len(values))], values).slope
+    assert math.isclose(found, exact, rel_tol=1e-6, abs_tol=1e-6 * max(map(abs, values)) * SECOND / every)
+
+
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2), st.integers(1, 10**12))
 def test_rate_times_the_time_between_is_delta(values: list[float], every: int) -> None:
     window = timed(values, every)
@@ -54,7 +70,7 @@ def test_rate_times_the_time_between_is_delta(values: list[float], every: int) -
     assert math.isclose(rate * (window[-1][0] - window[0][0]) / SECOND, delta, rel_tol=1e-9, abs_tol=1e-300)
 
 
-@pytest.mark.parametrize("aggregate", [Aggregate.DELTA, Aggregate.RATE])
+@pytest.mark.parametrize("aggregate", [Aggregate.DELTA, Aggregate.RATE, Aggregate.SLOPE])
 def test_a_difference_needs_two_samples_and_a_rate_a_time_between_them(aggregate: Aggregate) -> None:
     assert calculated(aggregate, timed([5.0])) is UNKNOWN
     same_time = calculated(aggregate, [(0, 1.0), (0, 3.0)])
@@ -107,6 +123,7 @@ def test_distinct_keeps_the_first_of_each_value_and_types_apart() -> None:
 def test_all_aggregates_but_those_of_one_sample_and_age_need_a_window() -> None:
     for aggregate in set(Aggregate) - {Aggregate.ACTIVE}:
         signal = {"name": "s", "stream": "speed", "aggregate": aggregate.value}
+        signal |= {"quantile": 0.5} if aggregate is Aggregate.QUANTILE else {}
         if aggregate not in (Aggregate.COUNT, Aggregate.AGE):
             with pytest.raises(ValidationError, match="needs a value"):
                 a_rule(signals=[{**signal, "over": "5s"}], when="true")
