@@ -125,7 +125,7 @@ def _plain(text: str, recording: Recording) -> str:
 
 
 def _replayed(job: Job, recording: Recording) -> Mined:
-    tracer, arrivals = Tracer(job.wanted, ways=False), Arrivals()
+    tracer, arrivals = Tracer(dict.fromkeys(job.wanted), ways=False), Arrivals()
     clips = None if job.clips is None else _clips(Path(job.clips))
     played = play(
         [recording],

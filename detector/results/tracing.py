@@ -62,15 +62,16 @@ class _Plan(NamedTuple):
 class Tracer:
     """Looks on at a replay. The engine's observer; ask it for the trace at the end."""
 
-    def __init__(self, subjects: Mapping[str, Set[str]] | None = None, *, ways: bool = True) -> None:
-        """`subjects`: those to trace, by rule, None: all; `ways`: note where clients are."""
+    def __init__(self, subjects: Mapping[str, Set[str] | None] | None = None, *, ways: bool = True) -> None:
+        """`subjects`: those to trace by rule, None: all; `ways`: note where clients are."""
         self._subjects = subjects
-        self._clients_by_rule = {rule: _clients_of(texts) for rule, texts in (subjects or {}).items()}
-        self._traced: dict[str, set[int]] = {rule: set() for rule in subjects or ()}
-        """By rule, the numbers of the clients that are traced, where not all subjects are."""
+        chosen = {rule: texts for rule, texts in (subjects or {}).items() if texts is not None}
+        self._clients_by_rule = {rule: _clients_of(texts) for rule, texts in chosen.items()}
+        self._traced: dict[str, set[int]] = {rule: set() for rule in chosen}
+        """The numbers of the clients that are traced, for each rule of which not all are."""
+        self._everybody = subjects is None or len(chosen) < len(subjects)
         self._with_ways = ways
-        self.engine: Engine | None = None
-        """That of the replay, for what it counts."""
+        self.engine: Engine | None = None  # of the replay, for its counts
         self._plans: dict[int, _Plan] = {}
         self._signals: dict[str, Changes] = {}
         self._aliases: dict[tuple[str, str | None, str], dict[str, Changes]] = {}
@@ -150,7 +151,7 @@ class Tracer:
 
     def _rows(self, numbers: Integers, looked: Truths | None) -> slice | Truths:
         """The clients of a block that are traced, of those that the rule looks at."""
-        if self._subjects is None:
+        if self._everybody:
             return slice(None) if looked is None else looked
         traced = np.isin(numbers, [*set().union(*self._traced.values())])
         return traced if looked is None else traced & looked
@@ -187,7 +188,8 @@ class Tracer:
             return
         numbers = self._numbers_of(these.block.clients)
         if self.looks_at(track.rule.name):
-            self._pair(track, these, time, numbers)
+            log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
+            log.add(time, these, numbers)
         if self._with_ways:
             assert isinstance(track.rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
             self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
@@ -195,10 +197,6 @@ class Tracer:
     def looks_at(self, rule: str) -> bool:
         """Whether the rule is one of those that are looked at."""
         return self._subjects is None or rule in self._subjects
-
-    def _pair(self, track: Track, these: PairBlock, time: int, numbers: Integers) -> None:
-        log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
-        log.add(time, these, numbers)
 
     # What came of it
 
