@@ -115,7 +115,7 @@ def test_broken_recordings_are_set_apart_with_their_reason(fleet: Path) -> None:
         ("drives/broken-001-drive.jsonl", "unreadable"),
         ("drives/broken-002-drive.mcap", "cut"),
     ]
-    assert "is no recording that Wayside reads" in found[0][2]
+    assert "is not a recording that Wayside can read" in found[0][2]
     assert "broken-001-drive.jsonl:" in found[1][2]
     assert re.search(r"the recording is cut \(.*\): [1-9]\d* messages", found[2][2])
     assert asked(fleet, "SELECT count(*) FROM 'out/recordings.parquet' WHERE samples > 0") == [(RECORDINGS + 1,)]
