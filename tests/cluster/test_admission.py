@@ -107,6 +107,15 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
         {"signals": [{"name": "speed", "stream": "odometri", "value": "msg.speed"}]},
         ["spec.signals[0].stream", "has no stream odometri", "did you mean odometry?"],
     ),
+    (
+        rule("large"),
+        {
+            "actions": [
+                {"name": "a", "deploy": {"template": "app", "parameters": {"x": "y" * 40_000, "z": "y" * 30_000}}}
+            ]
+        },
+        ["spec.actions[0].deploy.parameters", "exceeds the limit of 65536; the largest value is x: shorten it"],
+    ),
     (detector(), {"clientTimeout": "30s", "streams": "msg.t +"}, ["spec.streams[0].stamp", "ends too early"]),
 ]
 

@@ -196,6 +196,13 @@ class TestServerSideApply:
         stored = api.get("EventRule", EVENT_RULE["metadata"]["name"])
         assert [signal["name"] for signal in stored["spec"]["signals"]] == ["speed", "braking"]
 
+    def test_free_data_has_one_owner_whatever_is_inside(self, api: Api) -> None:
+        for manifest in (EVENT_RULE, APPLICATION_TASK):
+            fields = str(api.apply(manifest)["metadata"]["managedFields"])
+            assert "'f:parameters': {}" in fields
+            assert "'f:vehicles'" not in fields
+            assert "'f:nested'" not in fields
+
     def test_applying_the_same_again_changes_nothing(self, api: Api) -> None:
         for manifest in VALID.values():
             first = api.apply(manifest)

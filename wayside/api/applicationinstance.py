@@ -11,7 +11,6 @@ from pydantic.config import JsonDict
 from wayside.api.base import (
     Condition,
     Identifier,
-    JsonValue,
     Kind,
     Model,
     TemplateName,
@@ -20,6 +19,7 @@ from wayside.api.base import (
     immutable,
     validation,
 )
+from wayside.api.freedata import NestedValue
 
 _IMMUTABLE = "is immutable: delete this instance and create another"
 
@@ -37,7 +37,7 @@ class ApplicationInstanceSpec(Model):
         description="The value of the template's key; a list or map is written as JSON. Absent if the template has no "
         "key. Immutable.",
     )
-    parameters: dict[Identifier, JsonValue] = Field(
+    parameters: dict[Identifier, NestedValue] = Field(
         default_factory=dict,
         max_length=64,
         description="The merged values of the template's parameters.",

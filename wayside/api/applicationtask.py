@@ -11,7 +11,6 @@ from pydantic.config import JsonDict
 from wayside.api.base import (
     Condition,
     Identifier,
-    JsonValue,
     Kind,
     Model,
     ObjectName,
@@ -22,16 +21,8 @@ from wayside.api.base import (
     validation,
 )
 from wayside.api.classification import Classification
+from wayside.api.freedata import NestedValue
 from wayside.api.operation import MEANING, Operation
-
-MAXIMUM_PARAMETER_BYTES = 64 * 1024
-"""The most that a task's parameters may take as JSON; the manager refuses more."""
-
-Value = Annotated[
-    JsonValue,
-    Field(json_schema_extra={"maxLength": MAXIMUM_PARAMETER_BYTES, "maxItems": 4096, "maxProperties": 1024}),
-]
-"""A JSON value that the API server bounds on its first level: what is deeper inside, no schema of a CRD can."""
 
 _IMMUTABLE = "is immutable; only parameters and endTime can change: end this task and create another"
 
@@ -75,10 +66,11 @@ class TaskEvent(Model):
     onset_time: Time = Field(description="The time at which the rule's condition began to hold.")
     start_time: Time = Field(description="The start of the episode.")
     classification: Classification | None = Field(default=None, description="The classification of the rule.")
-    values: dict[str, Value] = Field(
+    values: dict[str, NestedValue] = Field(
         default_factory=dict,
         max_length=256,
-        description="The values of the rule's variables at the start of the episode.",
+        description="The values of the rule's variables at the start of the episode. The detector leaves out the "
+        "largest ones beyond 64 KiB in total.",
     )
 
 
@@ -98,7 +90,7 @@ class ApplicationTaskSpec(Model):
         "name. Immutable.",
         json_schema_extra=immutable(_IMMUTABLE),
     )
-    parameters: dict[Identifier, Value] = Field(
+    parameters: dict[Identifier, NestedValue] = Field(
         default_factory=dict,
         max_length=64,
         description="The values for the template's parameters, at most 64 KiB in total. Can change while the task is "

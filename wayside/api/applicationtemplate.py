@@ -13,7 +13,6 @@ from wayside.api.base import (
     Duration,
     Expression,
     Identifier,
-    JsonValue,
     Kind,
     Model,
     PositiveDuration,
@@ -24,6 +23,7 @@ from wayside.api.base import (
     validations,
 )
 from wayside.api.chart import Helm
+from wayside.api.freedata import NamedData, Value
 from wayside.api.parameter import Parameter
 
 
@@ -103,9 +103,8 @@ BASELINE_WITH_KEY = (
 class Baseline(Model):
     """An instance that always runs, with or without tasks."""
 
-    parameters: dict[Identifier, JsonValue] = Field(
+    parameters: NamedData = Field(
         default_factory=dict,
-        max_length=64,
         description="The parameter values of the baseline. With merge Same, tasks must agree with them. With any "
         "other merge, they count as the values of a task of the lowest priority.",
     )
@@ -152,7 +151,7 @@ class ApplicationTemplateSpec(Model):
         "priority. Default: no limit.",
     )
     lifecycle: Lifecycle = Field(default=Lifecycle(), description="The lifetime of instances.")
-    configuration: dict[FileName, JsonValue] = Field(
+    configuration: dict[FileName, Value] = Field(
         default_factory=dict,
         max_length=64,
         description="Files that the running application follows, by name, with ${…} as in manifests. They are stored "

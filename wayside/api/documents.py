@@ -124,7 +124,10 @@ def parse_object(raw: dict[str, Any]) -> Kind:
     """
     kind = _kind_of(raw)
     if kind.__name__ in _BOUNDED:
-        size = len(json.dumps(raw.get("spec"), ensure_ascii=False, separators=(",", ":"), default=str).encode())
+        try:
+            size = len(json.dumps(raw.get("spec"), ensure_ascii=False, separators=(",", ":"), default=str).encode())
+        except RecursionError:
+            raise ValueError("spec: is nested too deeply: flatten it") from None
         if size > MAXIMUM_BYTES:
             raise ValueError(
                 f"spec: takes {size} bytes as JSON, more than the {MAXIMUM_BYTES} that an object of kind "

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from wayside.api.base import JsonValue, Model
+from wayside.api.base import Model
+from wayside.api.freedata import FreeData
 from wayside.api.source import PluginName
 
 
@@ -15,8 +16,7 @@ class SignalPlugin(Model):
         description="The plugin: unmatched-objects, or the name of a wayside.signals entry point of an installed "
         "package."
     )
-    parameters: dict[str, JsonValue] = Field(
+    parameters: FreeData = Field(
         default_factory=dict,
         description="The parameters of the plugin; see its documentation.",
-        json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
     )

@@ -70,6 +70,8 @@ def _object_schema(kind: type[Kind]) -> dict[str, Any]:
 def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
     """Inline references, turn optional into absent, and keep only what a structural schema knows."""
     node = _resolved(node, definitions)
+    if "x-wayside-schema" in node:
+        return dict(node["x-wayside-schema"])  # structural already
     result = {key: value for key, value in node.items() if key in _KEPT or key.startswith("x-kubernetes-")}
     if "default" in result:
         result["default"] = _without_nulls(result["default"])
@@ -90,11 +92,18 @@ def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, 
             result["additionalProperties"] = _structural(values if isinstance(values, dict) else {}, definitions)
             if result.get("x-kubernetes-preserve-unknown-fields"):
                 result.pop("additionalProperties", None)
+            if _is_free(result) or _is_free(result.get("additionalProperties", {})):
+                # Else, server-side apply notes an owner for each key of whatever is inside.
+                result["x-kubernetes-map-type"] = "atomic"
     elif result.get("type") == "array":
         result["items"] = _structural(node.get("items", {}), definitions)
     elif "type" not in result and "x-kubernetes-int-or-string" not in result:
         result["x-kubernetes-preserve-unknown-fields"] = True
     return result
+
+
+def _is_free(node: dict[str, Any]) -> bool:
+    return bool(node.get("x-kubernetes-preserve-unknown-fields"))
 
 
 def _without_nulls(value: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import ConfigDict, Field, model_validator
 
 from wayside.api.base import ClientName, Expression, Identifier, Model, ObjectName, PositiveDuration, validations
+from wayside.api.freedata import bounded
 
 _POSITION = "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees"
 _MAX_AGE = PositiveDuration("1s")
@@ -157,13 +158,17 @@ class Each(Model):
     of: list[Element] = Field(
         min_length=1,
         max_length=256,
-        description="The elements. Each has a name and any other fields.",
+        description="The elements. Each has a name and any other fields; at most 64 KiB in total.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
 
     @model_validator(mode="after")
     def _unique_names(self) -> Each:
         names = [element.name for element in self.of]
+        try:
+            bounded({element.name: element.model_extra or {} for element in self.of})
+        except ValueError as error:
+            raise ValueError(f"of: {error}") from None
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"of: the name {twice[0]!r} is used twice: names must be unique")

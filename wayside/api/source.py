@@ -6,7 +6,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from wayside.api.base import JsonValue, Model, ObjectName
+from wayside.api.base import Model, ObjectName
+from wayside.api.freedata import FreeData
 
 ZENOH = "zenoh"
 """The default source of a stream: the session of `spec.zenoh`."""
@@ -22,8 +23,7 @@ class DataSource(Model):
     plugin: PluginName = Field(
         description="The plugin: mqtt, bag, or the name of a wayside.sources entry point of an installed package."
     )
-    parameters: dict[str, JsonValue] = Field(
+    parameters: FreeData = Field(
         default_factory=dict,
         description="The parameters of the plugin; see its documentation.",
-        json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
     )

@@ -6,13 +6,11 @@ Pure. A task whose values do not fit is refused as a whole, and then contributes
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Mapping
 from typing import Any
 
 from application_manager.core.claims import patterns, values
-from wayside.api import ApplicationTemplate
-from wayside.api.applicationtask import MAXIMUM_PARAMETER_BYTES
+from wayside.api import ApplicationTemplate, freedata
 from wayside.api.parameter import Parameter
 
 Parameters = Mapping[str, Any]
@@ -32,11 +30,11 @@ def with_defaults(declared: Mapping[str, Parameter], parameters: Parameters) -> 
 
 def size_problem(parameters: Parameters, where: str) -> str:
     """Why the parameters of one task are too large; empty where they are not."""
-    size = len(json.dumps(dict(parameters), ensure_ascii=False, separators=(",", ":")).encode())
-    if size <= MAXIMUM_PARAMETER_BYTES:
+    size = freedata.size(parameters)
+    if size <= freedata.MAXIMUM_BYTES:
         return ""
     return (
-        f"{where}: takes {size} bytes as JSON, more than the {MAXIMUM_PARAMETER_BYTES} allowed: "
+        f"{where}: takes {size} bytes as JSON, more than the {freedata.MAXIMUM_BYTES} allowed: "
         "pass a reference to the data instead"
     )
 

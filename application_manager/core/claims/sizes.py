@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from application_manager.core.claims.merging import Contribution
-from wayside.api.applicationtask import MAXIMUM_PARAMETER_BYTES
+from wayside.api import freedata
 
 TOO_LARGE = "ParametersTooLarge"
 """Reason of the condition Applied of an instance whose merged parameters are beyond the bounds."""
 
-MAXIMUM_MERGED_BYTES = 8 * MAXIMUM_PARAMETER_BYTES
+MAXIMUM_MERGED_BYTES = 8 * freedata.MAXIMUM_BYTES
 """Bytes of all merged parameters together, as JSON: an object of the API server holds some 1.5 MB in all."""
 
 _SHOWN = 3  # tasks that are named
@@ -25,16 +25,16 @@ _SHOWN = 3  # tasks that are named
 def too_large(parameters: Mapping[str, Any], contributions: Sequence[Contribution]) -> str:
     """Why the merged parameters are too large, naming the largest contributors; empty where they are not.
 
-    One parameter may take `MAXIMUM_PARAMETER_BYTES`, all of them `MAXIMUM_MERGED_BYTES`.
+    One parameter may take `freedata.MAXIMUM_BYTES`, all of them `MAXIMUM_MERGED_BYTES`.
     """
     sizes = {name: _size(value) for name, value in parameters.items()}
     if not sizes:
         return ""
     name, largest = max(sizes.items(), key=lambda each: each[1])
     total = sum(sizes.values())
-    if largest > MAXIMUM_PARAMETER_BYTES:
+    if largest > freedata.MAXIMUM_BYTES:
         what = f"spec.parameters.{name}: the merged value takes {largest} bytes as JSON"
-        limit = MAXIMUM_PARAMETER_BYTES
+        limit = freedata.MAXIMUM_BYTES
     elif total > MAXIMUM_MERGED_BYTES:
         what = f"spec.parameters: the merged values take {total} bytes as JSON, {largest} of them {name}"
         limit = MAXIMUM_MERGED_BYTES

@@ -22,6 +22,7 @@ from wayside.api.applicationtask import (
 )
 from wayside.api.base import JsonValue, Metadata
 from wayside.api.classification import Classification
+from wayside.api.freedata import fitting
 from wayside.api.operation import Operation
 from wayside.times import format_time, parse_time
 
@@ -81,7 +82,7 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
     """The demand as an object for the API server or a file.
 
     Absent and null are one in a resource, so null parameters and values are left out, and so are NaN and infinities
-    (JSON has none).
+    (JSON has none). Of the event's values, those that exceed the bounds of free data are left out.
 
     Args:
         demand: what is wanted.
@@ -113,7 +114,7 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
                 classification=None
                 if demand.classification is None
                 else Classification.model_validate(demand.classification),
-                values=plain(demand.values),
+                values=fitting(plain(demand.values)),
             ),
             end_time=None if end_time is None else format_time(end_time),
         ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from application_manager.core.claims.merging import Contribution
 from application_manager.core.claims.sizes import MAXIMUM_MERGED_BYTES, too_large
-from wayside.api.applicationtask import MAXIMUM_PARAMETER_BYTES
+from wayside.api import freedata
 
 
 def text(size: int) -> str:
@@ -13,14 +13,14 @@ def text(size: int) -> str:
 
 def test_a_parameter_may_be_as_large_as_a_task_and_no_larger() -> None:
     assert too_large({}, []) == ""
-    assert too_large({"a": text(MAXIMUM_PARAMETER_BYTES)}, []) == ""
-    assert too_large({"a": text(MAXIMUM_PARAMETER_BYTES + 1)}, []).startswith(
+    assert too_large({"a": text(freedata.MAXIMUM_BYTES)}, []) == ""
+    assert too_large({"a": text(freedata.MAXIMUM_BYTES + 1)}, []).startswith(
         "spec.parameters.a: the merged value takes 65537 bytes as JSON, more than the 65536 allowed"
     )
 
 
 def test_all_parameters_together_have_a_bound_too() -> None:
-    whole = {str(each): text(MAXIMUM_PARAMETER_BYTES) for each in range(8)}
+    whole = {str(each): text(freedata.MAXIMUM_BYTES) for each in range(8)}
     assert too_large(whole, []) == ""
     assert f"more than the {MAXIMUM_MERGED_BYTES} allowed" in too_large(whole | {"one": 1}, [])
 

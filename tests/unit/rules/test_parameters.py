@@ -187,8 +187,8 @@ def test_has_asks_for_a_parameter_as_for_any_member() -> None:
         (None, "m is null: give it a value"),
         ([1, None], "m[1] is null"),
         ({"a": float("nan")}, "m.a is nan: give a finite number"),
-        ([[[[[[[[[[1]]]]]]]]]], "nested more than 8 levels deep"),
-        ("x" * 70_000, "bytes exceeds the limit of 65536"),
+        ([[[[[[1]]]]]], "nested more than 5 levels deep"),
+        ("x" * 70_000, "bytes as JSON exceeds the limit of 65536"),
     ],
 )
 def test_what_no_expression_could_take_is_refused(value: object, text: str) -> None:

@@ -8,7 +8,8 @@ from typing import Annotated
 from pydantic import Field
 
 from wayside.api.actions.window import Window
-from wayside.api.base import Identifier, JsonValue, Model, PositiveDuration, PositiveQuantity
+from wayside.api.base import JsonValue, Model, PositiveDuration, PositiveQuantity
+from wayside.api.freedata import NamedData
 
 DatabaseName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9_-]+$")]
 """A name that MongoDB takes on every platform."""
@@ -28,9 +29,8 @@ class DatabaseAction(Window):
     """Writes the samples of the episode's window to the Detector's database, as one scenario."""
 
     database: DatabaseName = Field(default="wayside", description="The name of the database on the server.")
-    metadata: dict[Identifier, JsonValue] = Field(
+    metadata: NamedData = Field(
         default_factory=dict,
-        max_length=64,
         description="Additional fields of the scenario, such as the driver, with ${…} over the rule's variables at "
         "the start of the episode.",
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from wayside.api.base import Identifier, JsonValue, Model, TemplateName
+from wayside.api.base import Model, TemplateName
+from wayside.api.freedata import NamedData
 from wayside.api.operation import MEANING, Operation
 
 
@@ -20,9 +21,8 @@ class Deploy(Model):
         description="The priority of the task; the highest comes first. Ties are ordered by creation time, then by "
         "name.",
     )
-    parameters: dict[Identifier, JsonValue] = Field(
+    parameters: NamedData = Field(
         default_factory=dict,
-        max_length=64,
         description="The values for the template's parameters, with ${…} over the rule's variables at the start of "
         "the episode.",
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pydantic import Field
 
 from wayside.api.actions.window import Window
-from wayside.api.base import Identifier, JsonValue, Model
+from wayside.api.base import Model
+from wayside.api.freedata import FreeData, NamedData
 from wayside.api.source import PluginName
 
 
@@ -15,14 +16,12 @@ class ActionPlugin(Model):
     name: PluginName = Field(
         description="The plugin: the name of a wayside.actions entry point of an installed package."
     )
-    parameters: dict[str, JsonValue] = Field(
+    parameters: FreeData = Field(
         default_factory=dict,
         description="The parameters of the plugin; see its documentation.",
-        json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
     )
-    values: dict[Identifier, JsonValue] = Field(
+    values: NamedData = Field(
         default_factory=dict,
-        max_length=64,
         description="Values that the plugin receives for each episode, with ${…} over the rule's variables at the "
         "start of the episode.",
     )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 from pydantic import Field
 
 from wayside.api.actions.window import Window
 from wayside.api.base import JsonValue, Model, PositiveDuration, PositiveQuantity
+from wayside.api.freedata import FreeData
 
 
 class Compression(StrEnum):
@@ -42,9 +43,8 @@ class Record(Window):
         description="Complete the recording after this time and continue the episode in a new one; no sample is "
         "missing or in both. For rules whose episodes never end. Default: one recording per episode.",
     )
-    metadata: dict[Annotated[str, Field(min_length=1, max_length=63)], JsonValue] = Field(
+    metadata: FreeData = Field(
         default_factory=dict,
-        max_length=64,
         description="Additional metadata of the recording, with ${…} over the rule's variables at the start of the "
         "episode.",
     )

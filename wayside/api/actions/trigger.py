@@ -13,13 +13,13 @@ from wayside.api.actions.window import WindowClients
 from wayside.api.base import (
     ClientName,
     Duration,
-    Identifier,
     JsonValue,
     Model,
     ObjectName,
     PositiveDuration,
     validations,
 )
+from wayside.api.freedata import FreeData, NamedData
 from wayside.api.stream import Layout
 
 ServiceName = Annotated[
@@ -83,9 +83,8 @@ class ServiceCall(Model):
         description="The definition of the type, in the format of .srv files. Not needed for the services of "
         "rosbag2's recorder and of std_srvs (ROS 2 Jazzy).",
     )
-    request: dict[Identifier, JsonValue] = Field(
+    request: NamedData = Field(
         default_factory=dict,
-        max_length=64,
         description="The fields of the request, with ${…} over the rule's variables at the start of the episode. "
         "Omitted fields are zero or empty.",
     )
@@ -143,11 +142,10 @@ class HttpCall(Model):
     url: HttpUrl = Field(
         description="The URL, e.g. https://recorder/recordings/{id}. {id} is replaced with the ID of the recording."
     )
-    body: dict[str, JsonValue] | None = Field(
+    body: FreeData | None = Field(
         default=None,
         description="The JSON body, with ${…} over the rule's variables at the start of the episode. Default: id, do "
         "(start or stop), maximumDuration, and event: the CloudEvent of the start.",
-        json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64},
     )
 
     @field_validator("url")

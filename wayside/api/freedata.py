@@ -1,0 +1,97 @@
+"""Free data: maps of any JSON values, and their bounds.
+
+The schema bounds each value; the total is for the programs to check, which `check`, the webhook and the manager do.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+from pydantic.config import JsonDict
+
+from wayside.api.base import Identifier, JsonValue
+
+MAXIMUM_BYTES = 64 * 1024
+"""Of one map as JSON."""
+
+MAXIMUM_DEPTH = 5
+"""Levels of lists and maps in one value: the coordinates of a GeoJSON MultiPolygon have four."""
+
+_WIDTH: JsonDict = {"maxLength": MAXIMUM_BYTES, "maxItems": MAXIMUM_BYTES // 2, "maxProperties": MAXIMUM_BYTES // 5}
+"""What a value within `MAXIMUM_BYTES` never exceeds: an item takes two bytes, a named value five."""
+
+Value = Annotated[JsonValue, Field(json_schema_extra=_WIDTH)]
+"""A JSON value whose first level the API server bounds."""
+
+
+def _nested(levels: int) -> JsonDict:
+    """The schema of a value with at most these levels of lists and maps that are not empty."""
+    if levels == 0:
+        return {**_FREE, "maxLength": MAXIMUM_BYTES, "maxItems": 0, "maxProperties": 0}
+    return {**_FREE, **_WIDTH, "items": _nested(levels - 1), "additionalProperties": _nested(levels - 1)}
+
+
+_FREE: JsonDict = {"x-kubernetes-preserve-unknown-fields": True}
+
+NestedValue = Annotated[JsonValue, Field(json_schema_extra={"x-wayside-schema": _nested(MAXIMUM_DEPTH)})]
+"""A JSON value whose every level the API server bounds: for kinds that no webhook reviews."""
+
+
+def size(data: Mapping[str, Any]) -> int:
+    """The size of the map as JSON, in bytes."""
+    return len(json.dumps(dict(data), ensure_ascii=False, separators=(",", ":")).encode())
+
+
+def bounded(data: dict[str, Any]) -> dict[str, Any]:
+    """The map, if it is within the bounds. Raises ValueError, which names the value and the remedy."""
+    for name, value in data.items():
+        _check_depth(name, value, MAXIMUM_DEPTH)
+    total = size(data)
+    if total > MAXIMUM_BYTES:
+        name = max(data, key=lambda each: size({each: data[each]}))
+        raise ValueError(
+            f"the total size of {total} bytes as JSON exceeds the limit of {MAXIMUM_BYTES}; the largest value is "
+            f"{name}: shorten it, or refer to a file"
+        )
+    return data
+
+
+def fitting(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that fit: without those that are nested too deeply, and without the largest ones beyond the total."""
+    kept = {name: value for name, value in data.items() if _depth(value) <= MAXIMUM_DEPTH}
+    total = size(kept)
+    if total > MAXIMUM_BYTES:
+        sizes = {name: size({name: value}) for name, value in kept.items()}
+        for name in sorted(sizes, key=lambda each: (-sizes[each], each)):
+            del kept[name]
+            total -= sizes[name] - 1  # its braces stay
+            if total <= MAXIMUM_BYTES:
+                break
+    return kept
+
+
+def _depth(value: object) -> int:
+    if isinstance(value, list | dict) and value:
+        return 1 + max(map(_depth, value if isinstance(value, list) else value.values()))
+    return 0
+
+
+def _check_depth(name: str, value: object, levels: int) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{name} is {value}: give a finite number")
+    if isinstance(value, list | dict):
+        if levels == 0 and value:
+            raise ValueError(f"{name} is nested more than {MAXIMUM_DEPTH} levels deep: flatten it")
+        for part, child in enumerate(value) if isinstance(value, list) else value.items():
+            _check_depth(f"{name}[{part}]" if isinstance(part, int) else f"{name}.{part}", child, levels - 1)
+
+
+FreeData = Annotated[dict[str, Value], Field(max_length=64), AfterValidator(bounded)]
+"""By any names."""
+
+NamedData = Annotated[dict[Identifier, Value], Field(max_length=64), AfterValidator(bounded)]
+"""By names that expressions can use."""
