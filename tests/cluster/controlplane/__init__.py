@@ -34,6 +34,15 @@ from tests.ports import free_ports
 
 READY_TIMEOUT = PATIENCE  # for each program; a loaded machine takes ten times the usual 2 s
 
+_CONTROLLERS_RIGHTS = {
+    "apiVersion": "rbac.authorization.k8s.io/v1",
+    "kind": "ClusterRoleBinding",
+    "metadata": {"name": "test-controllers"},
+    "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "ClusterRole", "name": "cluster-admin"},
+    "subjects": [{"apiGroup": "rbac.authorization.k8s.io", "kind": "User", "name": commands.CONTROLLERS_USER}],
+}
+"""The controllers share one account here, so it may do what any of them does."""
+
 
 class ControlPlane:
     """A control plane with data of its own; a context manager that starts and removes it.
@@ -73,7 +82,7 @@ class ControlPlane:
         self.started_in: dict[str, float] = {}
         etcd_port, etcd_peer_port, api_port = free_ports(3)
         self._setup = commands.Setup(self.binaries, self.folder, etcd_port, etcd_peer_port, api_port, site)
-        self._token = new_token()
+        self._token, self._controllers_token = new_token(), new_token()
         self._etcd: Child | None = None
         self._api_server: Child | None = None
         self._controller_manager: Child | None = None
@@ -103,7 +112,7 @@ class ControlPlane:
             TimeoutError: one is not; the message has the end of its log.
         """
         try:
-            commands.write_tokens(self._setup, self._token)
+            commands.write_tokens(self._setup, self._token, self._controllers_token)
             self._etcd = self._start_etcd()
             self.start_api_server()
             if self.crds is not None:
@@ -171,6 +180,9 @@ class ControlPlane:
     def start_controller_manager(self) -> None:
         """Start the controller manager and wait until it serves a new namespace."""
         began = time.monotonic()
+        certificate = self._setup.serving_certificate.read_bytes()
+        write_kubeconfig(self._setup.controllers_kubeconfig, self.url, certificate, self._controllers_token)
+        self.api().apply(_CONTROLLERS_RIGHTS)
         command = commands.kube_controller_manager(self._setup)
         child = self._controller_manager = self._child("kube-controller-manager", command)
         probe = f"probe-{secrets.token_hex(3)}"
@@ -224,10 +236,18 @@ class ControlPlane:
         """Return the ends of all logs, for messages."""
         return "\n".join(log_tail(log, lines) for log in sorted(self.logs.glob("*.log")))
 
+    @property
+    def processes(self) -> dict[str, int]:
+        """The process id of each running program."""
+        return {child.name: child.pid for child in self._children()}
+
     def memory(self) -> dict[str, int]:
         """Return the resident bytes of each running program."""
+        return {child.name: child.resident_bytes() for child in self._children()}
+
+    def _children(self) -> list[Child]:
         children = (self._etcd, self._api_server, self._controller_manager)
-        return {child.name: child.resident_bytes() for child in children if child is not None}
+        return [child for child in children if child is not None]
 
     def _wait(self, child: Child, ready: Callable[[], bool], what: str) -> None:
         def look() -> bool:

@@ -40,11 +40,26 @@ class Setup:
         """An administrator's."""
         return self.folder / "kubeconfig"
 
+    @property
+    def controllers_kubeconfig(self) -> Path:
+        """The controller manager's."""
+        return self.folder / "kubeconfig-controllers"
 
-def write_tokens(setup: Setup, administrator: str) -> None:
-    """Write the file of those whom the API server lets in."""
+
+CONTROLLERS_USER = "system:kube-controller-manager"
+
+
+def write_tokens(setup: Setup, administrator: str, controllers: str) -> None:
+    """Write the file of those whom the API server lets in.
+
+    The controller manager has a user of its own, as in any cluster: who is of the group system:masters goes past API
+    Priority and Fairness.
+    """
     setup.tokens.touch(mode=0o600)
-    lines = [f'{administrator},administrator,administrator,"system:masters"']
+    lines = [
+        f'{administrator},administrator,administrator,"system:masters"',
+        f"{controllers},{CONTROLLERS_USER},{CONTROLLERS_USER}",
+    ]
     lines += [f'{token},{user},{user},"{group}"' for user, group, token in setup.site.users]
     setup.tokens.write_text("".join(f"{line}\n" for line in lines))
 
@@ -108,7 +123,7 @@ def kube_controller_manager(setup: Setup) -> list[str]:
     controllers = "*" if setup.site.runs_pods else ",".join(CONTROLLERS)
     return [
         str(setup.binaries.kube_controller_manager),
-        f"--kubeconfig={setup.kubeconfig}",
+        f"--kubeconfig={setup.controllers_kubeconfig}",
         f"--controllers={controllers}",
         f"--root-ca-file={setup.serving_certificate}",
         "--horizontal-pod-autoscaler-sync-period=1s",  # 15 s by default, which tests would wait for
@@ -116,4 +131,5 @@ def kube_controller_manager(setup: Setup) -> list[str]:
         "--secure-port=0",
         "--kube-api-qps=1000",  # the default of 20 a second would be what a test of 100 Deployments measures
         "--kube-api-burst=2000",
+        *setup.site.controller_manager,
     ]

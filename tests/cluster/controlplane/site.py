@@ -14,6 +14,7 @@ class Site:
         enter: what to put before a command line, so that it runs there.
         users: beside the administrator, who may come: name, group, token.
         api_server: further flags of kube-apiserver.
+        controller_manager: further flags of kube-controller-manager.
         runs_pods: whether there are nodes; then all controllers run.
     """
 
@@ -21,6 +22,7 @@ class Site:
     enter: tuple[str, ...] = ()
     users: tuple[tuple[str, str, str], ...] = ()
     api_server: tuple[str, ...] = ()
+    controller_manager: tuple[str, ...] = ()
     runs_pods: bool = False
 
 
