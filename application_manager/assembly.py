@@ -48,7 +48,8 @@ _INSTANCE_WORKERS = 16
 _INSTANCE_SHARE = 6  # of these for one namespace: more requests at once make each take longer, also those of others
 _CONFIGURATION_WORKERS = 4
 _JUDGING_WORKERS = 4  # one a namespace: they mostly wait for worker processes
-_STATUS_WORKERS = 2  # few: what runs goes before what is said of it
+_STATUS_WORKERS = 4
+_STATUS_SHARE = 2  # few: what runs goes before what is said of it
 
 
 class Assembly:
@@ -87,10 +88,10 @@ class Assembly:
             "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures, share=_INSTANCE_SHARE
         )
         self._statuses: WorkQueue[Name] = WorkQueue(
-            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measures
+            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measures, share=_STATUS_SHARE
         )
         self._tasks: WorkQueue[Name] = WorkQueue(
-            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measures
+            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measures, share=_STATUS_SHARE
         )
         self._templates: WorkQueue[Name] = WorkQueue(
             "template", self._reconcile_template, _JUDGING_WORKERS, self._instances, measures, share=1

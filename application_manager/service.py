@@ -27,6 +27,7 @@ from application_manager.cluster.client import ApiError, Client, Resource
 from application_manager.cluster.connection import ConfigurationError, load_configuration
 from application_manager.cluster.grants import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
+from application_manager.cluster.pacing import Pacing, Share
 from application_manager.cluster.starting import until_answered
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
 from application_manager.core.objects.policy import KindKey
@@ -55,7 +56,7 @@ async def serve(options: Options) -> None:
             or the port for metrics is taken.
     """
     measures, traced = Measures(), tracing("wayside-application-manager")
-    client = Client(await load_configuration(), measures)
+    client = Client(await load_configuration(), measures, pacing=Pacing(share=Share()))
     renewals = Client(await load_configuration(), measures, timeout=RENEWAL_TIMEOUT)  # not held up by all else
     leadership = Leadership(renewals, options.lease, measures)
     client.may_act = leadership.remaining

@@ -338,12 +338,13 @@ class Client:
         """Send a request, and retry it for up to 30 s while the API server rejects it unprocessed."""
         deadline = time.monotonic() + _PATIENCE
         changes = method != "GET" if writes is None else writes
-        where = _NAMESPACE.search(path) if changes and self.may_write is not None else None
-        if where is not None and self.may_write is not None and not await self.may_write(where[1]):
-            raise NotGranted(where[1])
+        found = _NAMESPACE.search(path)
+        namespace = found[1] if found is not None else ""
+        if namespace and changes and self.may_write is not None and not await self.may_write(namespace):
+            raise NotGranted(namespace)
         while True:
             try:
-                async with self._pacing.turn():
+                async with self._pacing.turn(namespace if changes else ""):
                     return await self._ask(method, path, dict(query or {}), body, content_type, changes)
             except ApiError as error:
                 if error.code not in (429, 503) or error.retry_after is None:

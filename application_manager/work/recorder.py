@@ -26,8 +26,8 @@ from application_manager.core.conditions import changed
 from application_manager.core.health.pods import TroubleReason
 from application_manager.core.statuses.allowance import Allowance
 from application_manager.core.statuses.conclusions import READY, STALLED
+from application_manager.core.turns import Turns
 from application_manager.measures import Measures
-from application_manager.work.turns import Turns
 from wayside.api.base import Condition, Kind
 from wayside.times import format_seconds
 

@@ -20,8 +20,8 @@ from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 from application_manager.cluster.client import ApiError, NotGranted, Unreachable
+from application_manager.core.turns import Turns
 from application_manager.measures import Measures
-from application_manager.work.turns import Turns
 
 Key = TypeVar("Key", bound=Hashable)
 

@@ -23,7 +23,7 @@ LENGTH = struct.Struct("<I")
 MEMORY = 256 * 1024 * 1024
 """Bytes of data that the process may have; it has 40 MB when it starts."""
 
-_NICENESS = 5  # the manager's own work goes first
+_NICENESS = 10  # the manager itself goes first, and so does all else on its machine
 
 
 Result_co = TypeVar("Result_co", covariant=True)

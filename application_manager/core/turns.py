@@ -31,6 +31,11 @@ class Turns(Generic[Item]):
 
     def next(self, may: Callable[[str], bool] = lambda _: True) -> Item | None:
         """Take the next item out of the namespaces that may have a turn; None where none waits in any of these."""
+        taken = self.take(may)
+        return None if taken is None else taken[1]
+
+    def take(self, may: Callable[[str], bool]) -> tuple[str, Item] | None:
+        """The same, with its namespace."""
         for namespace, items in self._waiting.items():
             if may(namespace):
                 item = items.popleft()
@@ -38,5 +43,5 @@ class Turns(Generic[Item]):
                     self._waiting.move_to_end(namespace)
                 else:
                     del self._waiting[namespace]
-                return item
+                return namespace, item
         return None
