@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import datetime
 import json
+import re
 import socket
 import ssl
 import subprocess
@@ -171,6 +172,8 @@ CLUSTER_WIDE = {
     "ClusterRole",
     "ClusterRoleBinding",
     "CustomResourceDefinition",
+    "FlowSchema",
+    "PriorityLevelConfiguration",
     "ValidatingAdmissionPolicy",
     "ValidatingAdmissionPolicyBinding",
     "ValidatingWebhookConfiguration",
@@ -232,6 +235,10 @@ def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_th
         assert done.returncode == 0, done.stderr
         assert "the manager is ready" in done.stdout
         assert "the webhook refuses what is wrong" in done.stdout
+        stranger = bare.kubeconfig_of_service_account(there.namespace, "default")
+        with pytest.raises(ApiError, match="cannot create resource"):
+            Api(stranger, there.namespace).create(TASK)
+        assert served_by(there) == {f"{hook}-{what}" for what in ("lease", "manager", "tasks")}
         # What is about to expire is renewed, and the API server trusts both before the next one is shown.
         dying = issued((service,), datetime.timedelta(minutes=20))
         data = {name: base64.b64encode(content).decode() for name, content in dying.items()}
@@ -286,6 +293,24 @@ def test_people_may_with_our_kinds_what_they_may_with_others(helm: Helm, there: 
         lambda found: found == wanted,
         what="Kubernetes' own roles have ours",
     )
+
+
+TASK: Object = {
+    "apiVersion": "wayside.dev/v1alpha1",
+    "kind": "ApplicationTask",
+    "metadata": {"name": "a"},
+    "spec": {"template": "a"},
+}
+
+
+def served_by(api: Api) -> set[str]:
+    """The chart's flow schemas by which the API server has served requests."""
+    found = re.findall(
+        r'^apiserver_flowcontrol_dispatched_requests_total\{flow_schema="([^"]*)".* [1-9]',
+        api.raw("/metrics"),
+        re.MULTILINE,
+    )
+    return set(found) & {each["metadata"]["name"] for each in ours(api, "FlowSchema")}
 
 
 RESOLVING = """
