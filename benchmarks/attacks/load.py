@@ -1,13 +1,14 @@
 """A task of one namespace, alone and while another namespace attacks the manager: the times, and the manager's memory.
 
-The attack, all from one namespace: templates whose expressions take too long, whose values change all the time; a flood
-of tasks; and large tasks. Prints the 95th percentile from a task to its Deployment and to its status, alone and under
-attack, beside that of three raw calls, which the API server alone makes slower; and the manager's largest resident set.
-Exits with 1 where one of the targets is missed.
+The attack, all from one namespace (see `attacker`): templates whose expressions take too long, whose values change all
+the time; a flood of tasks; and large tasks. Prints the times from a task to its Deployment and to its status, alone and
+under attack, beside those of its creation alone and of three raw calls, which the API server alone makes slower; where
+requests waited; what each program used; and the manager's largest resident set. Exits with 1 where a target is missed.
 
     python -m benchmarks.attacks.load [--tasks 30] [--bombs 8] [--flood 10000] [--large 40]
 
-Uses the cluster of KUBECONFIG where that is set, else a control plane of its own.
+Everybody has an account of its own and the rights that the chart gives: an administrator goes past API Priority and
+Fairness. The control plane is its own, and shares the machine's cores with all else here, so the machine must be idle.
 """
 
 from __future__ import annotations
@@ -20,113 +21,92 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import nullcontext
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import load_configuration
 from application_manager.core.claims.claims import instance_name
-from benchmarks.manager_memory import large as small
-from benchmarks.task_to_deployment import (
-    PATIENCE,
-    TASKS,
-    TEMPLATE,
-    TEMPLATES,
-    Seen,
-    at_once,
-    fresh_namespaces,
-    task,
-)
-from tests.cluster.controlplane import ControlPlane
-from tests.cluster.crds import CRDS
-from tests.worker_jobs import TEXT
+from benchmarks.attacks.cluster import LOUD, QUIET, SYSTEM, Cluster, small_cluster
+from benchmarks.task_to_deployment import PATIENCE, TASKS, TEMPLATE, Seen, cpu_seconds, task
 
 CONFIG_MAPS = Resource("v1", "ConfigMap", "configmaps")
 SLOWER = 2.0  # times that a task may take under attack, 95th percentile
 STATUS = 5.0  # s to its status, 95th percentile
 MEMORY = 1024  # MiB: the chart's limit
-LARGE = 1_000_000  # bytes of a large task
-TEXT_LENGTH = 60_000  # of each of its values: the API server takes no more than 65,536
 PAUSE = 0.3  # s between two tasks that are measured
+WARMING = 10  # tasks before those that are measured
+GATHERING = 5.0  # s from the start of the attack to the first task that is measured
 _LOOK = 0.02  # s between two looks for a status
 
-
-def bomb(namespace: str, number: int) -> dict[str, Any]:
-    """A template that takes half a minute to render with the values of `bombing`."""
-    expression = 'parameters.l.filter(x, parameters.s.matches("([ab]*a[ab]{50}){3}z")).size()'
-    config = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "${instance.name}"}}
-    return {
-        **TEMPLATE,
-        "metadata": {"name": f"bomb{number}", "namespace": namespace},
-        "spec": {
-            "parameters": {"l": {"type": "array", "items": "string"}, "s": {"type": "string"}},
-            "manifests": [{**config, "data": {"n": f"n=${{{expression}}}"}}],
-        },
-    }
-
-
-async def bombing(client: Client, namespace: str, number: int) -> None:
-    """Give a bomb other values again and again, until cancelled."""
-    turn = 0
-    while True:
-        turn += 1
-        items = [f"{turn}-{index}" for index in range(2000)]
-        spec = {"template": f"bomb{number}", "parameters": {"l": items, "s": TEXT}}
-        made = {**task(namespace, f"bomb{number}-{turn}"), "spec": spec}
-        raw = await client.create(TASKS, made)
-        await asyncio.sleep(2.0)
-        await client.delete(TASKS, namespace, made["metadata"]["name"], raw["metadata"]["uid"])
-
-
-def large(namespace: str, number: int) -> dict[str, Any]:
-    """A task with about a megabyte of text."""
-    made = small(namespace, number, 0)
-    values = {f"x{index}": "x" * TEXT_LENGTH for index in range(LARGE // TEXT_LENGTH)}
-    return {**made, "spec": {**made["spec"], "event": {**made["spec"]["event"], "values": values}}}
+STAGES = ("creation", "Deployment", "status", "raw calls")
 
 
 class Measured:
     """Seconds from the creation of tasks to their Deployments, and to their statuses."""
 
-    def __init__(self, client: Client, namespace: str, seen: Seen) -> None:
+    def __init__(self, client: Client, seen: Seen) -> None:
         self._client = client
-        self._namespace = namespace
         self._seen = seen
 
-    async def p95(self, prefix: str, count: int) -> tuple[float, float, float]:
-        """The 95th percentiles of both, over as many tasks, one after the other; and of three raw calls in between."""
-        deployed: list[float] = []
-        told: list[float] = []
-        raw: list[float] = []
+    async def times(self, prefix: str, count: int) -> dict[str, list[float]]:
+        """The times of each of STAGES, over as many tasks, one after the other; the raw calls are in between."""
+        found: dict[str, list[float]] = {stage: [] for stage in STAGES}
         for index in range(count):
             name = f"{prefix}{index}"
             began = time.perf_counter()
-            await self._client.create(TASKS, task(self._namespace, name))
+            await self._client.create(TASKS, task(QUIET, name))
+            found["creation"].append(time.perf_counter() - began)
             status = asyncio.create_task(self._status(name))
             await self._seen.wait(len(self._seen.at) + (instance_name("app", name) not in self._seen.at))
-            deployed.append(self._seen.at[instance_name("app", name)] - began)
-            told.append(await status - began)
+            found["Deployment"].append(self._seen.at[instance_name("app", name)] - began)
+            found["status"].append(await status - began)
             await asyncio.sleep(PAUSE)
-            raw.append(await self._raw(name))
+            found["raw calls"].append(await self._raw(name))
             await asyncio.sleep(PAUSE)
-        return _p95(deployed), _p95(told), _p95(raw)
+        return found
 
     async def _raw(self, name: str) -> float:
         """Seconds of three calls that make an object each, which no manager looks at: what the API server takes."""
         began = time.perf_counter()
         for index in range(3):
-            metadata = {"name": f"{name}-{index}", "namespace": self._namespace}
+            metadata = {"name": f"{name}-{index}", "namespace": QUIET}
             await self._client.create(CONFIG_MAPS, {"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata})
         return time.perf_counter() - began
 
     async def _status(self, name: str) -> float:
         async with asyncio.timeout(PATIENCE):
             while "status" not in (  # noqa: ASYNC110  what is waited for is at the API server
-                await self._client.get(TASKS, self._namespace, name) or {}
+                await self._client.get(TASKS, QUIET, name) or {}
             ):
                 await asyncio.sleep(_LOOK)
         return time.perf_counter()
+
+
+class Usage:
+    """What each program uses of a core, and where requests wait, from its making to `report`."""
+
+    def __init__(self, cluster: Cluster, programs: Mapping[str, int]) -> None:
+        self._cluster = cluster
+        self._programs = dict(programs)
+        self._began = time.monotonic()
+        self._requests = cluster.requests()
+        self._cpu = {name: cpu_seconds(pid) for name, pid in programs.items()}
+
+    def report(self, when: str) -> None:
+        """Print both."""
+        elapsed = time.monotonic() - self._began
+        used = {name: (cpu_seconds(pid) - self._cpu[name]) / elapsed for name, pid in self._programs.items()}
+        print(
+            f"{when}: cores used, in {elapsed:.0f} s: " + ", ".join(f"{name} {each:.2f}" for name, each in used.items())
+        )
+        for schema, now in self._cluster.requests().items():
+            before = self._requests.get(schema, (0.0, 0.0, 0.0))
+            count, wait, execution = (after - was for after, was in zip(now, before, strict=True))
+            if count > elapsed:
+                rate = f"{count / elapsed:6.1f} requests/s"
+                means = f"{wait / count * 1e3:6.1f} ms in a queue, {execution / count * 1e3:6.1f} ms at work"
+                print(f"{when}: {schema:24} {rate}, in the mean {means}")
 
 
 def _p95(values: list[float]) -> float:
@@ -139,43 +119,54 @@ def largest(pid: int) -> float:
     return int(text.partition("VmHWM:")[2].split()[0]) / 1024
 
 
-async def measure(options: argparse.Namespace, pid: int, namespaces: tuple[str, str]) -> list[str]:
+async def measure(options: argparse.Namespace, cluster: Cluster, manager: int) -> list[str]:
     """Measure and print; what was missed."""
-    quiet, loud = namespaces
-    client, attacker, seen = Client(await load_configuration()), Client(await load_configuration()), Seen()
-    for namespace in namespaces:
-        await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}})
-    attacks: list[asyncio.Task[None]] = []
-    measured = Measured(client, quiet, seen)
+    os.environ["KUBECONFIG"] = str(cluster.tenants[QUIET])
+    client, seen = Client(await load_configuration()), Seen()
+    measured = Measured(client, seen)
+    programs = {**cluster.programs, "manager": manager}
+    attacker: subprocess.Popen[bytes] | None = None
     try:
-        async with seen.watching(client, quiet):
-            await measured.p95("warm", 5)
-            alone, status_alone, raw_alone = await measured.p95("alone", options.tasks)
-            for number in range(options.bombs):
-                await attacker.create(TEMPLATES, bomb(loud, number))
-                attacks.append(asyncio.create_task(bombing(attacker, loud, number)))
-            flood = [attacker.create(TASKS, task(loud, f"flood{index}")) for index in range(options.flood)]
-            flood += [attacker.create(TASKS, large(loud, index)) for index in range(options.large)]
-            attacks.append(asyncio.create_task(at_once(flood)))
-            attacked, status, raw = await measured.p95("attacked", options.tasks)
+        async with seen.watching(client, QUIET):
+            await measured.times("warm", WARMING)
+            usage = Usage(cluster, programs)
+            alone = await measured.times("alone", options.tasks)
+            usage.report("alone")
+            attacker = attack(options, cluster)
+            await asyncio.sleep(GATHERING)
+            usage = Usage(cluster, {**programs, "attacker": attacker.pid})
+            attacked = await measured.times("attacked", options.tasks)
+            usage.report("under attack")
+            lasted = attacker.poll() is None
     finally:
-        for attack in attacks:
-            attack.cancel()
-        await asyncio.gather(*attacks, return_exceptions=True)
+        if attacker is not None:
+            attacker.kill()
+            attacker.wait()
         await client.close()
-        await attacker.close()
-    memory = largest(pid)
-    for what, before, after in (
-        ("Deployment", alone, attacked),
-        ("status", status_alone, status),
-        ("raw calls", raw_alone, raw),
-    ):
-        times = f"alone {before * 1e3:7.1f} ms   under attack {after * 1e3:7.1f} ms"
-        print(f"{what:10}, p95  {times}   {after / before:.2f} times")
-    print(f"targets: the Deployment within {SLOWER:g} times, the status within {STATUS:g} s")
+    memory = largest(manager)
+    for stage in STAGES:
+        for what, of in (("p50", statistics.median), ("p95", _p95)):
+            before, after = of(alone[stage]), of(attacked[stage])
+            times = f"alone {before * 1e3:7.1f} ms   under attack {after * 1e3:7.1f} ms"
+            print(f"{stage:10} {what}  {times}   {after / before:.2f} times")
     print(f"the manager's memory     {memory:.0f} MiB at most, of {MEMORY}")
-    found = {"the time": attacked > SLOWER * alone, "the status": status > STATUS, "the memory": memory > MEMORY}
+    print(f"targets: the Deployment within {SLOWER:g} times, the status within {STATUS:g} s, both p95")
+    found = {
+        "the time": _p95(attacked["Deployment"]) > SLOWER * _p95(alone["Deployment"]),
+        "the status": _p95(attacked["status"]) > STATUS,
+        "the memory": memory > MEMORY,
+        "an attack as long as the measurement: give a larger --flood": not lasted,
+    }
     return [what for what, missed in found.items() if missed]
+
+
+def attack(options: argparse.Namespace, cluster: Cluster) -> subprocess.Popen[bytes]:
+    """Start the attacks."""
+    given = [f"--{name}={getattr(options, name)}" for name in ("bombs", "flood", "large")]
+    return subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.attacks.attacker", LOUD, *given],
+        env=os.environ | {"KUBECONFIG": str(cluster.tenants[LOUD])},
+    )
 
 
 def main() -> None:
@@ -184,17 +175,21 @@ def main() -> None:
     for name, default in (("tasks", 30), ("bombs", 8), ("flood", 10_000), ("large", 40)):
         parser.add_argument(f"--{name}", type=int, default=default)
     options = parser.parse_args()
-    given = "KUBECONFIG" in os.environ
-    with nullcontext() if given else ControlPlane(crds=CRDS) as plane, tempfile.TemporaryFile() as log:
-        if plane is not None:
-            os.environ["KUBECONFIG"] = str(plane.kubeconfig)
-        namespaces = asyncio.run(fresh_namespaces())
-        command = [sys.executable, "-m", "application_manager.cli", "run"]
-        for namespace in namespaces:
-            command += ["--namespace", namespace]
-        manager = subprocess.Popen(command, stdout=log, stderr=log)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        small_cluster(Path(folder)) as cluster,
+        tempfile.TemporaryFile() as log,
+    ):
+        for namespace in (QUIET, LOUD):
+            cluster.api.create({**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}})
+        manager = subprocess.Popen(
+            [sys.executable, "-m", "application_manager.cli", "run", f"--lease={SYSTEM}/application-manager"],
+            env=os.environ | {"KUBECONFIG": str(cluster.manager)},
+            stdout=log,
+            stderr=log,
+        )
         try:
-            missed = asyncio.run(measure(options, manager.pid, namespaces))
+            missed = asyncio.run(measure(options, cluster, manager.pid))
         finally:
             manager.terminate()
             manager.wait()
