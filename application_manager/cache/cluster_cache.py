@@ -179,6 +179,36 @@ class ClusterCache:
             self.places.touch((name[0], each))
         self.turns.note(name, fallback)
 
+    def note_task(self, name: Name) -> set[Name]:
+        """Determine the claim of a task again; returns the instances that it claims and claimed, if that is a change.
+
+        A task of which only the status changed, mostly by our own writes, concerns no instance.
+        """
+        entry, before = self.store.get(TASK, name), self.claims.claim(name)
+        if entry is None:
+            return set()
+        touched = self.claims.note(name, entry, self.template((name[0], entry.raw["spec"].get("template", ""))))
+        after = self.claims.claim(name)
+        if before is None or after is None or before.task.metadata.uid != entry.uid:
+            return touched
+        same = before.task.spec == after.task.spec and replace(before, task=after.task) == after
+        return set() if same else touched
+
+    def touch(self, instances: Iterable[Name]) -> set[Name]:
+        """Note that something about the instances changed; returns those to decide again.
+
+        A name that stands for all instances of a template means each of these.
+        """
+        found = {each for name in instances for each in self.meant(name)}
+        for each in found:
+            self.places.touch(each)
+        return found
+
+    def is_unsettled(self, instance: Name) -> bool:
+        """Whether claims of tasks that were there at the beginning, and may demand the instance, are not known yet."""
+        known = self.instance(instance)
+        return known is not None and self.claims.unsettled((instance[0], known.spec.template))
+
     def note_limits(self, template: Name) -> None:
         """Note how many instances a template may have now, and what it falls back to, should it be there."""
         found = self.template(template)

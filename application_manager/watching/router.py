@@ -72,7 +72,7 @@ class Router:
         if old is not None and old.uid != entry.uid:
             self.applier.forget(old.raw)
         if kind == TASK:
-            self._task(name, entry)
+            self.claimed(name)
         elif kind == TEMPLATE:
             self._template(name, old, entry)
         elif kind == INSTANCE:
@@ -100,7 +100,7 @@ class Router:
             self._claim_again(name)
             self._rules(name[0])
         elif kind == INSTANCE:
-            self._look_at_one(name)
+            self.look_at(name)
             self.configuration(name)
             if isinstance(entry.model, ApplicationInstance):
                 self.template((name[0], entry.model.spec.template))
@@ -128,24 +128,9 @@ class Router:
             for name, _ in self.cache.store.all(kind):
                 self.rule((kind, name))
 
-    def _task(self, name: Name, entry: Entry) -> None:
-        of = entry.raw["spec"].get("template", "")
-        before = self.cache.claims.claim(name)
-        touched = self.cache.claims.note(name, entry, self.cache.template((name[0], of)))
-        after = self.cache.claims.claim(name)
-        # A task whose status alone changed, which is mostly our own doing, concerns no instance.
-        same = before is not None and after is not None and before.task.spec == after.task.spec
-        if not same or before is None or before.task.metadata.uid != entry.uid:
-            self._enqueue_all(touched)
-        self.task(name)
-
     def claimed(self, name: Name) -> None:
-        """The claim of a task is known now."""
-        entry = self.cache.store.get(TASK, name)
-        if entry is None:
-            return
-        of = (name[0], entry.raw["spec"].get("template", ""))
-        self._enqueue_all(self.cache.claims.note(name, entry, self.cache.template(of)))
+        """The claim of a task may be another one now."""
+        self._enqueue_all(self.cache.note_task(name))
         self.task(name)
 
     def settled(self, template: Name) -> None:
@@ -174,7 +159,7 @@ class Router:
         self._enqueue_all(touched)
 
     def _instance(self, name: Name, old: Entry | None, entry: Entry) -> None:
-        self._look_at_one(name)
+        self.look_at(name)
         if (old is None or old.uid != entry.uid) and isinstance(entry.model, ApplicationInstance):
             self.template((name[0], entry.model.spec.template))
 
@@ -231,16 +216,11 @@ class Router:
 
     def look_at(self, name: Name) -> None:
         """Enqueue an instance, or all of a template where the name stands for these."""
-        for each in self.cache.meant(name):
-            self._look_at_one(each)
-
-    def _look_at_one(self, instance: Name) -> None:
-        self.cache.places.touch(instance)
-        self.instance(instance)
+        self._enqueue_all([name])
 
     def _enqueue_all(self, instances: Iterable[Name]) -> None:
-        for name in instances:
-            self.look_at(name)
+        for name in self.cache.touch(instances):
+            self.instance(name)
 
 
 def _instance_of(raw: Object) -> Name | None:

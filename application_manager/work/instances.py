@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from application_manager.cache.cluster_cache import ClusterCache, Record
@@ -20,6 +20,7 @@ from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.health.refusals import reason_of, with_remedy
+from application_manager.core.objects import trimming
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.ownership import Applied, Known, ObjectKey, references
 from application_manager.core.objects.policy import Name
@@ -29,10 +30,45 @@ from application_manager.work.attempts import Attempts
 from application_manager.work.recorder import Reason, Recorder
 from application_manager.work.suspending import Suspending
 from wayside.api import ApplicationInstance
+from wayside.api.documents import parse_object
 
 log = logging.getLogger(__name__)
 
 _LOOK_AGAIN = 1.0  # s until an object that is on its way out is looked for again, should its watch event not come
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """What the work on one instance starts from. It is read from the cache in one go, so it belongs together.
+
+    Attributes:
+        existing: the instance; None where it is to be made.
+        record: how the last work went, if it was this process's.
+    """
+
+    name: Name
+    decision: Decision
+    existing: ApplicationInstance | None
+    template: drafting.TemplateState
+    record: Record | None
+
+    def record_of(self, instance: ApplicationInstance) -> Record | None:
+        """The record, unless it is of a namesake."""
+        return self.record if self.record is not None and self.record.uid == instance.metadata.uid else None
+
+    def known(self, instance: ApplicationInstance) -> Known:
+        """What was applied so far: the record where there is one, since it is newer than the status."""
+        if (record := self.record_of(instance)) is not None:
+            return Known.read(record.digest, record.applied.objects)
+        status = instance.status
+        return Known.read(status.spec_hash, status.objects) if status else Known()
+
+    def was_applied(self, instance: ApplicationInstance) -> Aspect | None:
+        """The condition Applied, where it is True."""
+        if (record := self.record_of(instance)) is not None:
+            return record.applied.aspect if record.applied.aspect.holds else None
+        kept = find(instance.status.conditions, "Applied") if instance.status else None
+        return Aspect("Applied", True, kept.reason, kept.message) if kept and kept.status == "True" else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +121,10 @@ class InstanceWork:
             raise
 
     async def _reconcile(self, name: Name) -> None:
-        if self._is_unsettled(name):
-            return  # what runs stays: who demands it is being worked out, and that brings us back
-        await self._know_whether_it_was_made(name)
+        if self.cache.is_unsettled(name):
+            return  # what runs stays: the claims of its tasks are being worked out, and that enqueues it again
+        if name in self.cache.places.being_made:
+            await self._look_whether_it_was_made(name)
         decision = self._decide(name)
         if self._is_over(name, decision):
             # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
@@ -106,78 +143,91 @@ class InstanceWork:
             return
         if instance is not None and instance.metadata.deletion_timestamp is not None:
             self.not_made(name, decision, f"instance {name[1]} is being removed, and is made again once it is gone")
-            return  # its deletion brings us back
-        await self._make(name, decision, instance)
+            return  # its deletion enqueues it again
+        template = self.cache.template((name[0], decision.template))
+        await self._make(_Start(name, decision, instance, template, self.cache.records.get(name)))
 
-    async def _make(self, name: Name, decision: Decision, existing: ApplicationInstance | None) -> None:
+    async def _make(self, start: _Start) -> None:
+        name, decision, existing = start.name, start.decision, start.existing
         if decision.paused and existing is not None:
-            self._leave(name, decision, existing)
+            self._leave(start, existing)
             return
         if decision.too_large and existing is None:
             self.not_made(name, decision, f"instance {name[1]} is not made: {decision.too_large}")
             return
         wanted = drafting.draft(name, decision, existing)
-        template = self.cache.template((name[0], wanted.spec.template))
-        rendering = self.objects(wanted, template)
+        rendering = self.objects(wanted, start.template)
         if rendering is None:
             return
-        manifest = drafting.manifest(wanted, existing, template)
-        looked: dict[ObjectKey, Object | None] = {}
-        if manifest is not None:
-            # Both at once: what to look for is known before the instance has a uid.
-            to_look = rendering.manifests if existing is None and isinstance(rendering, Rendering) else ()
-            if existing is None:
-                self.cache.places.being_made.add(name)  # it takes its place from here on
-            try:
-                raw, looked = await asyncio.gather(
-                    self.client.apply(self.instances, manifest), self.applier.look(name[0], to_look)
-                )
-            except ApiError as error:
-                if existing is None and error.permanent and not error.terminating:
-                    why = with_remedy(reason_of(error.code, error.message), error.message)
-                    self.not_made(name, decision, f"instance {name[1]} cannot be made: {why}")
-                raise
-            self.observe(raw)
+        manifest = drafting.manifest(wanted, existing, start.template)
+        if manifest is None:
+            if existing is not None:
+                await self._apply_objects(start, existing, rendering, {})
+            return
+        answer, looked = await self._apply_instance(start, manifest, rendering)
+        try:
+            instance = parse_object(trimming.own(answer))
+            if isinstance(instance, ApplicationInstance) and instance.metadata.deletion_timestamp is None:
+                await self._apply_objects(start, instance, rendering, looked)
+        finally:  # the cache learns of the instance afterwards, so that nothing comes between it and its objects
+            self.observe(answer)
             self.cache.places.being_made.discard(name)
-        instance = self.cache.instance(name)
-        if instance is None or instance.metadata.deletion_timestamp is not None:
-            return  # deleted by somebody meanwhile: its event brings us back
-        known = self._known(name, instance)
-        if not isinstance(rendering, Rendering):
-            if rendering.reason == drafting.CHART_PENDING and self._was_applied(name, instance) is not None:
-                return  # what runs stays as it is, and nothing is news until the chart is rendered, or has failed
-            self._note(
-                name, instance, decision, Applied(rendering, references(known.objects), complete=False), known.digest
+
+    async def _apply_instance(
+        self, start: _Start, manifest: Object, rendering: Rendering | Aspect
+    ) -> tuple[Object, dict[ObjectKey, Object | None]]:
+        """Apply the instance itself, and look for its objects where it is new; what is to be looked for is known."""
+        to_look = rendering.manifests if start.existing is None and isinstance(rendering, Rendering) else ()
+        if start.existing is None:
+            self.cache.places.being_made.add(start.name)  # it takes its place from here on
+        try:
+            return await asyncio.gather(
+                self.client.apply(self.instances, manifest), self.applier.look(start.name[0], to_look)
             )
+        except ApiError as error:
+            if start.existing is None and error.permanent and not error.terminating:
+                why = with_remedy(reason_of(error.code, error.message), error.message)
+                problem = f"instance {start.name[1]} cannot be made: {why}"
+                self.not_made(start.name, start.decision, problem)
+            raise
+
+    async def _apply_objects(
+        self,
+        start: _Start,
+        instance: ApplicationInstance,
+        rendering: Rendering | Aspect,
+        looked: Mapping[ObjectKey, Object | None],
+    ) -> None:
+        name, known, was_applied = start.name, start.known(instance), start.was_applied(instance)
+        if not isinstance(rendering, Rendering):
+            if rendering.reason == drafting.CHART_PENDING and was_applied is not None:
+                return  # what runs stays as it is, and nothing changes until the chart is rendered, or has failed
+            self._note(start, instance, Applied(rendering, references(known.objects), complete=False), known.digest)
             return
         await self.suspending.settle(instance, rendering)
-        instance = self.cache.instance(name) or instance
-        pending = self.applier.pending(instance, rendering, known)
-        was_applied = self._was_applied(name, instance)
-        if not pending and was_applied is not None:
-            self._note(name, instance, decision, Applied(was_applied, references(known.objects), True), known.digest)
-            return
         trying = (instance.metadata.uid, rendering.digest)
         until = self.attempts.waits_until(name, trying, time.time())
-        if until is not None and (record := self.cache.records.get(name)) is not None:
-            self.again(name, until)
-            self._note(name, instance, decision, record.applied, record.digest)
+        pending = self.applier.pending(instance, rendering, known)
+        if not pending and was_applied is not None:
+            self._note(start, instance, Applied(was_applied, references(known.objects), True), known.digest)
             return
-        if existing is not None:
+        if until is not None and start.record is not None:
+            self.again(name, until)
+            self._note(start, instance, start.record.applied, start.record.digest)
+            return
+        if start.existing is not None:
             looked = await self.applier.look(name[0], pending)
             if rendering.keys() - known.objects.keys():
-                await self._announce(name, instance, known, rendering)
+                await self._announce(instance, known, rendering)
         try:
             applied = await self.applier.apply(instance, rendering, pending, known, looked)
         except ApiError as error:
             if not error.terminating:
-                message = f"the API server failed and is asked again: {error.message}"
-                failed = Applied(
-                    Aspect("Applied", False, "Retrying", message), references(known.objects), complete=False
-                )
-                self._note(name, instance, decision, failed, known.digest)
+                message = f"the API server failed; retrying with backoff: {error.message}"
+                retrying = Aspect("Applied", False, "Retrying", message)
+                self._note(start, instance, Applied(retrying, references(known.objects), complete=False), known.digest)
             raise
-        self._note(name, instance, decision, applied, rendering.digest if applied.complete else known.digest)
+        self._note(start, instance, applied, rendering.digest if applied.complete else known.digest)
         if any(object_key(each) == (*CONFIG_MAP, config_map_name(name[1])) for each in pending):
             self.configured(name)
         if applied.complete:
@@ -187,62 +237,43 @@ class InstanceWork:
         else:
             self.again(name, self.attempts.refused(name, trying, time.time()))
 
-    async def _know_whether_it_was_made(self, name: Name) -> None:
+    async def _look_whether_it_was_made(self, name: Name) -> None:
         """Look for the instance where an attempt to make it failed, and so may have made it or not."""
-        if name in self.cache.places.being_made:
-            raw = await self.client.get(self.instances, name[0], name[1])
-            if raw is not None:
-                self.observe(raw)
-            self.cache.places.being_made.discard(name)
-            self.cache.places.touch(name)
+        raw = await self.client.get(self.instances, name[0], name[1])
+        if raw is not None:
+            self.observe(raw)
+        self.cache.places.being_made.discard(name)
+        self.cache.places.touch(name)
 
-    def _leave(self, name: Name, decision: Decision, instance: ApplicationInstance) -> None:
+    def _leave(self, start: _Start, instance: ApplicationInstance) -> None:
         """Note that the instance stays as it is, by a person's wish."""
-        known = self._known(name, instance)
+        known = start.known(instance)
         message = "as it was when the instance was paused"
         aspect = (
             Aspect("Applied", True, "Applied", message)
-            if self._was_applied(name, instance) is not None
+            if start.was_applied(instance) is not None
             else Aspect("Applied", False, "Paused", "the instance was paused before all objects were applied")
         )
-        applied = Applied(aspect, references(known.objects), complete=False)
-        self._note(name, instance, decision, applied, known.digest)
+        self._note(start, instance, Applied(aspect, references(known.objects), complete=False), known.digest)
 
-    def _known(self, name: Name, instance: ApplicationInstance) -> Known:
-        """What was applied so far: our own record where it is newer than the status."""
-        record = self.cache.records.get(name)
-        if record is not None and record.uid == instance.metadata.uid:
-            return Known.read(record.digest, record.applied.objects)
-        status = instance.status
-        return Known.read(status.spec_hash, status.objects) if status else Known()
-
-    def _was_applied(self, name: Name, instance: ApplicationInstance) -> Aspect | None:
-        """The condition Applied, where it is True."""
-        record = self.cache.records.get(name)
-        if record is not None and record.uid == instance.metadata.uid:
-            return record.applied.aspect if record.applied.aspect.holds else None
-        kept = find(instance.status.conditions, "Applied") if instance.status else None
-        return Aspect("Applied", True, kept.reason, kept.message) if kept and kept.status == "True" else None
-
-    async def _announce(self, name: Name, instance: ApplicationInstance, known: Known, rendering: Rendering) -> None:
+    async def _announce(self, instance: ApplicationInstance, known: Known, rendering: Rendering) -> None:
         """Write down what will belong to the instance, before any of it is applied.
 
-        An instance that was just created does without: whatever bears its label and has it as controller is its own.
+        An instance that was just created does without: whatever has its label, and it as controller, is its own.
         """
         announced = references({**dict.fromkeys(rendering.keys()), **known.objects})
         status = {"objects": [each.to_json() for each in announced]}
-        uid = instance.metadata.uid
-        self.observe(await self.client.patch_status(self.instances, name[0], name[1], uid, status))
+        namespace, name, uid = instance.namespace, instance.name, instance.metadata.uid
+        self.observe(await self.client.patch_status(self.instances, namespace, name, uid, status))
 
-    def _note(
-        self, name: Name, instance: ApplicationInstance, decision: Decision, applied: Applied, digest: str | None
-    ) -> None:
-        if decision.too_large and applied.aspect.holds:  # what it has is applied, and not what is demanded
-            applied = replace(applied, aspect=Aspect("Applied", False, TOO_LARGE, decision.too_large))
-        uid, before = instance.metadata.uid, self.cache.records.get(name)
-        since = before.since if before is not None and before.uid == uid else time.time()
-        self.cache.records[name] = Record(uid, decision, applied, digest, since)
-        self.done(name)
+    def _note(self, start: _Start, instance: ApplicationInstance, applied: Applied, digest: str | None) -> None:
+        too_large = start.decision.too_large
+        if too_large and applied.aspect.holds:  # what it has is applied, and not what is demanded
+            applied = replace(applied, aspect=Aspect("Applied", False, TOO_LARGE, too_large))
+        before = start.record_of(instance)
+        since = before.since if before is not None else time.time()
+        self.cache.records[start.name] = Record(instance.metadata.uid, start.decision, applied, digest, since)
+        self.done(start.name)
 
     def _decide(self, name: Name) -> Decision | None:
         """Decide, and enqueue the instances that the decision concerns too."""
@@ -279,7 +310,3 @@ class InstanceWork:
         self.recorder.say(instance, Reason.PREEMPTED if over.yields else Reason.RELEASED, why, time.time())
         log.info("instance %s/%s: released: %s", *name, why)
         return True
-
-    def _is_unsettled(self, name: Name) -> bool:
-        instance = self.cache.instance(name)
-        return instance is not None and self.cache.claims.unsettled((name[0], instance.spec.template))
