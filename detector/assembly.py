@@ -31,6 +31,7 @@ from wayside.rules import (
     RuleProblem,
     compile_rule,
     dependency_problems,
+    place_problems,
     source_problems,
     stream_problems,
 )
@@ -97,6 +98,7 @@ def inlets(detector: Detector) -> Inlets:
             fields[stream.name] = known
         problems += stream_problems(stream, index, known)
     problems += source_problems(detector)
+    problems += place_problems(detector)
     if problems:
         raise DetectorError(problems)
     patterns = {stream.name: KeyPattern.parse(stream.key) for stream in detector.spec.streams}

@@ -31,6 +31,15 @@ def cartesian(latitude: float, longitude: float) -> tuple[float, float, float]:
     )
 
 
+def degrees(latitude: float) -> tuple[float, float]:
+    """The length of a degree of latitude and of one of longitude at a latitude, in metres."""
+    sine = math.sin(math.radians(latitude))
+    rest = 1 - _ECCENTRICITY_2 * sine * sine
+    meridian = SEMI_MAJOR * (1 - _ECCENTRICITY_2) / (rest * math.sqrt(rest))
+    normal = SEMI_MAJOR / math.sqrt(rest)
+    return math.radians(meridian), math.radians(normal * math.cos(math.radians(latitude)))
+
+
 def distance(latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float) -> float:
     """The way along the surface between two places, in metres; of the heights nothing is known.
 

@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any
 
 from tests.reference.aggregates import NOTHING, aggregated
+from tests.reference.places import Where, with_fields
 from tests.reference.world import SECOND, World
 from wayside.expressions import UNKNOWN, Environment, Expression, Kind
 
@@ -25,8 +26,18 @@ def truth(source: str | None, variables: dict[str, Any], names: Iterable[str]) -
     return value if isinstance(value, bool) else None
 
 
+_WHERE = Where({}, {})
+
+
+def tell_places(places: Iterable[dict[str, Any]], position: dict[str, str]) -> None:
+    """The places that expressions name, and the position of a sample."""
+    _WHERE.places.update({place["name"]: place for place in places})
+    _WHERE.position.update(position)
+
+
 def _evaluated(source: str, variables: dict[str, Any], names: tuple[str, ...]) -> Any:
-    value = _compiled(source, names).evaluate_or_unknown(variables)
+    source, variables, more = with_fields(source, variables, _WHERE)
+    value = _compiled(source, (*names, *more)).evaluate_or_unknown(variables)
     return NOTHING if value is UNKNOWN else value
 
 

@@ -22,6 +22,7 @@ from wayside.api.base import (
 )
 from wayside.api.constants import Constants
 from wayside.api.database import Database
+from wayside.api.place import Place
 from wayside.api.pod import DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
 from wayside.api.selector import LabelSelector
@@ -162,6 +163,12 @@ class DetectorSpec(Model):
         description="Definitions of ROS 2 message types that the common packages lack or define differently.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
+    places: list[Place] = Field(
+        default_factory=list,
+        max_length=512,
+        description='The areas, lines and lanes that rules can name, as in at(position, "crossing").',
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
     buffer: Buffer = Field(default=Buffer(), description="The limits of the buffer of samples.")
     client_timeout: PositiveDuration = Field(
         default=PositiveDuration("30s"),
@@ -202,6 +209,7 @@ class DetectorSpec(Model):
             ("streams", [s.name for s in self.streams]),
             ("sources", [s.name for s in self.sources]),
             ("clients", [c.name for c in self.clients]),
+            ("places", [p.name for p in self.places]),
             ("messages", [m.name for m in self.messages]),
         ):
             twice = sorted({name for name in names if names.count(name) > 1})

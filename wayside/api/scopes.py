@@ -18,12 +18,15 @@ class Position(Model):
     model_config = validations(
         (
             "has(self.x) == has(self.y) && has(self.latitude) == has(self.longitude)"
-            " && has(self.x) != has(self.latitude) && (!has(self.z) || has(self.x))",
+            " && !(has(self.x) && has(self.latitude)) && (!has(self.z) || has(self.x))",
             _POSITION,
         ),
     )
 
-    stream: ObjectName = Field(description="The stream whose newest sample contains the position.")
+    stream: ObjectName = Field(
+        description="The stream whose newest sample contains the position. Without x and y, and without latitude and "
+        "longitude, it is the position that the Detector gives the stream."
+    )
     x: Expression | None = Field(
         default=None, description="CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."
     )
@@ -52,7 +55,7 @@ class Position(Model):
     @model_validator(mode="after")
     def _complete(self) -> Position:
         given = frozenset(axis for axis in ("x", "y", "z", "latitude", "longitude") if getattr(self, axis) is not None)
-        if given not in ({"x", "y"}, {"x", "y", "z"}, {"latitude", "longitude"}):
+        if given and given not in ({"x", "y"}, {"x", "y", "z"}, {"latitude", "longitude"}):
             raise ValueError(_POSITION)
         return self
 

@@ -78,6 +78,62 @@ class StreamBuffer(Model):
     )
 
 
+_POSITION = "give x and y (and z, yaw) in metres and radians, or latitude and longitude (and heading) in degrees"
+
+
+class StreamPosition(Model):
+    """The position of the client that a sample contains."""
+
+    model_config = validations(
+        (
+            "has(self.x) == has(self.y) && has(self.latitude) == has(self.longitude)"
+            " && has(self.x) != has(self.latitude)"
+            " && (has(self.x) || !(has(self.z) || has(self.yaw))) && (has(self.latitude) || !has(self.heading))",
+            _POSITION,
+        ),
+    )
+
+    x: Expression | None = Field(
+        default=None, description="CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."
+    )
+    y: Expression | None = Field(default=None, description="CEL over msg: the position on the second axis in metres.")
+    z: Expression | None = Field(default=None, description="CEL over msg: the position on the third axis in metres.")
+    yaw: Expression | None = Field(
+        default=None,
+        description="CEL over msg: the direction in radians, counter-clockwise from the first axis, e.g. "
+        "yaw(msg.pose.orientation).",
+    )
+    latitude: Expression | None = Field(
+        default=None, description="CEL over msg: the latitude in degrees north (WGS 84), e.g. msg.latitude."
+    )
+    longitude: Expression | None = Field(
+        default=None, description="CEL over msg: the longitude in degrees east (WGS 84), e.g. msg.longitude."
+    )
+    heading: Expression | None = Field(
+        default=None, description="CEL over msg: the direction in degrees, clockwise from north."
+    )
+    speed: Expression | None = Field(default=None, description="CEL over msg: the speed in that direction, m/s.")
+
+    @property
+    def axes(self) -> dict[str, str]:
+        """The expressions by axis."""
+        return {axis: source for axis, source in self if source is not None}
+
+    @property
+    def geographic(self) -> bool:
+        """Whether it is on the Earth, else in metres."""
+        return self.latitude is not None
+
+    @model_validator(mode="after")
+    def _complete(self) -> StreamPosition:
+        given = self.axes.keys() - {"speed"}
+        if not ({"x", "y"} <= given <= {"x", "y", "z", "yaw"}) and not (
+            {"latitude", "longitude"} <= given <= {"latitude", "longitude", "heading"}
+        ):
+            raise ValueError(_POSITION)
+        return self
+
+
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
@@ -179,6 +235,11 @@ class Stream(Model):
         description="CEL over msg: the sender's time in seconds since the epoch, e.g. msg.time_ms / 1000; or "
         "sample.received, the receive time (t of JSON lines). Default: header.stamp if the type has one, the "
         "generation time of an ETSI ITS message, otherwise none.",
+    )
+    position: StreamPosition | None = Field(
+        default=None,
+        description="Where the client is by a sample. Expressions over a sample see it as position, and scopes of "
+        "pairs can refer to it.",
     )
     stale_after: Duration | str | None = Field(
         default=None,

@@ -21,6 +21,7 @@ from cel_expr_python import cel
 
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
+from wayside.expressions.expanding import Places, expanded
 from wayside.expressions.failures import NO_MEMBERS, clean, says_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import settle
@@ -32,6 +33,7 @@ from wayside.expressions.projection import Leaf, missing_path, no_member, normal
 from wayside.expressions.regex import LARGEST_PATTERN, pattern_size
 from wayside.expressions.syntax import Constant, Node, Path, arguments, calls, nothing_but_arguments, parse, paths
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
+from wayside.geometry import Shape
 
 Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int | bool, "Value"]
 """The result of an expression: plain data. An int is always beyond 2^53."""
@@ -89,11 +91,14 @@ _SMALLER: Final = "a loop within a loop multiplies what it joins with `+`: join 
 class Environment:
     """The variables that expressions may use. Immutable; compiled expressions are cached."""
 
-    def __init__(self, variables: Mapping[str, Kind], members: Mapping[str, Kind] | None = None) -> None:
+    def __init__(
+        self, variables: Mapping[str, Kind], members: Mapping[str, Kind] | None = None, places: Places | None = None
+    ) -> None:
         """`members` are those of maps whose kind is known, by their paths, such as `parameters.maxSpeed`.
 
         They serve to find wrong types when compiling, and change nothing in what an expression yields.
         """
+        self._places = places or Places()
         for name in variables:
             if not _NAME.fullmatch(name):
                 raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
@@ -107,7 +112,11 @@ class Environment:
 
     def knowing(self, members: Mapping[str, Kind]) -> Environment:
         """The same, with the kinds of more members known."""
-        return Environment(self.variables, {**self._members, **members}) if members else self
+        return Environment(self.variables, {**self._members, **members}, self._places) if members else self
+
+    def naming(self, places: Places) -> Environment:
+        """The same, with places that expressions can name."""
+        return Environment(self.variables, self._members, places)
 
     def compile(self, source: str, *, result: Kind = Kind.DYN) -> Expression:
         """Compiles `source`; if its type is known only at evaluation, `result` is checked then.
@@ -122,7 +131,8 @@ class Environment:
             return cached
         if not source.strip():
             raise ExpressionError("the expression is empty", source=source, hint=EMPTY)
-        rewritten = doubled(source)
+        whole = expanded(source, self._places)
+        rewritten = doubled(whole.text, whole.origin)
         try:
             program = self._env.compile(rewritten.text)
             parsed = parse(program.serialize())
@@ -137,7 +147,7 @@ class Environment:
                 f"a value in it would hold more than {MOST} copies of others", source=source, hint=_SMALLER
             )
         _check_static(typed.return_type(), result, source)
-        expression = Expression(source, program, read, leaves, result, self.variables)
+        expression = Expression(source, program, read, leaves, result, self.variables, whole.shapes)
         if len(self._cache) >= _CACHE_SIZE:
             self._cache.clear()  # a bound against rules that come and go for months; refilling costs 50 µs each
         self._cache[source, result] = expression
@@ -158,9 +168,12 @@ def _cel_environment(variables: Mapping[str, Kind]) -> cel.Env:
 
 
 class Expression:
-    """A compiled expression. `paths` are the literal paths it reads, `names` and `kinds` those of their variables."""
+    """A compiled expression. `paths` are the literal paths it reads, `names` and `kinds` those of their variables.
 
-    __slots__ = ("_program", "_read", "kinds", "names", "paths", "result", "source")
+    `places` are those that it names.
+    """
+
+    __slots__ = ("_program", "_read", "kinds", "names", "paths", "places", "result", "source")
 
     def __init__(
         self,
@@ -170,8 +183,10 @@ class Expression:
         leaves: Mapping[Path, Leaf],
         result: Kind,
         variables: Mapping[str, Kind],
+        places: tuple[Shape, ...] = (),
     ) -> None:
         self.source = source
+        self.places = places
         self.paths = read
         self.names = frozenset(str(path[0]) for path in read)
         self.kinds: Mapping[str, Kind] = {name: variables[name] for name in self.names}

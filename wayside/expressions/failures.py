@@ -15,6 +15,8 @@ NO_MEMBERS: Final = frozenset({_NO_MEMBERS})
 _ABSENT = ("no value for ", "no key ", "no index ")
 _OVERLOAD: Final = re.compile(r"^\w+: No matching overloads found : (.*)$")
 _CALL: Final = re.compile(r"^([^(]+)\((.*)\)$")
+_OF_A_FIELD: Final = re.compile(r"\b(at|seen)_(\w+)")
+_WRITTEN: Final = {"at": "at", "seen": "seenFrom"}
 _COMPARISONS: Final = frozenset({"<", "<=", ">", ">="})
 _NAMES: Final = {"[]": "[…]", "?:": "? :"}
 _OF_BYTES: Final = "byteCount, checksum, allZero, numberAt or utf8"
@@ -37,6 +39,7 @@ _TYPES: Final = {
 
 def clean(message: str) -> str:
     """The message without CEL's codes, and in the words of the documentation."""
+    message = _OF_A_FIELD.sub(lambda found: f"{_WRITTEN[found[1]]}(…).{found[2]}", message)
     overload = _OVERLOAD.search(message)
     if overload is not None:
         return _no_overload(overload[1])

@@ -17,6 +17,7 @@ left alone.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from wayside.expressions.lexer import Token, TokenKind, tokens
@@ -44,8 +45,11 @@ class Doubled:
     origin: tuple[int, ...]
 
 
-def doubled(source: str) -> Doubled:
-    """Rewrites `source` as described in the module. Never fails: CEL reports syntax errors."""
+def doubled(source: str, stems: Sequence[int] | None = None) -> Doubled:
+    """Rewrites `source` as described in the module. Never fails: CEL reports syntax errors.
+
+    `stems` are the offsets in the author's text of its characters; None: it is that text.
+    """
     scanned = list(tokens(source))
     significant = [token for token in scanned if token.kind not in (TokenKind.SPACE, TokenKind.COMMENT)]
     before, after, replaced = _edits(significant)
@@ -57,7 +61,7 @@ def doubled(source: str) -> Doubled:
         origin += [token.start] * len(text[-3])
         origin += range(token.start, token.end) if own == token.text else [token.start] * len(own)
         origin += [token.end - 1] * len(text[-1])
-    return Doubled("".join(text), tuple(origin))
+    return Doubled("".join(text), tuple(origin) if stems is None else tuple(stems[at] for at in origin))
 
 
 def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int, str]]:

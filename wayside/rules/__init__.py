@@ -21,6 +21,7 @@ from wayside.rules.compiling import compile_rule
 from wayside.rules.dependencies import dependency_problems, depends, in_order
 from wayside.rules.fields import BYTES, Fields
 from wayside.rules.parameters import unknown_rules
+from wayside.rules.places import KnownPlaces, place_problems
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.sources import source_problems
 from wayside.rules.streams import compile_stream, stream_problems
@@ -40,6 +41,7 @@ __all__ = [
     "CompiledWindow",
     "Fields",
     "FleetSubject",
+    "KnownPlaces",
     "PairSubject",
     "RuleError",
     "RuleProblem",
@@ -50,6 +52,7 @@ __all__ = [
     "episode_stream",
     "in_order",
     "own_problems",
+    "place_problems",
     "source_problems",
     "stream_problems",
     "unknown_rules",

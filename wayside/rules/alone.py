@@ -13,13 +13,14 @@ from wayside.api.base import Metadata, PositiveDuration
 from wayside.api.detector import Buffer, DetectorSpec
 from wayside.api.stream import Stream
 from wayside.rules.compiling import compile_rule
+from wayside.rules.places import NO_MORE_IS_KNOWN
 from wayside.rules.problems import RuleError, RuleProblem
 
 
 def own_problems(rule: EventRule) -> tuple[RuleProblem, ...]:
     """Every problem that the rule has with each Detector; none where some Detector could evaluate it."""
     try:
-        compile_rule(rule, _taking_everything())
+        compile_rule(rule, _taking_everything(), places=NO_MORE_IS_KNOWN)
     except RuleError as error:
         # The stream's type and messages depend on the Detector; the ones here are invented.
         return tuple(each for each in error.problems if each.path[-1:] != ("stream",))

@@ -10,6 +10,7 @@ from wayside.api.eventrule import Aggregate
 from wayside.api.model import ModelImage, ModelPoints, ModelSource
 from wayside.api.operation import Operation
 from wayside.expressions import CompiledTemplate, Expression
+from wayside.geometry import Shape
 from wayside.rules.parameters import NO_PARAMETERS, Parameters
 
 
@@ -230,6 +231,8 @@ class CompiledRule:
     parameters: Parameters = NO_PARAMETERS
     models: tuple[CompiledModel, ...] = ()
     """The signals that models compute."""
+    places: tuple[Shape, ...] = ()
+    """The places that its expressions name."""
     on_sample: str | None = None
     """The stream with whose samples it is evaluated."""
     on_demand: bool = False

@@ -25,6 +25,8 @@ from wayside.expressions import (
     Path,
     compile_template,
 )
+from wayside.expressions.expanding import POSITION, Places
+from wayside.geometry import Shape
 from wayside.rules.actions import canonical, compile_actions
 from wayside.rules.compiled import (
     CompiledDeploy,
@@ -39,6 +41,7 @@ from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.models import compile_models
 from wayside.rules.naming import signal_name_problem
 from wayside.rules.parameters import kinds_of, override_problems, parameters_of
+from wayside.rules.places import KnownPlaces, located, of_conditions, of_samples, places_of
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.scopes import (
     closing_speed_problem,
@@ -62,16 +65,18 @@ def compile_rule(
     detector: Detector,
     fields: Mapping[str, Fields] | None = None,
     known: Iterable[RuleProblem] = (),
+    places: KnownPlaces | None = None,
 ) -> CompiledRule:
     """The rule as the engine evaluates it.
 
     `fields` has the message fields of the streams that are known to have no others; what an expression reads beside
-    them is a problem. `known` has problems that were found beside it, among several rules.
+    them is a problem. `known` has problems that were found beside it, among several rules. `places` are those that it
+    can name; None: those that the Detector defines itself.
 
     Raises:
         RuleError: with every problem of the rule.
     """
-    compiler = _RuleCompiler(rule, detector, fields or {})
+    compiler = _RuleCompiler(rule, detector, fields or {}, places or KnownPlaces(places_of(detector)))
     compiler.problems += known
     compiled = compiler.compile()
     if compiler.problems or compiled is None:
@@ -82,14 +87,18 @@ def compile_rule(
 class _RuleCompiler:
     """Goes through a rule once and collects the problems on the way."""
 
-    def __init__(self, rule: EventRule, detector: Detector, fields: Mapping[str, Fields]) -> None:
-        self.rule = rule
-        self.spec = rule.spec
+    def __init__(self, rule: EventRule, detector: Detector, fields: Mapping[str, Fields], places: KnownPlaces) -> None:
+        self._written = rule
+        self.rule = located(rule, detector)
+        self.spec = self.rule.spec
         self.detector = detector
+        self._places = places
+        self._of_conditions = of_conditions(self.rule, places)
+        self._used: dict[str, Shape] = {}
         self.fields = fields
         self.parameters = parameters_of(rule, detector)
         self._kinds = kinds_of(rule)
-        self._knowing: dict[Environment, Environment] = {}
+        self._knowing: dict[tuple[Environment, str | None], Environment] = {}
         self.problems = [
             RuleProblem(path, message, detector.name) for path, message in override_problems(rule, detector)
         ]
@@ -135,7 +144,8 @@ class _RuleCompiler:
             deploys=tuple(deploy for deploy in deploys if deploy is not None),
             actions=tuple(actions),
             classification=None if spec.classification is None else spec.classification.to_json(),
-            digest=_digest(self.rule, self.detector),
+            digest=_digest(self._written, self.rule, self.detector, self._used),
+            places=tuple(self._used.values()),
             elements=elements,
             parameters=self.parameters,
             models=models,
@@ -217,6 +227,7 @@ class _RuleCompiler:
                 self.problem((*path, _parameter_of(each)), str(each))
             return None
         for embedded in compiled.embedded:
+            self._use(embedded.expression)
             self._members((*path, _parameter_of(embedded)), embedded.expression.paths)
         return compiled
 
@@ -241,7 +252,7 @@ class _RuleCompiler:
         self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind, element: str | None = None
     ) -> Expression | None:
         """An expression over one sample, and the element's variable; None where there is none, or it is wrong."""
-        expression = self._expression(path, source, sample_environment(element), kind)
+        expression = self._expression(path, source, sample_environment(element), kind, of_samples(stream, self._places))
         if expression is None:
             return None
         if element is not None:
@@ -257,22 +268,28 @@ class _RuleCompiler:
         return expression
 
     def _expression(
-        self, path: FieldPath, source: str | None, environment: Environment, kind: Kind
+        self, path: FieldPath, source: str | None, environment: Environment, kind: Kind, places: Places | None = None
     ) -> Expression | None:
         if source is None:
             return None
         try:
-            return self._typed(environment).compile(source, result=kind)
+            expression = self._typed(environment, places).compile(source, result=kind)
         except ExpressionError as error:
             for each in (error, *error.others):
                 self.problem(path, str(each))
             return None
+        self._use(expression)
+        return expression
 
-    def _typed(self, environment: Environment) -> Environment:
-        """The environment, knowing of which kinds the rule's parameters are."""
-        if environment not in self._knowing:
-            self._knowing[environment] = environment.knowing(self._kinds)
-        return self._knowing[environment]
+    def _use(self, expression: Expression) -> None:
+        self._used.update({shape.name: shape for shape in expression.places})
+
+    def _typed(self, environment: Environment, places: Places | None = None) -> Environment:
+        """The environment, knowing of which kinds the rule's parameters are, and the places; None: of conditions."""
+        key = environment, None if places is None else places.stream
+        if key not in self._knowing:
+            self._knowing[key] = environment.knowing(self._kinds).naming(places or self._of_conditions)
+        return self._knowing[key]
 
     def kept_ns(self, stream: Stream) -> int:
         """How long the Detector keeps the stream's samples, in nanoseconds."""
@@ -297,8 +314,9 @@ class _RuleCompiler:
         return replace(subject, closing_speed=True)
 
     def problem(self, path: FieldPath, message: str) -> None:
-        """Report a problem with a field."""
-        self.problems.append(RuleProblem(path, message))
+        """Report a problem with a field, once: a position that is written once is read by axes."""
+        if (problem := RuleProblem(path, message)) not in self.problems:
+            self.problems.append(problem)
 
 
 def _parameter_of(located: InterpolationError | Embedded) -> str:
@@ -306,7 +324,24 @@ def _parameter_of(located: InterpolationError | Embedded) -> str:
     return re.split(r"[.\[]", located.path, maxsplit=1)[0]
 
 
-def _digest(rule: EventRule, detector: Detector) -> str:
-    """Of what decides which episodes there are, the Detector's values for the parameters among it."""
+def _digest(written: EventRule, rule: EventRule, detector: Detector, places: Mapping[str, Shape]) -> str:
+    """Of what decides which episodes there are, the Detector's values for the parameters and its places among it.
+
+    `rule` has written out what the Detector knows of positions.
+    """
     clients = {client.name: values for client in detector.spec.clients if (values := client.parameters.get(rule.name))}
-    return hashlib.sha256(canonical([rule.semantics(), clients]).encode()).hexdigest()[:16]
+    decisive: list[JsonValue] = [rule.semantics(), clients]
+    if places or rule is not written:
+        decisive.append(sorted(shape.key for shape in places.values()))
+    decisive += [
+        {stream.name: dict(stream.position.axes)}
+        for stream in detector.spec.streams
+        if stream.position is not None and any(POSITION in each for each in _of_stream(written, stream.name))
+    ]
+    return hashlib.sha256(canonical(decisive).encode()).hexdigest()[:16]
+
+
+def _of_stream(rule: EventRule, stream: str) -> list[str]:
+    """The expressions of the rule's signals over the stream."""
+    signals = (signal for signal in rule.spec.signals if signal.stream == stream)
+    return [each for signal in signals for each in (signal.value, signal.where) if each is not None]

@@ -85,7 +85,13 @@ def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> Pai
     position = pairs.position
     stream = compiler.stream((*at, "position", "stream"), position.stream)
     axes: dict[str, Expression] = {}
-    complete = True
+    complete = position.x is not None or position.latitude is not None
+    if not complete and stream is not None:
+        compiler.problem(
+            (*at, "position", "stream"),
+            f"stream {stream.name} has no position: give x and y, or latitude and longitude, or give position in the "
+            "stream of the Detector",
+        )
     for axis in ("x", "y", "z", "latitude", "longitude"):
         source = getattr(position, axis)
         if source is not None:
@@ -159,9 +165,10 @@ def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:
     if spec.scope.pairs is not None:
         signals = (signal.name for signal in spec.signals if signal.plugin is None)
         member: dict[str, Any] = dict.fromkeys((*MEMBER_OF_CLIENT, *signals))
-        geographic = spec.scope.pairs.position.latitude is not None
+        position = spec.scope.pairs.position
+        axes = ("latitude", "longitude") if position.latitude is not None else ("x", "y", "z")
         member["parameters"] = dict.fromkeys(spec.parameters)
-        member["position"] = dict.fromkeys(("latitude", "longitude") if geographic else ("x", "y", "z"))
+        member["position"] = dict.fromkeys(axes) if position.x or position.latitude else None
         yield "a", member
         yield "b", member
     if spec.each is not None:

@@ -11,7 +11,7 @@ from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.compiled import CompiledStream
 from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.problems import RuleError, RuleProblem
-from wayside.rules.variables import naming_environment, stamp_environment
+from wayside.rules.variables import naming_environment, sample_environment, stamp_environment
 
 
 def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> CompiledStream:
@@ -36,6 +36,8 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
         yield RuleProblem(("spec", "streams", index, "key"), str(error))
     if stream.names_by_message:
         yield from _naming_problems(stream, ("spec", "streams", index, "client"), fields)
+    for axis, source in {} if stream.position is None else stream.position.axes.items():
+        yield from _sample_problems(("spec", "streams", index, "position", axis), source, fields)
     if stream.stamp is None:
         return
     path: FieldPath = ("spec", "streams", index, "stamp")
@@ -48,6 +50,19 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
     for variable, members in (("sample", {"received": None}), ("msg", fields)):
         if members is not None:
             yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, variable, members))
+
+
+def _sample_problems(path: FieldPath, source: str, fields: Fields | None) -> Iterable[RuleProblem]:
+    """The problems of an expression for a number of a sample."""
+    try:
+        expression = sample_environment().compile(source, result=Kind.DOUBLE)
+    except ExpressionError as error:
+        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        return
+    if "parameters" in expression.names:
+        yield RuleProblem(path, "parameters belong to a rule, and a stream has none: write the number itself")
+    if fields is not None:
+        yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, "msg", fields))
 
 
 def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:

@@ -19,6 +19,7 @@ from wayside.rules import (
     compile_rule,
     dependency_problems,
     own_problems,
+    place_problems,
     source_problems,
     stream_problems,
 )
@@ -76,7 +77,7 @@ def detector_findings(detector: Detector) -> Findings:
     problems = [
         str(problem) for index, stream in enumerate(detector.spec.streams) for problem in stream_problems(stream, index)
     ]
-    return Findings((*problems, *map(str, source_problems(detector))))
+    return Findings((*problems, *map(str, source_problems(detector)), *map(str, place_problems(detector))))
 
 
 def newly_wrong(rule: EventRule, new: Detector, old: Detector | None) -> tuple[Finding, ...]:

@@ -102,6 +102,33 @@ _message = st.builds(
     _places,
 )
 
+POSITION = {"x": "msg.x", "y": "msg.y", "yaw": "msg.v", "speed": "msg.v"}
+"""Of stream pose, as the Detector has it."""
+
+PLACES: tuple[dict[str, Any], ...] = (
+    {"name": "yard", "area": [[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]]},
+    {"name": "lane", "line": [[-1, 1], [3, 1], [3, 60]], "width": 2},
+    {"name": "stop", "line": [[3, 0], [3, 5]]},
+)
+
+AT_A_SAMPLE = (
+    'at(position, "yard").inside',
+    'at(position, "yard").distance',
+    'at(position, "lane").inside',
+    'at(position, "lane").along',
+    'at(position, "stop").across',
+    'at(position, "lane").heading',
+    "position.x + position.speed",
+)
+
+AT_A_PAIR = (
+    'at(a.position, "yard").inside && at(b.position, "lane").distance < 3',
+    'at(b.position, "stop").along > 2 || !at(a.position, "lane").inside',
+    "seenFrom(a, b).ahead > 0.5 || seenFrom(b, a).left >= 2",
+    "seenFrom(a, b).speedAhead < 0 || seenFrom(b, a).speedLeft > 0.5",
+    "seenFrom(a, b).heading < 30",
+)
+
 _WINDOWED = (
     "Min", "Max", "Mean", "Sum", "Count", "Rate", "Delta", "StdDev", "Quantile", "Slope", "All", "Any", "Distinct"
 )  # fmt: skip
@@ -125,7 +152,8 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
         signal["quantile"] = draw(st.sampled_from((0.0, 0.25, 0.5, 1.0)))
     if aggregate not in ("Count", "Age"):
         field = "msg.values.s" if of_rule else "msg.v"
-        signal["value"] = draw(st.sampled_from((field, field, f"{field} > 1", "sample.received > 0")))
+        of_places = AT_A_SAMPLE if signal.get("stream") == "pose" else ()
+        signal["value"] = draw(st.sampled_from((field, field, f"{field} > 1", "sample.received > 0", *of_places)))
     if aggregate in _WINDOWED or draw(st.integers(0, 3)) == 0:
         signal["over"] = draw(st.sampled_from(("500ms", "1s", "2s", "3s", "5s")))
     if draw(st.integers(0, 3)) == 0:
@@ -167,7 +195,7 @@ _scopes = st.sampled_from(
         None,
         None,
         {"client": {"where": '"speed" in streams'}},
-        {"pairs": {"position": _POSITION, "within": 5}},
+        {"pairs": {"position": {"stream": "pose"}, "within": 5}},
         {"pairs": {"position": {**_POSITION, "maxAge": "500ms"}, "within": 10}},
         {"pairs": {"position": {**_POSITION, "maxAge": "2s"}, "within": 10}},
         {"pairs": {"position": {**_POSITION, "maxAge": "10s"}, "within": 10}},
@@ -208,6 +236,8 @@ def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
     if scope is not None and "pairs" in scope:
         names = [f"{role}.{name}" for name in names for role in "ab"] + ["distance", "closingSpeed"]
     conditions = _conditions(names)
+    if scope is not None and scope.get("pairs", {}).get("position", {}).get("stream") == "pose":
+        conditions = st.one_of(conditions, conditions, st.sampled_from(AT_A_PAIR))
     if scope is not None and "fleet" in scope:
         conditions = st.sampled_from(_OF_A_FLEET)
     if draw(st.integers(0, 4)) == 0:

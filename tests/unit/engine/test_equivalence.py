@@ -20,8 +20,10 @@ from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival, DecodeError
 from tests.driving import START, a_detector, a_rule, a_stream, compiled
 from tests.reference.detector import Reference, Told
+from tests.reference.places import located
+from tests.reference.signals import tell_places
 from tests.reference.world import SECOND, Sample, World
-from tests.unit.engine.random_drives import BROKEN, HALF, Message, Scene, scenes
+from tests.unit.engine.random_drives import BROKEN, HALF, PLACES, POSITION, Message, Scene, scenes
 from wayside.rules import dependency_problems
 
 TIMEOUT, KEPT = 4 * SECOND, 6 * SECOND
@@ -60,12 +62,15 @@ def by_the_engine(scene: Scene, cut: int) -> list[Event]:
     caps = {"speed": {"count": scene.count}, "pose": {"bytes": scene.pose_bytes}}
     streams = [
         a_stream(
-            name, staleAfter="Never" if stale is None else f"{stale // SECOND}s", buffer=_given(caps.get(name, {}))
+            name,
+            staleAfter="Never" if stale is None else f"{stale // SECOND}s",
+            buffer=_given(caps.get(name, {})),
+            **({"position": POSITION} if name == "pose" else {}),
         )
         for name, stale in STREAMS.items()
     ]
     buffer = _given({"duration": "6s", "bytes": scene.all_bytes})
-    detector = a_detector(*streams, clientTimeout="4s", buffer=buffer, **clock)
+    detector = a_detector(*streams, clientTimeout="4s", buffer=buffer, places=[*PLACES], **clock)
     entries = inlets(detector)
     decoders = dict.fromkeys(STREAMS, Plain())
     engine = Engine(detector, holder="h", decoders=decoders, read_key=entries.read_key, start=START)
@@ -106,10 +111,12 @@ def payload_of(time: int, message: Message) -> bytes:
 
 
 def by_the_reference(scene: Scene) -> list[Told]:
+    tell_places(PLACES, POSITION)
     counts, sizes = _given({"speed": scene.count}), _given({"pose": scene.pose_bytes})
     world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes)
     lateness = scene.lateness * HALF if scene.data else None
-    reference = Reference(scene.rules, world, lateness=lateness, start=START, keep_starts=KEPT)
+    rules = {name: located(spec, {"pose": POSITION}) for name, spec in scene.rules.items()}
+    reference = Reference(rules, world, lateness=lateness, start=START, keep_starts=KEPT)
     gap = scene.gap
     for number, (time, each) in enumerate(ordered(scene)):
         if gap is not None and time > START + gap[0] * HALF:

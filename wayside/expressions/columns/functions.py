@@ -13,9 +13,13 @@ from typing import Final
 import numpy as np
 
 from wayside.expressions.columns.values import Bools, Doubles
-from wayside.expressions.functions import FUNCTIONS
+from wayside.expressions.functions import FUNCTIONS, OF_FIELDS
 from wayside.expressions.functions.declaring import Takes, Yields
+from wayside.expressions.functions.whereabouts import OF_PLACES, allowed
+from wayside.geometry import Shape
 
+Called = tuple[str, int] | tuple[str, int, Shape]
+"""A function, how many numbers it takes, and perhaps the place that it is about."""
 Answer = tuple[Doubles, Bools | None]
 """The results, and where there is one; None: everywhere."""
 Vectorised = Callable[..., Answer]
@@ -81,7 +85,7 @@ VECTORISED: Final[dict[tuple[str, int], Vectorised]] = {
 
 def _scalar_functions() -> dict[tuple[str, int], Callable[..., float]]:
     found: dict[tuple[str, int], Callable[..., float]] = {}
-    for function in FUNCTIONS.values():
+    for function in (*FUNCTIONS.values(), *OF_FIELDS.values()):
         for signature in function.signatures:
             alone = sum(len(each.parameters) == len(signature.parameters) for each in function.signatures) == 1
             numbers = all(parameter.takes is Takes.NUMBER for parameter in signature.parameters)
@@ -99,12 +103,19 @@ def takes_columns(name: str, count: int) -> bool:
     return (name, count) in SCALAR
 
 
-def calculate(name: str, given: Sequence[Doubles], wanted: Bools) -> Answer:
+def about_place(name: str) -> bool:
+    """Whether the last argument of the function is the key of a place."""
+    return name in OF_PLACES
+
+
+def calculate(called: Called, given: Sequence[Doubles], wanted: Bools) -> Answer:
     """The function's results where they are wanted, and where there is one.
 
     The arrays given broadcast to the shape of `wanted`.
     """
-    key = name, len(given)
+    key = called[0], len(given)
+    if len(called) == 3:
+        return _placed(called[0], called[2], given, wanted)
     if key in VECTORISED:
         return VECTORISED[key](*given)
     results = np.zeros(wanted.shape)
@@ -119,6 +130,15 @@ def calculate(name: str, given: Sequence[Doubles], wanted: Bools) -> Answer:
         return results, None
     known = np.zeros(wanted.shape, bool)
     known[wanted] = answered
+    return results, known
+
+
+def _placed(name: str, shape: Shape, given: Sequence[Doubles], wanted: Bools) -> Answer:
+    """A function of positions with regard to a place."""
+    whole = [np.broadcast_to(each, wanted.shape) for each in given]
+    known = wanted & allowed(shape, whole[0], whole[1], *whole[2:])
+    results = np.zeros(wanted.shape)
+    results[known] = OF_PLACES[name][0](shape, *(each[known] for each in whole))
     return results, known
 
 

@@ -7,12 +7,13 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import Final, NamedTuple
 
 from wayside.expressions.cel import Expression, Kind
-from wayside.expressions.columns.functions import takes_columns
+from wayside.expressions.columns.functions import about_place, takes_columns
 from wayside.expressions.columns.nodes import Holds, Nodes, Op
 from wayside.expressions.columns.values import Tag
 from wayside.expressions.projection import integer
 from wayside.expressions.syntax import Call, Collection, Node, Path, Select, path_of
 from wayside.expressions.syntax import Constant as Literal
+from wayside.geometry import shape_of
 
 _ARITHMETIC: Final = {"_+_": Op.ADD, "_-_": Op.SUBTRACT, "_*_": Op.MULTIPLY, "_/_": Op.DIVIDE}
 _ORDER: Final = {"_<_": (Op.LESS, False), "_<=_": (Op.LESS_EQUAL, False)} | {
@@ -112,6 +113,13 @@ class _Lowering:
                 return self._in(a, elements)
             case Call("_?_:_", None, (condition, a, b)):
                 return self._choose(condition, a, b)
+            case Call(name, None, (*given, Literal(str() as key))) if about_place(name):
+                return self._graph.node(
+                    Op.CALL,
+                    Holds.NUMBERS,
+                    tuple(self._number(each) for each in given),
+                    (name, len(given), shape_of(key)),
+                )
             case Call(name, None, given) if takes_columns(name, len(given)):
                 return self._graph.node(
                     Op.CALL, Holds.NUMBERS, tuple(self._number(each) for each in given), (name, len(given))

@@ -64,7 +64,7 @@ class Node:
     holds: Holds
     operands: tuple[int, ...]
     detail: Hashable = None
-    """A leaf's name, a constant's value, the tag that is expected, a function's name and count of arguments."""
+    """A leaf's name, a constant's value, the tag that is expected, a function's name, count of arguments and place."""
     depth: int = 0
 
 

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from wayside.expressions.columns.frame import ABSENT, BOOLEAN, NUMBER, ONE, THREE, Frame, Operand, Source
-from wayside.expressions.columns.functions import calculate
+from wayside.expressions.columns.functions import Called, calculate
 from wayside.expressions.columns.nodes import Op
 from wayside.expressions.columns.values import Bools, Bytes, Doubles, Tag
 
@@ -29,7 +29,7 @@ class Step:
     out: slice
     partial: bool
     into: Source
-    function: str = ""
+    function: Called = ("", 0)
 
     def __call__(self, frame: Frame) -> None:
         """Runs it."""

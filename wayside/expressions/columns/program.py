@@ -13,6 +13,7 @@ import numpy as np
 
 from wayside.expressions.columns.foreign import Foreign, Found
 from wayside.expressions.columns.frame import ABSENT, NUMBER, Frame, Memory, Operand, Rows, Sizes, Source
+from wayside.expressions.columns.functions import Called
 from wayside.expressions.columns.nodes import GIVEN, Holds, Node, Nodes, Op
 from wayside.expressions.columns.operations import UNKNOWN_OF_NUMBERS, Step
 from wayside.expressions.columns.values import Bools, Bytes, Column, Doubles, Tag, Texts
@@ -145,7 +146,7 @@ class Program:
         first = counts[into]
         counts[into] += len(numbers)
         self._places |= {number: (into, first + row) for row, number in enumerate(numbers)}
-        function = str(node.detail[0]) if node.op is Op.CALL and isinstance(node.detail, tuple) else ""
+        function: Called = node.detail if node.op is Op.CALL and isinstance(node.detail, tuple) else ("", 0)
         return Step(node.op, operands, slice(first, counts[into]), self._partial[numbers[0]], into, function)
 
     def _operand(self, numbers: Sequence[int]) -> Operand:

@@ -10,7 +10,17 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from wayside.expressions.functions import angles, bounded, comparing, digits, motion, numbers, octets, places
+from wayside.expressions.functions import (
+    angles,
+    bounded,
+    comparing,
+    digits,
+    motion,
+    numbers,
+    octets,
+    places,
+    whereabouts,
+)
 from wayside.expressions.functions.declaring import Function
 
 FUNCTIONS: Final[Mapping[str, Function]] = MappingProxyType(
@@ -22,10 +32,13 @@ FUNCTIONS: Final[Mapping[str, Function]] = MappingProxyType(
 )
 """By name."""
 
+OF_FIELDS: Final[Mapping[str, Function]] = MappingProxyType({each.name: each for each in whereabouts.FUNCTIONS})
+"""Not for authors: the functions that fields of `at` and `seenFrom` become (see `expanding`)."""
+
 DECLARATIONS: Final = [
     digits.DECLARATION,
     bounded.DECLARATION,
-    *(function.declaration() for function in FUNCTIONS.values()),
+    *(function.declaration() for function in (*FUNCTIONS.values(), *OF_FIELDS.values())),
 ]
 """As CEL takes them."""
 

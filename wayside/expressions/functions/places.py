@@ -7,14 +7,11 @@ for edges up to a few kilometres is the straight way on the ground to within cen
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from fractions import Fraction
 
 from wayside import geodesy
 from wayside.expressions.functions.declaring import Yields, function
 from wayside.expressions.functions.members import pair, place, sequence
-
-Point = tuple[float, float]
+from wayside.geometry import Point, contains
 
 
 def wgs84_distance(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:
@@ -38,7 +35,7 @@ def wgs84_bearing(latitude1: float, longitude1: float, latitude2: float, longitu
 
 def inside(x: float, y: float, polygon: object) -> bool:
     """Whether (x, y) lies in the polygon, a list of corners [x, y] or {x, y}; on its edges and corners counts."""
-    return _contains(_corners(polygon, ("x", "y")), (x, y))
+    return contains([_corners(polygon, ("x", "y"))], (x, y))
 
 
 def inside_wgs84(latitude: float, longitude: float, polygon: object) -> bool:
@@ -54,14 +51,14 @@ def inside_wgs84(latitude: float, longitude: float, polygon: object) -> bool:
         unrolled.append((here, there - 360.0 * round(step / 360.0)))
     west, east = min(point[1] for point in unrolled), max(point[1] for point in unrolled)
     turns = range(math.ceil((west - longitude) / 360.0), math.floor((east - longitude) / 360.0) + 1)
-    return any(_contains(unrolled, (latitude, longitude + 360.0 * turn)) for turn in turns)
+    return any(contains([unrolled], (latitude, longitude + 360.0 * turn)) for turn in turns)
 
 
 def count_inside(items: object, polygon: object, path: str = "") -> float:
     """How many objects of a list lie in the polygon."""
     corners = _corners(polygon, ("x", "y"))
     places = [place(item, f"items[{i}]", path) for i, item in enumerate(sequence(items, "items"))]
-    return float(sum(_contains(corners, (x, y)) for x, y, _ in places))
+    return float(sum(contains([corners], (x, y)) for x, y, _ in places))
 
 
 def _corners(polygon: object, names: tuple[str, str]) -> list[Point]:
@@ -71,34 +68,6 @@ def _corners(polygon: object, names: tuple[str, str]) -> list[Point]:
     if not all(map(math.isfinite, (number for corner in corners for number in corner))):
         raise ValueError("a corner of the polygon is infinite")
     return corners
-
-
-def _contains(corners: Sequence[Point], point: Point) -> bool:
-    """Even-odd: a ray to the right crosses the edges an odd number of times. Exact, so that edges belong to it."""
-    x, y = point
-    odd = False
-    ax, ay = corners[-1]
-    for bx, by in corners:
-        if min(ay, by) <= y <= max(ay, by) and x <= max(ax, bx):
-            side = _side(ax, ay, bx, by, x, y)
-            if side == 0 and min(ax, bx) <= x:
-                return True
-            if (ay > y) != (by > y) and (side > 0) == (by > ay):
-                odd = not odd
-        ax, ay = bx, by
-    return odd
-
-
-def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
-    """Above 0 where (x, y) lies left of the way from a to b, 0 on its line; exact by fractions in doubt."""
-    left, right = (bx - ax) * (y - ay), (by - ay) * (x - ax)
-    value = left - right
-    if abs(value) > 4e-16 * (abs(left) + abs(right)) and math.isfinite(value):
-        return value
-    exact = (Fraction(bx) - Fraction(ax)) * (Fraction(y) - Fraction(ay)) - (Fraction(by) - Fraction(ay)) * (
-        Fraction(x) - Fraction(ax)
-    )
-    return (exact > 0) - (exact < 0)
 
 
 def _check(latitude: float, longitude: float) -> None:

@@ -1,0 +1,66 @@
+"""Places: named areas, lines and lanes that rules refer to."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from wayside.api.base import ClientName, Model, validations
+
+_SHAPE = "give area, line, or both"
+_WIDTH = "width is for a line without area: remove it, or give a line alone"
+
+Corner = Annotated[
+    list[float], Field(min_length=2, max_length=2, json_schema_extra={"x-kubernetes-list-type": "atomic"})
+]
+"""x and y, or latitude and longitude."""
+
+
+class Frame(StrEnum):
+    """What the coordinates of places are."""
+
+    METRES = "Metres"
+    WGS84 = "Wgs84"
+
+
+class Place(Model):
+    """A named area, line or lane."""
+
+    model_config = validations(
+        ("has(self.area) || has(self.line)", _SHAPE),
+        ("!has(self.width) || (has(self.line) && !has(self.area))", _WIDTH),
+    )
+
+    name: ClientName = Field(description='The name of the place in expressions, as in at(position, "crossing").')
+    frame: Frame = Field(
+        default=Frame.METRES,
+        description="Metres: the points are x and y in the frame of the positions. Wgs84: they are latitude and "
+        "longitude in degrees.",
+    )
+    area: list[Corner] | None = Field(
+        default=None,
+        min_length=3,
+        max_length=1000,
+        description="The corners of an area. It is closed automatically, and its edges must not cross.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    line: list[Corner] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=1000,
+        description="The points of a line, in its direction. With an area: the middle of the lane that the area is.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    width: float | None = Field(
+        default=None, gt=0, le=1000, description="The width in metres of a lane, of which line is the middle."
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Place:
+        if self.area is None and self.line is None:
+            raise ValueError(_SHAPE)
+        if self.width is not None and (self.line is None or self.area is not None):
+            raise ValueError(_WIDTH)
+        return self

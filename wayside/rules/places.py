@@ -1,0 +1,136 @@
+"""The places of a Detector and the positions of its streams: what rules get of them, and what is wrong with them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from wayside.api import Detector, EventRule
+from wayside.api.documents import FieldPath
+from wayside.api.eventrule import EventRuleSpec, Signal
+from wayside.api.place import Frame, Place
+from wayside.api.stream import Stream
+from wayside.expressions.expanding import SEEN_FROM, Places
+from wayside.geometry import FARTHEST, Point, Shape, crossing, interned
+from wayside.rules.problems import RuleProblem
+
+_MOTION: Final = {False: ("yaw", "speed"), True: ("heading", "speed")}
+"""The signals that `seenFrom` reads of both clients."""
+
+
+class KnownPlaces(NamedTuple):
+    """The places that rules can name."""
+
+    shapes: Mapping[str, Shape]
+    complete: bool = True
+    """Whether there are no others; else any name is accepted."""
+
+
+NO_MORE_IS_KNOWN: Final = KnownPlaces({}, complete=False)
+
+
+def place_problems(detector: Detector) -> Iterator[RuleProblem]:
+    """What is wrong with the places that the Detector defines itself."""
+    for index, place in enumerate(detector.spec.places):
+        for field, text in shape_problems(place.frame is Frame.WGS84, place.area, place.line):
+            yield RuleProblem(("spec", "places", index, *field), text)
+
+
+def shape_problems(
+    geographic: bool, area: Sequence[Sequence[float]] | None, line: Sequence[Sequence[float]] | None
+) -> Iterator[tuple[FieldPath, str]]:
+    """What is wrong with an area and a line: the field and the message."""
+    found = False
+    for field, points in (("area", area), ("line", line)):
+        for index, (u, v) in enumerate(map(_point, points or ())):
+            if (problem := _out_of_range(geographic, u, v)) is not None:
+                found = True
+                yield (field, index), problem
+    if found:
+        return
+    if area is not None and (crossed := crossing([*map(_point, area)])) is not None:
+        one, other = crossed
+        count = len(area)
+        yield (
+            ("area",),
+            (
+                f"the edge from corner {one} to {(one + 1) % count} crosses or touches that from {other} to "
+                f"{(other + 1) % count}: order the corners along the outline, each once"
+            ),
+        )
+    if line is not None and all(_point(each) == _point(line[0]) for each in line):
+        yield ("line",), "all points of the line are the same: give two or more different points"
+
+
+def _out_of_range(geographic: bool, u: float, v: float) -> str | None:
+    if not geographic:
+        if math.isfinite(u) and math.isfinite(v) and max(abs(u), abs(v)) <= FARTHEST:
+            return None
+        return f"[{u:g}, {v:g}] is no position in metres: give finite numbers"
+    if abs(u) <= 90 and abs(v) <= 360:
+        return None
+    return f"[{u:g}, {v:g}] is no [latitude, longitude] in degrees: correct the order, or set frame: Metres"
+
+
+def places_of(detector: Detector) -> Mapping[str, Shape]:
+    """The places that the Detector defines itself, by name; those that are wrong are left out."""
+    wrong = {problem.path[2] for problem in place_problems(detector)}
+    return {place.name: shape_of_place(place) for at, place in enumerate(detector.spec.places) if at not in wrong}
+
+
+def shape_of_place(place: Place) -> Shape:
+    """The geometry of a place without problems."""
+    rings = () if place.area is None else (tuple(map(_point, place.area)),)
+    line = tuple(map(_point, place.line or ()))
+    return interned(Shape(place.name, place.frame is Frame.WGS84, rings, line, place.width))
+
+
+def _point(corner: Sequence[float]) -> Point:
+    u, v = corner
+    return float(u), float(v)
+
+
+def located(rule: EventRule, detector: Detector) -> EventRule:
+    """The rule with what its Detector knows of positions written out.
+
+    A position of pairs without axes gets those of its stream, and a rule about pairs that uses `seenFrom` the signals
+    that it reads: yaw (heading on the Earth) and speed, unless it has signals of these names.
+    """
+    pairs = rule.spec.scope.pairs
+    stream = None if pairs is None else detector.spec.stream(pairs.position.stream)
+    if pairs is None or stream is None or stream.position is None:
+        return rule
+    position, own = pairs.position, stream.position
+    if position.x is None and position.latitude is None:
+        names = ("latitude", "longitude") if own.geographic else ("x", "y", "z")
+        axes = {axis: source for axis, source in own.axes.items() if axis in names}
+        pairs = pairs.model_copy(update={"position": position.model_copy(update=axes)})
+    signals = list(rule.spec.signals)
+    if SEEN_FROM in _conditions(rule.spec):
+        named = {signal.name for signal in signals}
+        for axis in _MOTION[pairs.position.latitude is not None]:
+            if axis in own.axes and axis not in named:
+                signals.append(Signal(name=axis, stream=stream.name, value=own.axes[axis]))
+    scope = rule.spec.scope.model_copy(update={"pairs": pairs})
+    return rule.model_copy(update={"spec": rule.spec.model_copy(update={"scope": scope, "signals": signals})})
+
+
+def _conditions(spec: EventRuleSpec) -> str:
+    """All expressions about pairs in one text."""
+    where = None if spec.scope.pairs is None else spec.scope.pairs.where
+    return f"{where} {spec.when} {spec.until} {[action.to_json() for action in spec.actions]}"
+
+
+def of_conditions(rule: EventRule, known: KnownPlaces) -> Places:
+    """What the rule's conditions can name."""
+    pairs = rule.spec.scope.pairs
+    return Places(known.shapes, known.complete, None if pairs is None else pairs.position.latitude is not None)
+
+
+def of_samples(stream: Stream | None, known: KnownPlaces) -> Places:
+    """What an expression over a sample of the stream can name; of the start of an episode, there is no stream."""
+    if stream is None:
+        return Places(known.shapes, known.complete)
+    axes = {} if stream.position is None else stream.position.axes
+    return Places(known.shapes, known.complete, None, axes, stream.name)
