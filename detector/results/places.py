@@ -1,4 +1,4 @@
-"""The places that rules name: polygons among their parameters."""
+"""The places that rules name: those of the Detector, and polygons among their parameters."""
 
 from __future__ import annotations
 
@@ -9,19 +9,29 @@ from wayside.rules import CompiledRule
 
 
 class Polygon(NamedTuple):
-    """An area."""
+    """An area or a line."""
 
     rule: str
     name: str
-    """The parameter's, or the element's and the field's."""
+    """The place's, the parameter's, or the element's and the field's."""
     corners: tuple[tuple[float, float], ...]
     """x and y in metres, or latitude and longitude in degrees."""
     geographic: bool
+    closed: bool = True
+    """Whether it is an area, else a line."""
 
 
 def polygons_of(rules: Iterable[CompiledRule]) -> Iterator[Polygon]:
-    """The areas among the parameters and the elements of rules."""
+    """The places that rules name, each once, and the areas among their parameters and elements."""
+    named_already: set[str] = set()
     for rule in rules:
+        for place in rule.places:
+            if place.key not in named_already:
+                named_already.add(place.key)
+                for ring in place.rings:
+                    yield Polygon(rule.name, place.name, ring, place.geographic)
+                if place.line:
+                    yield Polygon(rule.name, place.name, place.line, place.geographic, closed=False)
         named: dict[str, Any] = dict(rule.parameters.own)
         for element in rule.elements:
             for variable in element.variables.values():

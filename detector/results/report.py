@@ -108,7 +108,7 @@ def data_of(result: Result) -> dict[str, Any]:
         "ways": _ways(result, table),
         "geographic": trace.geographic,
         "polygons": [
-            {"rule": each.rule, "name": each.name, "corners": each.corners}
+            {"rule": each.rule, "name": each.name, "corners": each.corners, "closed": each.closed}
             for each in polygons_of(result.rules.values())
             if each.geographic == trace.geographic
         ],

@@ -164,7 +164,7 @@ def _polygons(result: Result, time: int, origin: Doubles) -> Iterator[SceneEntit
             continue
         flat = _metres(corners, origin, geographic=polygon.geographic)
         line = LinePrimitive(
-            type=LinePrimitiveLineType.LineLoop,
+            type=LinePrimitiveLineType.LineLoop if polygon.closed else LinePrimitiveLineType.LineStrip,
             pose=_pose(0.0, 0.0),
             thickness=2.0,
             scale_invariant=True,
@@ -173,7 +173,11 @@ def _polygons(result: Result, time: int, origin: Doubles) -> Iterator[SceneEntit
         )
         text = _label(polygon.name, (float(flat[0].mean()), float(flat[1].mean())), 0.5, _PLACE)
         yield SceneEntity(
-            timestamp=_stamp(time), frame_id=FRAME, id=f"{polygon.rule} {polygon.name}", lines=[line], texts=[text]
+            timestamp=_stamp(time),
+            frame_id=FRAME,
+            id=f"{polygon.rule} {polygon.name}{'' if polygon.closed else ' line'}",
+            lines=[line],
+            texts=[text],
         )
 
 

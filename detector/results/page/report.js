@@ -252,7 +252,9 @@
       y_axis_label: data.geographic ? "latitude, degrees" : "y, m" });
     for (const each of data.polygons) {
       const corners = each.corners.map(([one, other]) => (data.geographic ? [other, one] : [one, other]));
-      made.patch(corners.map(([x]) => x), corners.map(([, y]) => y), { fill_color: colour("place"), fill_alpha: 0.12, line_color: colour("place") });
+      const [xs, ys] = [corners.map(([x]) => x), corners.map(([, y]) => y)];
+      if (each.closed) made.patch(xs, ys, { fill_color: colour("place"), fill_alpha: 0.12, line_color: colour("place") });
+      else made.line(xs, ys, { line_color: colour("place"), line_width: 2 });
     }
     const own = new Set(chosen ? chosen.clients : []);
     const lines = (ways, options) => made.multi_line({ field: "xs" }, { field: "ys" }, { ...options, source: new Bokeh.ColumnDataSource({

@@ -21,7 +21,15 @@ metadata: {name: desk}
 spec:
   mode: Standalone
   streams:
-    - {name: odom, key: 'vehicles/${client:*}/odom', encoding: json, staleAfter: 1s}
+    - name: odom
+      key: vehicles/${client:*}/odom
+      encoding: json
+      staleAfter: 1s
+      position: {x: msg.x, y: msg.y}
+  places:
+    - {name: yard, area: [[0, 0], [40, 0], [40, 40]]}
+    - {name: gate, line: [[40, 0], [40, 40]]}
+    - {name: elsewhere, line: [[900, 0], [900, 40]]}
 """
 
 RULES = """
@@ -60,7 +68,7 @@ spec:
   scope:
     pairs: {position: {stream: odom, x: msg.x, y: msg.y}, within: 120}
   signals: [{name: speed, stream: odom, value: msg.speed}]
-  when: distance < 50 && a.speed > 0
+  when: distance < 50 && a.speed > 0 && (at(a.position, "yard").distance >= 0 || at(b.position, "gate").across > 0)
   until: distance > 70
 ---
 apiVersion: wayside.dev/v1alpha1

@@ -220,7 +220,11 @@ def test_the_report_has_the_rules_the_data_and_what_actions_would_have_done(resu
     assert len(data["deeds"]) == started
     assert data["deeds"][0][3:5] == ["deploy", f'speed-watch: vehicle="{data["deeds"][0][2]}"']
     assert [each["template"] for each in data["demands"]] == ["speed-watch"]
-    assert [each["name"] for each in data["polygons"]] == ["area"]
+    assert [(each["name"], each["closed"]) for each in data["polygons"]] == [
+        ("yard", True),
+        ("gate", False),
+        ("area", True),
+    ]
     assert [each["client"] for each in data["ways"]] == ["car0", "car1", "car2"]
 
 
