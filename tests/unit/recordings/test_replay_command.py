@@ -82,8 +82,8 @@ def test_an_error_of_a_fleet_condition_names_the_signals_that_it_reads(desk: Des
 @pytest.mark.parametrize(
     ("field", "text", "said"),
     [
-        ("key", "veh/${client:*}/odom/", "detector.yaml:30:10: spec.streams[0].key: "),
-        ("stamp", "msg.", "detector.yaml:32:12: spec.streams[0].stamp: line 1, "),
+        ("key", "veh/${client:*}/odom/", ":10: spec.streams[0].key: "),
+        ("stamp", "msg.", ":12: spec.streams[0].stamp: line 1, "),
         ("stamp", "t", "; write sample.received for the t of JSON lines"),
     ],
 )
@@ -95,7 +95,10 @@ def test_what_is_wrong_with_a_stream_has_file_line_and_column_in_replay_as_in_ch
     detector["spec"]["streams"] = [stream]
     desk.write(detector, a_rule("fast", **FAST))
     desk.drive("drive.jsonl", (0.5, {"v": 20}))
+    lines = (desk.folder / "detector.yaml").read_text().splitlines()
+    (place,) = (number for number, line in enumerate(lines, 1) if line.lstrip(" -").startswith(f"{field}: {text}"))
     checked = desk.run("check", "detector.yaml").said.removesuffix(" [invalid-detector]\n")
+    assert f"detector.yaml:{place}:" in checked
     assert said in checked
     assert checked in desk.replay("drive.jsonl").said
 
