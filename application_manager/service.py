@@ -126,6 +126,7 @@ class Manager:
             measures=measures,
             pool=work.pool,
             namespaces=options.namespaces,
+            defaults=options.detectors,
         )
         self._injecting = Injecting(
             cache=work.cache,

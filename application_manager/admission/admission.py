@@ -21,6 +21,8 @@ from application_manager.cluster.client import ApiError, Client, Object, Resourc
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
+from application_manager.core.objects.detectors import deployment_to_try
+from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures
 from application_manager.workers.jobs import DetectorJob, RuleJob, Surroundings, TemplateJob
@@ -29,6 +31,7 @@ from application_manager.workers.process import Job
 from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
+from wayside.api.pod import DetectorMode
 from wayside.findings import Finding
 from wayside.rules import depends
 
@@ -38,6 +41,9 @@ AT_ONCE = 8
 LOOKING_UP = 3.0  # s for what is asked of the API server, which waits for us meanwhile
 LOOKING_AT_RULES = 1.0  # s for the rules of a Detector that changes
 _RULES_AT_ONCE = 20  # of these in one job, so that the limit of CPU time is each some rules'
+
+_DEPLOYMENTS = Resource("apps/v1", "Deployment", "deployments")
+_FORBIDDEN = 403
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +57,7 @@ class Admission:
         observe: takes an object that was read.
         pool: where objects are judged.
         namespaces: those that the manager looks after; empty: all.
+        defaults: what holds for all detectors; None where the manager runs none.
     """
 
     cache: ClusterCache
@@ -60,6 +67,7 @@ class Admission:
     measures: Measures
     pool: Runs
     namespaces: Collection[str] = ()
+    defaults: PodDefaults | None = None
     _asked: Counter[str] = field(default_factory=Counter)
 
     async def review(self, asked: Any) -> Object:
@@ -142,6 +150,8 @@ class Admission:
         """What is wrong with the detector; that rules of it no longer compile is a remark, since they may follow."""
         before = old if isinstance(old, Detector) else None
         findings = await self._run(detector.namespace, DetectorJob(detector))
+        if not findings.problems and (problem := await self._pod_problem(detector, before)):
+            return replace(findings, problems=(problem,))
         remarks: list[Finding] = []
         until = time.monotonic() + LOOKING_AT_RULES
         rules = self.cache.models(EVENT_RULE, EventRule, detector.namespace)
@@ -153,6 +163,23 @@ class Admission:
                 remarks.append(Finding(BROKEN_RULE.name, unseen))
                 break
         return replace(findings, remarks=tuple(remarks))
+
+    async def _pod_problem(self, detector: Detector, before: Detector | None) -> str:
+        """Why the API server would refuse the detector's Deployment; empty where it would not, or cannot be asked."""
+        spec, old = detector.spec, before.spec if before is not None else None
+        unchanged = old is not None and (old.mode, old.pod) == (spec.mode, spec.pod)
+        if self.defaults is None or spec.mode is not DetectorMode.STANDALONE or spec.pod is None or unchanged:
+            return ""
+        problem = ""
+        try:
+            async with asyncio.timeout(LOOKING_UP):
+                await self.client.apply(_DEPLOYMENTS, deployment_to_try(detector, self.defaults), dry_run=True)
+        except ApiError as error:
+            if error.permanent and error.code != _FORBIDDEN:
+                problem = f"spec.pod: {error.message}"
+        except (Unreachable, TimeoutError) as error:
+            log.warning("the pod of Detector %s/%s is not checked: %s", detector.namespace, detector.name, error)
+        return problem
 
 
 def _parsed(raw: Object | None) -> Kind | None:

@@ -228,11 +228,12 @@ class Client:
                 break
         return found, version
 
-    async def apply(self, resource: Resource, manifest: Object) -> Object:
-        """Server-side apply, as the one field manager that we are."""
+    async def apply(self, resource: Resource, manifest: Object, *, dry_run: bool = False) -> Object:
+        """Server-side apply, as the one field manager that we are; with `dry_run`, nothing is stored."""
         metadata = manifest["metadata"]
         path = resource.path(metadata["namespace"], metadata["name"])
-        return await self._request("PATCH", path, {**_STRICTLY, "force": "true"}, manifest, _APPLY)
+        query = {**_STRICTLY, "force": "true", **({"dryRun": "All"} if dry_run else {})}
+        return await self._request("PATCH", path, query, manifest, _APPLY)
 
     async def patch_status(self, resource: Resource, namespace: str, name: str, uid: str, status: Object) -> Object:
         """Merge into the status of the object with this uid; null removes a field."""

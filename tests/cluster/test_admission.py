@@ -218,6 +218,27 @@ def test_a_rule_may_follow_its_detector_at_once(api: Api, webhook: Webhook) -> N
             api.create(rule(f"rule-{number}", signals=signals))
 
 
+def test_a_detectors_pod_is_tried_by_a_dry_run(api: Api, processes: Processes, tmp_path: Path) -> None:
+    webhook = Webhook(processes, api, tmp_path / "certificates", options=("--detector-image", "wayside:1"))
+    made = detector()
+    made["spec"] |= {"mode": "Standalone"}
+
+    def placed(operator: str) -> Object:
+        terms = [{"matchExpressions": [{"key": "site", "operator": operator}]}]
+        return {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": terms}}}
+
+    with webhook.asked():
+        for pod, parts in (
+            ({"affinity": placed("Near")}, r"spec\.pod: .*nodeAffinity.*operator: Invalid value: \"?Near"),
+            ({"securityContext": {"fsGroop": 7}}, r"spec\.pod: .*fsGroop"),
+        ):
+            with pytest.raises(ApiError, match=parts):
+                api.create({**made, "spec": made["spec"] | {"pod": pod}})
+        api.create({**made, "spec": made["spec"] | {"pod": {"affinity": placed("Exists")}}})
+        api.wait_for("Deployment", "detector-intersection-a", lambda _: True, what="the detector's Deployment is made")
+    assert [each["metadata"]["name"] for each in api.list("Deployment")] == ["detector-intersection-a"]
+
+
 def test_a_manager_that_is_away_or_hangs_prevents_nothing(api: Api, processes: Processes, tmp_path: Path) -> None:
     webhook = Webhook(processes, api, tmp_path / "certificates", patience=TIMEOUT)
     api.create(template())

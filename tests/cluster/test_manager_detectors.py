@@ -208,8 +208,9 @@ def test_the_pod_passes_the_restricted_standard(
     control_plane.api().patch("Namespace", namespace, {"metadata": {"labels": labels}})
     start_manager(processes, namespace, *RUNS)
     paths = {"state": {"path": "/state"}, "recordings": {"path": "/data/recordings"}}
-    volumes = [{"path": "/data", "claim": "town"}]
-    pod = {"volumes": volumes, "secrets": ["pager"]}
+    volumes = [{"name": "data", "persistentVolumeClaim": {"claimName": "town"}}]
+    mounts = [{"name": "data", "mountPath": "/data"}]
+    pod = {"volumes": volumes, "volumeMounts": mounts, "secrets": ["pager"]}
     api.create(detector(mode="Standalone", pod=pod, **paths))
     api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
 

@@ -23,7 +23,7 @@ from wayside.api.base import (
 from wayside.api.constants import Constants
 from wayside.api.database import Database
 from wayside.api.place import Place
-from wayside.api.pod import DetectorMode, DetectorPod
+from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
 from wayside.api.selector import LabelSelector
 from wayside.api.source import DataSource
@@ -90,8 +90,10 @@ class State(Model):
 _POD_WITHOUT_MODE = "pod has no effect without mode: set mode to Standalone or Sidecar, or remove pod"
 _ACCOUNTS_WITHOUT_SIDECAR = "serviceAccountNames has no effect without mode Sidecar: set mode: Sidecar, or remove it"
 _SIDECAR_ON_NODES = (
-    "pod.nodeSelector and pod.tolerations have no effect with mode Sidecar, which uses an existing pod: remove them"
+    f"{', '.join(f'pod.{field}' for field in OF_ITS_OWN_POD)} have no effect with mode Sidecar, which uses an existing "
+    "pod: remove them"
 )
+_ITS_OWN_POD = " || ".join(f"has(self.pod.{field})" for field in OF_ITS_OWN_POD)
 
 
 class DetectorSpec(Model):
@@ -106,8 +108,7 @@ class DetectorSpec(Model):
             "Forbidden",
         ),
         (
-            "!has(self.mode) || self.mode != 'Sidecar' || !has(self.pod) || "
-            "!(has(self.pod.nodeSelector) || has(self.pod.tolerations))",
+            f"!has(self.mode) || self.mode != 'Sidecar' || !has(self.pod) || !({_ITS_OWN_POD})",
             _SIDECAR_ON_NODES,
             ".pod",
             "Forbidden",
@@ -235,12 +236,9 @@ class DetectorSpec(Model):
             if self.pod is not None:
                 raise ValueError(_POD_WITHOUT_MODE)
             return self
-        if (
-            self.mode is DetectorMode.SIDECAR
-            and self.pod is not None
-            and (self.pod.node_selector or self.pod.tolerations)
-        ):
-            raise ValueError(_SIDECAR_ON_NODES)
+        if self.mode is DetectorMode.SIDECAR and self.pod is not None and (given := self.pod.on_its_own):
+            fields = " and ".join(f"pod.{field}" for field in given)
+            raise ValueError(f"{fields} cannot be used with mode Sidecar, which uses an existing pod: remove them")
         for field, path in self.folders.items():
             if not path.startswith("/") or path.strip("/") == "" or ":" in path or ".." in path.split("/"):
                 raise ValueError(

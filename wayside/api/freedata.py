@@ -50,6 +50,11 @@ def bounded(data: dict[str, Any]) -> dict[str, Any]:
     """The map, if it is within the bounds. Raises ValueError, which names the value and the remedy."""
     for name, value in data.items():
         _check_depth(name, value, MAXIMUM_DEPTH)
+    return of_bounded_size(data)
+
+
+def of_bounded_size(data: dict[str, Any]) -> dict[str, Any]:
+    """The map, if it is not too large. Raises ValueError as `bounded` does."""
     total = size(data)
     if total > MAXIMUM_BYTES:
         name = max(data, key=lambda each: size({each: data[each]}))

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
+from pydantic.alias_generators import to_snake
 
 from wayside.api.base import Identifier, Model, ObjectName, PositiveQuantity, Quantity, validations
+from wayside.api.freedata import of_bounded_size
 
-_ONE = "give claim or size, not both"
-_ONE_SOURCE = "give exactly one of value and fromSecret"
+_SOURCES = ("persistentVolumeClaim", "ephemeral", "emptyDir", "configMap", "secret", "projected", "csi")
+_ONE_VOLUME = f"give exactly one of {', '.join(_SOURCES[:-1])} and {_SOURCES[-1]}"
+_OWN_VOLUMES = "^(scratch|folder-[0-9]+|secret-[0-9]+)$"
+_OWN_VOLUME = "scratch, folder-<n> and secret-<n> are names of the detector's own volumes: choose another name"
+_ONE_SOURCE = "give exactly one of value and valueFrom"
+_ONE_REFERENCE = "give exactly one of secretKeyRef, configMapKeyRef, fieldRef and resourceFieldRef"
 _ANY_KEY = "without key, operator must be Exists; with operator Exists, remove value"
 
 RESERVED_VARIABLES = frozenset({"POD_NAME", "POD_NAMESPACE", "POD_UID"})
@@ -25,6 +32,13 @@ class DetectorMode(StrEnum):
     SIDECAR = "Sidecar"
 
 
+Embedded = Annotated[
+    dict[str, Any],
+    Field(json_schema_extra={"type": "object", "x-kubernetes-preserve-unknown-fields": True, "maxProperties": 64}),
+    AfterValidator(of_bounded_size),
+]
+"""A part of a PodSpec that the API server checks with the pod."""
+
 MountPath = Annotated[str, Field(min_length=2, max_length=1024, pattern=r"^/[^:]+$")]
 """An absolute path in the pod."""
 
@@ -36,27 +50,52 @@ Amounts = Annotated[
 
 
 class DetectorVolume(Model):
-    """A volume and its mount path."""
+    """A volume, as in a PodSpec, of one of the sources that the restricted Pod Security Standard allows."""
 
-    model_config = validations(("!(has(self.claim) && has(self.size))", _ONE, ".size", "Forbidden"))
-
-    path: MountPath = Field(description="The mount path, e.g. /var/lib/wayside.")
-    claim: ObjectName | None = Field(
-        default=None,
-        description="The name of a PersistentVolumeClaim in the namespace. Without it, the volume is removed with the "
-        "pod.",
+    model_config = validations(
+        (f"[{', '.join(f'has(self.{source})' for source in _SOURCES)}].filter(given, given).size() == 1", _ONE_VOLUME),
+        (f"!self.name.matches('{_OWN_VOLUMES}')", _OWN_VOLUME, ".name", "Forbidden"),
     )
-    size: PositiveQuantity | None = Field(
-        default=None,
-        description="Without a claim: the maximum size of the volume. A pod that writes more is evicted. Default: no "
-        "limit.",
+
+    name: ObjectName = Field(description="The name of the volume.")
+    persistent_volume_claim: Embedded | None = Field(
+        default=None, description="A PersistentVolumeClaim in the namespace: claimName, readOnly."
+    )
+    ephemeral: Embedded | None = Field(
+        default=None, description="A claim that is created and deleted with the pod: volumeClaimTemplate."
+    )
+    empty_dir: Embedded | None = Field(
+        default=None, description="A folder that is removed with the pod: sizeLimit, medium."
+    )
+    config_map: Embedded | None = Field(
+        default=None, description="Files from a ConfigMap: name, items, defaultMode, optional."
+    )
+    secret: Embedded | None = Field(
+        default=None, description="Files from a Secret: secretName, items, defaultMode, optional."
+    )
+    projected: Embedded | None = Field(default=None, description="Files from several sources: sources, defaultMode.")
+    csi: Embedded | None = Field(
+        default=None, description="A volume of a CSI driver: driver, volumeAttributes, readOnly."
     )
 
     @model_validator(mode="after")
-    def _one(self) -> DetectorVolume:
-        if self.claim is not None and self.size is not None:
-            raise ValueError(_ONE)
+    def _one_source(self) -> DetectorVolume:
+        if sum(getattr(self, to_snake(source)) is not None for source in _SOURCES) != 1:
+            raise ValueError(_ONE_VOLUME)
+        if re.match(_OWN_VOLUMES, self.name):
+            raise ValueError(_OWN_VOLUME)
         return self
+
+
+class DetectorVolumeMount(Model):
+    """The mount of a volume, as in a PodSpec."""
+
+    name: ObjectName = Field(description="The name of the volume.")
+    mount_path: MountPath = Field(description="The path in the container, e.g. /var/lib/wayside.")
+    sub_path: Annotated[str, Field(min_length=1, max_length=1024)] | None = Field(
+        default=None, description="A path within the volume. Default: its root."
+    )
+    read_only: bool = Field(default=False, description="If true, the container cannot write to it.")
 
 
 class DetectorResources(Model):
@@ -94,37 +133,90 @@ class DetectorResources(Model):
 _RESOURCES = ("cpu", "memory", "ephemeral-storage")
 
 
-class SecretKey(Model):
-    """A key of a Secret."""
+class KeySelector(Model):
+    """A key of a Secret or ConfigMap, as in a PodSpec."""
 
-    name: ObjectName = Field(description="The name of the Secret, in the namespace of the Detector.")
+    name: ObjectName = Field(description="The name of the object, in the namespace of the Detector.")
     key: Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._A-Za-z0-9]+$")] = Field(
-        description="The key in the Secret."
+        description="The key in the object."
+    )
+    optional: bool | None = Field(
+        default=None, description="If true, the detector starts without the object or the key. Default: false."
     )
 
 
-class DetectorVariable(Model):
-    """An environment variable."""
+class FieldSelector(Model):
+    """A field of the pod, as in a PodSpec."""
+
+    field_path: Annotated[str, Field(min_length=1, max_length=317)] = Field(
+        description="The path of the field, e.g. spec.nodeName."
+    )
+
+
+class ResourceSelector(Model):
+    """A resource of the detector's container, as in a PodSpec."""
+
+    resource: Annotated[str, Field(min_length=1, max_length=317)] = Field(
+        description="The resource, e.g. limits.memory."
+    )
+    divisor: PositiveQuantity | None = Field(default=None, description="The unit of the value. Default: 1.")
+
+
+class VariableSource(Model):
+    """The source of a variable's value, as in a PodSpec."""
 
     model_config = validations(
-        ("has(self.value) != has(self.fromSecret)", _ONE_SOURCE),
-        (f"!(self.name in {sorted(RESERVED_VARIABLES)})".replace("'", '"'), _RESERVED, ".name", "Forbidden"),
+        (
+            "[has(self.secretKeyRef), has(self.configMapKeyRef), has(self.fieldRef), has(self.resourceFieldRef)]"
+            ".filter(given, given).size() == 1",
+            _ONE_REFERENCE,
+        )
+    )
+
+    secret_key_ref: KeySelector | None = Field(default=None, description="A key of a Secret.")
+    config_map_key_ref: KeySelector | None = Field(default=None, description="A key of a ConfigMap.")
+    field_ref: FieldSelector | None = Field(default=None, description="A field of the pod.")
+    resource_field_ref: ResourceSelector | None = Field(
+        default=None, description="A request or limit of the detector's container."
+    )
+
+    @model_validator(mode="after")
+    def _one_reference(self) -> VariableSource:
+        if [self.secret_key_ref, self.config_map_key_ref, self.field_ref, self.resource_field_ref].count(None) != 3:
+            raise ValueError(_ONE_REFERENCE)
+        return self
+
+
+class DetectorVariable(Model):
+    """An environment variable, as in a PodSpec."""
+
+    model_config = validations(
+        ("has(self.value) != has(self.valueFrom)", _ONE_SOURCE),
+        (
+            f"!(self.name in {sorted(RESERVED_VARIABLES)})".replace("'", '"'),
+            _RESERVED,
+            ".name",
+            "Forbidden",
+        ),
     )
 
     name: Identifier = Field(description="The name of the variable, e.g. OTEL_RESOURCE_ATTRIBUTES.")
     value: Annotated[str, Field(max_length=4096)] | None = Field(default=None, description="The literal value.")
-    from_secret: SecretKey | None = Field(
-        default=None,
-        description="The Secret key that contains the value. The detector does not start without that Secret.",
-    )
+    value_from: VariableSource | None = Field(default=None, description="The source of the value.")
 
     @model_validator(mode="after")
     def _consistent(self) -> DetectorVariable:
-        if (self.value is None) == (self.from_secret is None):
+        if (self.value is None) == (self.value_from is None):
             raise ValueError(_ONE_SOURCE)
         if self.name in RESERVED_VARIABLES:
             raise ValueError(_RESERVED)
         return self
+
+
+class ObjectNameReference(Model):
+    """A reference to an object of the same namespace."""
+
+    name: ObjectName = Field(description="The name of the object.")
 
 
 class TolerationOperator(StrEnum):
@@ -195,11 +287,33 @@ class DetectorPod(Model):
         max_length=16,
         description="The labels that a node must have. Not with mode Sidecar.",
     )
+    affinity: Embedded | None = Field(
+        default=None,
+        description="The affinity to nodes and other pods, as in a PodSpec. Not with mode Sidecar.",
+    )
     tolerations: list[DetectorToleration] = Field(
         default_factory=list,
         max_length=16,
         description="The node taints that the pod tolerates. Not with mode Sidecar.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
+    )
+    priority_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = Field(
+        default=None, description="The PriorityClass of the pod. Not with mode Sidecar."
+    )
+    runtime_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = Field(
+        default=None, description="The RuntimeClass of the pod. Not with mode Sidecar."
+    )
+    image_pull_secrets: list[ObjectNameReference] = Field(
+        default_factory=list,
+        max_length=16,
+        description="The Secrets to pull the image with, in addition to those of the manager's option "
+        "--detector-pull-secret.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    security_context: Embedded | None = Field(
+        default=None,
+        description="Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They take precedence over "
+        "the defaults, with which the pod meets the restricted Pod Security Standard. Not with mode Sidecar.",
     )
     env: list[DetectorVariable] = Field(
         default_factory=list,
@@ -211,9 +325,15 @@ class DetectorPod(Model):
     volumes: list[DetectorVolume] = Field(
         default_factory=list,
         max_length=16,
-        description="Volumes for the folders of the state, the recordings, the database spool and the database files. "
-        "A folder that is on none of these volumes gets one that is removed with the pod.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["path"]},
+        description="Volumes for volumeMounts.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    volume_mounts: list[DetectorVolumeMount] = Field(
+        default_factory=list,
+        max_length=16,
+        description="The mounts of the volumes, for the folders of the state, the recordings, the database spool and "
+        "the database files. A folder that is on none of them gets a volume that is removed with the pod.",
+        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["mountPath"]},
     )
     secrets: list[ObjectName] = Field(
         default_factory=list,
@@ -226,10 +346,33 @@ class DetectorPod(Model):
 
     @model_validator(mode="after")
     def _unique(self) -> DetectorPod:
-        paths = [each.path for each in self.volumes]
+        volumes = [each.name for each in self.volumes]
+        paths = [each.mount_path for each in self.volume_mounts]
         variables = [each.name for each in self.env]
-        for field, names in (("volumes", paths), ("secrets", self.secrets), ("env", variables)):
+        keys = [each.name for each in self.image_pull_secrets]
+        for field, names in (
+            ("volumes", volumes),
+            ("volumeMounts", paths),
+            ("secrets", self.secrets),
+            ("env", variables),
+            ("imagePullSecrets", keys),
+        ):
             twice = sorted({each for each in names if names.count(each) > 1})
             if twice:
                 raise ValueError(f"{field}: {twice[0]} is given twice: give it once")
+        for mount in self.volume_mounts:
+            if mount.name not in volumes:
+                raise ValueError(f"volumeMounts: {mount.mount_path}: volumes has no {mount.name}: add it")
         return self
+
+    @property
+    def on_its_own(self) -> list[str]:
+        """The given fields that only a pod of the detector's own can have."""
+        given = {name: getattr(self, to_snake(name)) for name in OF_ITS_OWN_POD}
+        return [name for name, value in given.items() if value]
+
+
+OF_ITS_OWN_POD = (
+    "nodeSelector", "affinity", "tolerations", "priorityClassName", "runtimeClassName", "securityContext"
+)  # fmt: skip
+"""The fields of a pod that have no effect on a container in an existing pod."""

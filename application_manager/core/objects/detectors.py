@@ -15,7 +15,7 @@ from typing import Any
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.rights import bound, detector_rights, merged, sidecar_rights
 from wayside.api import API_VERSION, Detector
-from wayside.api.pod import DetectorMode, DetectorPod
+from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 
 Manifest = dict[str, Any]
 
@@ -37,6 +37,7 @@ KINDS = (
 METRICS, METRICS_PORT = "metrics", 9100
 _SECRETS_FOLDER = "/etc/wayside/secrets"  # where the detector looks for them
 _SECRET_FIELDS = frozenset({"tlsSecret", "credentialsSecret", "uriSecret"})
+_AS_GIVEN = frozenset(OF_ITS_OWN_POD) - {"securityContext"}
 _SCRATCH_SIZE = "256Mi"
 
 
@@ -71,6 +72,13 @@ def detector_objects(detector: Detector, defaults: PodDefaults) -> list[Manifest
         made = [*detector_roles(detector.namespace, detector.name), _deployment(detector, defaults)]
     for each in made:
         each["metadata"] |= {"labels": _labels(detector.name), "ownerReferences": [_owner(detector)]}
+    return made
+
+
+def deployment_to_try(detector: Detector, defaults: PodDefaults) -> Manifest:
+    """The Deployment of a detector of its own, for a dry run: by a name that none has, and owned by nothing."""
+    made = _deployment(detector, defaults)
+    made["metadata"]["name"] += ".dry-run"
     return made
 
 
@@ -147,10 +155,10 @@ def _pod(detector: Detector, defaults: PodDefaults) -> Manifest:
             **({} if defaults.user is None else {"fsGroup": defaults.user}),  # volumes are writable to it
             "fsGroupChangePolicy": "OnRootMismatch",
             "seccompProfile": {"type": "RuntimeDefault"},
+            **(pod.security_context or {}),
         },
-        **({"imagePullSecrets": [{"name": each} for each in defaults.pull_secrets]} if defaults.pull_secrets else {}),
-        **({"nodeSelector": dict(pod.node_selector)} if pod.node_selector else {}),
-        **({"tolerations": [each.to_json() for each in pod.tolerations]} if pod.tolerations else {}),
+        **({"imagePullSecrets": keys} if (keys := pull_secrets(detector, defaults)) else {}),
+        **{field: value for field, value in pod.to_json().items() if field in _AS_GIVEN and value},
         "containers": [container(detector, defaults, mounts) | probes],
         "volumes": volumes,
     }
@@ -199,6 +207,12 @@ def container(
     }
 
 
+def pull_secrets(detector: Detector, defaults: PodDefaults) -> list[Manifest]:
+    """The Secrets to pull the image with: those of all detectors, then its own."""
+    own = [each.name for each in detector.spec.pod.image_pull_secrets] if detector.spec.pod is not None else []
+    return [{"name": each} for each in dict.fromkeys((*defaults.pull_secrets, *own))]
+
+
 def run_as(defaults: PodDefaults) -> Manifest:
     """As whom a detector runs, as a security context says it."""
     return {} if defaults.user is None else {"runAsUser": defaults.user, "runAsGroup": defaults.user}
@@ -221,10 +235,8 @@ def _environment(pod: DetectorPod, defaults: PodDefaults) -> list[Manifest]:
     given: dict[str, Manifest] = {name: {"value": value} for name, value in sorted(defaults.environment.items())}
     for each in pod.env:
         given.pop(each.name, None)
-        source = each.from_secret
-        given[each.name] = (
-            {"value": each.value or ""} if source is None else {"valueFrom": {"secretKeyRef": source.to_json()}}
-        )
+        source = each.value_from
+        given[each.name] = {"value": each.value or ""} if source is None else {"valueFrom": source.to_json()}
     own = [told("POD_NAME", "metadata.name"), told("POD_UID", "metadata.uid")]
     return [*own, *({"name": name, **value} for name, value in given.items())]
 
@@ -238,13 +250,10 @@ def volumes_of(detector: Detector, prefix: str = "") -> tuple[list[Manifest], li
     scratch = f"{prefix}scratch"
     volumes: list[Manifest] = [{"name": scratch, "emptyDir": {"sizeLimit": _SCRATCH_SIZE}}]
     mounts: list[Manifest] = [{"name": scratch, "mountPath": "/tmp"}]  # noqa: S108  a mount of the pod's own
-    for index, each in enumerate(sorted(pod.volumes, key=lambda each: each.path)):
-        name = f"{prefix}volume-{index}"
-        if each.claim is not None:
-            volumes.append({"name": name, "persistentVolumeClaim": {"claimName": each.claim}})
-        else:
-            volumes.append({"name": name, "emptyDir": {"sizeLimit": each.size} if each.size is not None else {}})
-        mounts.append({"name": name, "mountPath": each.path})
+    volumes += [each.to_json() | {"name": f"{prefix}{each.name}"} for each in pod.volumes]
+    for each in sorted(pod.volume_mounts, key=lambda each: each.mount_path):
+        given = {field: value for field, value in each.to_json().items() if value}
+        mounts.append(given | {"name": f"{prefix}{each.name}"})
     for index, path in enumerate(_without_volume(detector, pod)):
         volumes.append({"name": f"{prefix}folder-{index}", "emptyDir": {}})
         mounts.append({"name": f"{prefix}folder-{index}", "mountPath": path})
@@ -258,7 +267,7 @@ def volumes_of(detector: Detector, prefix: str = "") -> tuple[list[Manifest], li
 def _without_volume(detector: Detector, pod: DetectorPod) -> list[str]:
     """The folders that are in no volume, those within another one left out."""
     found: list[PurePosixPath] = []
-    there = [PurePosixPath(each.path) for each in pod.volumes] + [PurePosixPath("/tmp")]  # noqa: S108  see above
+    there = [PurePosixPath(each.mount_path) for each in pod.volume_mounts] + [PurePosixPath("/tmp")]  # noqa: S108  see above
     for path in sorted(map(PurePosixPath, detector.spec.folders.values())):
         if not any(path.is_relative_to(each) for each in (*there, *found)):
             found.append(path)

@@ -15,7 +15,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager.core.objects.detectors import Manifest, container, probe, run_as, told, volumes_of
+from application_manager.core.objects.detectors import (
+    Manifest,
+    container,
+    probe,
+    pull_secrets,
+    run_as,
+    told,
+    volumes_of,
+)
 from application_manager.core.objects.poddefaults import PodDefaults
 from wayside.api import Detector
 
@@ -74,7 +82,7 @@ def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults)
     items = {
         "initContainers": [_sidecar(detector, defaults, mounts, _port(spec))],
         "volumes": [each for each in volumes if each["name"] not in there],
-        "imagePullSecrets": [{"name": each} for each in defaults.pull_secrets if each not in keys],
+        "imagePullSecrets": [each for each in pull_secrets(detector, defaults) if each["name"] not in keys],
     }
     return Addition({field: each for field, each in items.items() if each})
 
@@ -125,8 +133,9 @@ def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], 
     made["command"] += ["--as-pod", "--namespace=$(POD_NAMESPACE)"]
     made["env"].append(told("POD_NAMESPACE", "metadata.namespace"))
     for each in made["env"]:  # a Secret that is not there would keep the whole pod from starting
-        if "secretKeyRef" in each.get("valueFrom", {}):
-            each["valueFrom"]["secretKeyRef"] |= {"optional": True}
+        for reference in ("secretKeyRef", "configMapKeyRef"):
+            if reference in each.get("valueFrom", {}):
+                each["valueFrom"][reference] |= {"optional": True}
     # The pod's own securityContext is its author's, so all that the restricted standard asks for is said here.
     made["securityContext"] |= {
         "runAsNonRoot": True,

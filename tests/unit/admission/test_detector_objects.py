@@ -26,6 +26,10 @@ from tests.unit.manager_objects import NOW
 from wayside.api import Detector
 
 IMAGE = "wayside:1"
+ON_A_CLAIM = {
+    "volumes": [{"name": "data", "persistentVolumeClaim": {"claimName": "town"}}],
+    "volumeMounts": [{"name": "data", "mountPath": "/data"}],
+}
 DEFAULTS = PodDefaults(IMAGE)
 
 
@@ -57,19 +61,28 @@ def test_each_folder_is_in_a_volume_that_lasts_where_a_claim_is_given() -> None:
         state={"path": "/var/lib/wayside"},
         recordings={"path": "/data/recordings"},
         database={"uriSecret": "mongo", "spool": {"path": "/data/spool"}, "files": {"path": "/var/lib/wayside/files"}},
-        pod={"volumes": [{"path": "/data", "claim": "town"}, {"path": "/models", "size": "1Gi"}]},
+        pod={
+            "volumes": [
+                {"name": "data", "persistentVolumeClaim": {"claimName": "town"}},
+                {"name": "models", "configMap": {"name": "risk", "defaultMode": 292}},
+            ],
+            "volumeMounts": [
+                {"name": "models", "mountPath": "/models", "readOnly": True},
+                {"name": "data", "mountPath": "/data", "subPath": "town"},
+            ],
+        },
     )
     assert mounted(given) == {
         "/tmp": {"emptyDir": {"sizeLimit": "256Mi"}},
         "/data": {"persistentVolumeClaim": {"claimName": "town"}},
-        "/models": {"emptyDir": {"sizeLimit": "1Gi"}},
+        "/models": {"configMap": {"name": "risk", "defaultMode": 292}},
         "/var/lib/wayside": {"emptyDir": {}},
         "/etc/wayside/secrets/mongo": {"secret": {"secretName": "mongo", "optional": True}},
     }
 
 
 def test_a_folder_beside_one_whose_name_it_begins_with_has_a_volume_of_its_own() -> None:
-    given = detector(state={"path": "/data2"}, pod={"volumes": [{"path": "/data", "claim": "town"}]})
+    given = detector(state={"path": "/data2"}, pod=ON_A_CLAIM)
     assert mounted(given)["/data2"] == {"emptyDir": {}}
 
 
@@ -136,11 +149,16 @@ def test_what_holds_for_all_detectors_is_in_each_pod_and_what_a_detector_says_it
     environment = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://all:4318", "B": "all"}
     defaults = PodDefaults(IMAGE, PullPolicy.ALWAYS, ("registry",), environment)
     key = {"name": "collector", "key": "headers"}
-    own = [{"name": "OTEL_EXPORTER_OTLP_HEADERS", "fromSecret": key}, {"name": "B", "value": "own"}]
+    own = [{"name": "OTEL_EXPORTER_OTLP_HEADERS", "valueFrom": {"secretKeyRef": key}}, {"name": "B", "value": "own"}]
     toleration = {"key": "roadside", "operator": "Exists", "effect": "NoExecute", "tolerationSeconds": 60}
-    given = pod(detector(pod={"env": own, "tolerations": [toleration]}), defaults)
+    affinity = {"podAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": []}}
+    placed = {"affinity": affinity, "priorityClassName": "roadside", "runtimeClassName": "gvisor"}
+    more = {"imagePullSecrets": [{"name": "own"}, {"name": "registry"}], "securityContext": {"fsGroup": 7}}
+    given = pod(detector(pod={"env": own, "tolerations": [toleration], **placed, **more}), defaults)
+    assert {field: given[field] for field in placed} == placed
+    assert (given["securityContext"]["fsGroup"], given["securityContext"]["runAsNonRoot"]) == (7, True)
     (container,) = given["containers"]
-    assert given["imagePullSecrets"] == [{"name": "registry"}]
+    assert given["imagePullSecrets"] == [{"name": "registry"}, {"name": "own"}]
     assert given["tolerations"] == [toleration]
     assert container["imagePullPolicy"] == "Always"
     assert container["env"][2:] == [
@@ -173,10 +191,21 @@ def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str],
         ({"recordings": {"path": "/"}}, "recordings.path: '/' cannot be a volume path"),
         ({"recordings": {"path": "/data/../etc"}}, "use an absolute path"),
         ({"mode": None, "pod": {}}, "set mode to Standalone or Sidecar, or remove pod"),
-        ({"pod": {"volumes": [{"path": "/a", "claim": "b", "size": "1Gi"}]}}, "give claim or size, not both"),
-        ({"pod": {"volumes": [{"path": "/a"}, {"path": "/a"}]}}, "volumes: /a is given twice"),
+        ({"pod": {"volumes": [{"name": "a", "emptyDir": {}, "csi": {}}]}}, "give exactly one of persistentVolumeClaim"),
+        ({"pod": {"volumes": [{"name": "a", "hostPath": {"path": "/"}}]}}, "hostPath"),
+        ({"pod": {"volumes": [{"name": "scratch", "emptyDir": {}}]}}, "names of the detector's own volumes"),
+        ({"pod": {"volumeMounts": [{"name": "a", "mountPath": "/a"}]}}, "volumeMounts: /a: volumes has no a: add it"),
+        (
+            {
+                "pod": {
+                    "volumes": [{"name": "a", "emptyDir": {}}],
+                    "volumeMounts": [{"name": "a", "mountPath": "/a"}] * 2,
+                }
+            },
+            "volumeMounts: /a is given twice",
+        ),
         ({"pod": {"env": [{"name": "A", "value": ""}, {"name": "A", "value": "b"}]}}, "env: A is given twice"),
-        ({"pod": {"env": [{"name": "A"}]}}, "give exactly one of value and fromSecret"),
+        ({"pod": {"env": [{"name": "A"}]}}, "give exactly one of value and valueFrom"),
         (
             {"pod": {"env": [{"name": "POD_UID", "value": "1"}]}},
             "POD_UID are set automatically in each pod",

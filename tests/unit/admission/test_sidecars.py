@@ -23,6 +23,7 @@ from application_manager.core.objects.sidecars import CONTAINER, added, addition
 from application_manager.core.statuses.running import carried
 from tests.cluster.manifests import DETECTOR
 from tests.guides import guide, yaml_blocks
+from tests.unit.admission.test_detector_objects import ON_A_CLAIM
 from wayside.api import Detector
 
 IMAGE = "wayside:1"
@@ -92,7 +93,7 @@ detectors = st.sampled_from(
     [
         detector(),
         detector(zenoh={"connect": ["tls/zenoh:7447"], "tlsSecret": "zenoh"}),
-        detector(state={"path": "/state"}, pod={"volumes": [{"path": "/data", "claim": "town"}], "secrets": ["pager"]}),
+        detector(state={"path": "/state"}, pod={**ON_A_CLAIM, "secrets": ["pager"]}),
     ]
 )
 
@@ -197,7 +198,7 @@ def test_the_guides_pod_gets_the_guides_detector() -> None:
 
 
 def test_what_is_needed_to_pull_its_image_or_would_keep_the_pod_from_starting_is_seen_to() -> None:
-    variables = [{"name": "TOKEN", "fromSecret": {"name": "pager", "key": "token"}}]
+    variables = [{"name": "TOKEN", "valueFrom": {"secretKeyRef": {"name": "pager", "key": "token"}}}]
     defaults = PodDefaults(IMAGE, pull_secrets=("registry", "mirror"))
     given_one = pod(imagePullSecrets=[{"name": "registry"}, {"name": "own"}])["spec"]
     found = addition(given_one, detector(pod={"env": variables}), defaults)
@@ -346,8 +347,8 @@ def test_pods_that_are_over_are_no_trouble() -> None:
         ({"mode": "Standalone"}, "serviceAccountNames has no effect without mode Sidecar"),
         ({"mode": None}, "serviceAccountNames has no effect without mode Sidecar"),
         (
-            {"pod": {"nodeSelector": {"a": "b"}}},
-            "pod.nodeSelector and pod.tolerations have no effect with mode Sidecar",
+            {"pod": {"nodeSelector": {"a": "b"}, "securityContext": {"fsGroup": 1}}},
+            "pod.nodeSelector and pod.securityContext cannot be used with mode Sidecar",
         ),
         ({"serviceAccountNames": ["a", "a"]}, "serviceAccountNames: a is given twice"),
         ({"state": {"path": "state"}}, "state.path: 'state' cannot be a volume path"),
