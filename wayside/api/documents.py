@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from pydantic import ValidationError
 
 from wayside.api import API_VERSION, KINDS
 from wayside.api.base import Kind
+from wayside.api.schema import fields_at
 from wayside.api.wording import FieldPath, field_text, messages
 from wayside.findings import ignored_by
 from wayside.inputerror import InputError
@@ -137,7 +139,9 @@ def parse_object(raw: dict[str, Any]) -> Kind:
         return kind.model_validate(raw)
     except ValidationError as error:
         raise ValueError(
-            "; ".join(f"{field_text(path)}: {message}" for path, message in messages(error, raw))
+            "; ".join(
+                f"{field_text(path)}: {message}" for path, message in messages(error, raw, partial(fields_at, kind))
+            )
         ) from None
 
 
@@ -209,7 +213,7 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
     try:
         return Document(kind.model_validate(raw), file, marks)
     except ValidationError as error:
-        for path, message in messages(error, raw):
+        for path, message in messages(error, raw, partial(fields_at, kind)):
             problems.append(Problem(file, *_mark(marks, path), field_text(path), message))
         return None
 

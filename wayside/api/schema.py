@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from wayside.api.base import GROUP, VERSION, Kind
@@ -43,6 +44,15 @@ def crd(kind: type[Kind]) -> dict[str, Any]:
             "versions": [version],
         },
     }
+
+
+def fields_at(kind: type[Kind], path: Sequence[str | int]) -> list[str]:
+    """The names of the fields that an object of the kind has at a path; empty where any name is allowed."""
+    node = _object_schema(kind)
+    for part in path:
+        inner = node.get("items") if isinstance(part, int) else node.get("properties", {}).get(part)
+        node = inner or node.get("additionalProperties") or {}
+    return list(node.get("properties", ()))
 
 
 def _column(column: dict[str, str]) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 from pydantic import ValidationError
@@ -38,14 +39,33 @@ def field_text(path: FieldPath) -> str:
     return text
 
 
-def messages(error: ValidationError, raw: Any) -> Iterator[tuple[FieldPath, str]]:
-    """The messages for pydantic's errors, each once, with the paths as the author wrote them."""
+def messages(
+    error: ValidationError, raw: Any, fields: Callable[[FieldPath], Collection[str]] = lambda _: ()
+) -> Iterator[tuple[FieldPath, str]]:
+    """The messages for pydantic's errors, each once, with the paths as the author wrote them.
+
+    Args:
+        error: of the validation.
+        raw: what was validated.
+        fields: the names of the fields that an object at a path has.
+    """
     seen = set()
     for item in error.errors(include_url=False):
-        found = _written(item["loc"], raw), _message(item)
+        path = _written(item["loc"], raw)
+        if item["type"] == "extra_forbidden":
+            found = path, _unknown(str(path[-1]), fields(path[:-1])) if path else _message(item)
+        else:
+            found = path, _message(item)
         if found not in seen:
             seen.add(found)
             yield found
+
+
+def _unknown(name: str, fields: Collection[str]) -> str:
+    """The message for a field that does not exist: with the name of one that does, if one is similar."""
+    stem = name.lower().rstrip("s")
+    similar = [*(each for each in fields if each.lower().startswith(stem)), *difflib.get_close_matches(name, fields, 1)]
+    return f"unknown field: did you mean {similar[0]}?" if similar else "unknown field: check its spelling and position"
 
 
 def _message(item: ErrorDetails) -> str:
@@ -53,8 +73,6 @@ def _message(item: ErrorDetails) -> str:
     match item["type"]:
         case "missing":
             return "is missing: add it"
-        case "extra_forbidden":
-            return "unknown field: check its spelling and position"
         case "value_error":
             return str(item["ctx"]["error"])
         case _ if given is None:
