@@ -34,6 +34,7 @@ from application_manager.work.recorder import Recorder
 from application_manager.work.rendering import Renderings
 from application_manager.work.rulework import RuleKey, RuleWork
 from application_manager.work.sidecars import SidecarNews
+from application_manager.work.statuses import StatusWriter
 from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork
 from application_manager.work.templates import TemplateWork
@@ -136,14 +137,13 @@ class Assembly:
         self.cache.claims.moved = self.router.claimed
         self.cache.overlap.every = options.resync
         self.cache.overlap.resumed = lambda _: self.router.everything()
+        statuses = StatusWriter(client, self.recorder, self.router.observe)
         self._status_work = InstanceStatusWork(
             cache=self.cache,
-            client=client,
+            statuses=statuses,
             applier=applier,
-            recorder=self.recorder,
             instances=resources[INSTANCE],
             task_changed=self._tasks.add,
-            observe=self.router.observe,
             nodes=NodeLook(client),
             failed_pods=FailedPodsLook(client),
             again=self._statuses.add_at,
@@ -177,7 +177,7 @@ class Assembly:
         self._task_work = TaskWork(
             cache=self.cache,
             client=client,
-            recorder=self.recorder,
+            statuses=statuses,
             tasks=resources[TASK],
             templates=resources[TEMPLATE],
             ttl=options.ttl_after_finished,
@@ -188,19 +188,15 @@ class Assembly:
         )
         self._template_work = TemplateWork(
             cache=self.cache,
-            client=client,
-            recorder=self.recorder,
+            statuses=statuses,
             templates=resources[TEMPLATE],
-            observe=self.router.observe,
             pool=self.pool,
             again=self._templates.add_at,
         )
         self._rule_work = RuleWork(
             cache=self.cache,
-            client=client,
-            recorder=self.recorder,
+            statuses=statuses,
             resources=resources,
-            observe=self.router.observe,
             pool=self.pool,
             detectors=self.book,
         )

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from functools import partial
 
 from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
-from application_manager.cluster.client import ApiError, Client, Resource
+from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.entitlement import judge, lacking
+from application_manager.cluster.errors import ApiError
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.cluster.starting import until_answered
 from application_manager.core.objects.policy import KindKey, Policy, kind_text

@@ -23,8 +23,9 @@ from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import Desk, webhook
 from application_manager.assembly import Assembly
 from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
-from application_manager.cluster.client import ApiError, Client, Resource
+from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError, load_configuration
+from application_manager.cluster.errors import ApiError
 from application_manager.cluster.grants import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
 from application_manager.cluster.pacing import Pacing, Share

@@ -17,7 +17,8 @@ from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
 from application_manager.cache.surroundings import surroundings
-from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
-from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.findings.injections import (
     Injection,
     PodRequest,

@@ -23,8 +23,9 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from application_manager.admission.authority import AUTHORITY, VALID, issued, written
 from application_manager.admission.reviewing import Serving
 from application_manager.cluster.certificate import CERTIFICATE, KEY
-from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
+from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.connection import ConfigurationError
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.starting import until_answered
 from application_manager.core.findings.webhooks import Place
 

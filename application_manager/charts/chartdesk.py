@@ -26,6 +26,7 @@ from application_manager.core.objects.charts import (
     ChartSource,
 )
 from application_manager.core.objects.policy import Name
+from wayside.backoff import pause_after
 
 FIRST_PAUSE = 5.0  # s after a failure, doubled with each further one
 LONGEST_PAUSE = 300.0  # s
@@ -45,8 +46,8 @@ class _Pause:
     failure: ChartFailure | None = None
 
     def fail(self, failure: ChartFailure) -> None:
-        self.until = time.monotonic() + min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** min(self.failures, 10))
         self.failures += 1
+        self.until = time.monotonic() + pause_after(self.failures, FIRST_PAUSE, LONGEST_PAUSE)
         self.failure = failure
 
     @property

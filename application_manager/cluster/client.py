@@ -21,6 +21,7 @@ import aiohttp
 import msgspec
 from kubernetes.aio.client import ApiClient, Configuration
 
+from application_manager.cluster.errors import ApiError, NotActive, NotGranted, Unreachable
 from application_manager.cluster.fence import FencedRequest, writing
 from application_manager.cluster.pacing import Pacing
 from application_manager.core.objects.ownership import FIELD_MANAGER
@@ -43,58 +44,8 @@ _PAGE_BYTES = 4 * 1024 * 1024
 _RESTARTS = 3  # of a list whose rest is not there any more
 _NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
 _NAMESPACE = re.compile(r"/namespaces/([^/]+)/")
-_BAD_MANIFEST = "failed to create typed patch object"
 _OURS: Mapping[str, str] = {"fieldManager": FIELD_MANAGER}
 _STRICTLY: Mapping[str, str] = {**_OURS, "fieldValidation": "Strict"}
-
-
-class Unreachable(Exception):  # noqa: N818  a state of the world
-    """The API server gave no answer."""
-
-
-class NotActive(Unreachable):
-    """Another manager is active, or may be: nothing is written."""
-
-    def __init__(self) -> None:
-        super().__init__("this manager is not the active one and writes nothing")
-
-
-class NotGranted(Unreachable):
-    """The account may not write in this namespace: nothing is written there, and nothing needs to be tried again."""
-
-    def __init__(self, namespace: str) -> None:
-        super().__init__(f"namespace {namespace} is not granted to this manager, which writes nothing there")
-
-
-class ApiError(Exception):
-    """The API server refused.
-
-    Attributes:
-        code: the HTTP status.
-        message: what the API server said.
-        retry_after: seconds that it asked us to wait; None where it did not say.
-        causes: the reasons of the causes, such as NamespaceTerminating.
-    """
-
-    def __init__(self, code: int, message: str, retry_after: float | None = None, causes: tuple[str, ...] = ()) -> None:
-        super().__init__(f"{message} (HTTP {code})")
-        self.code = code
-        self.message = message
-        self.retry_after = retry_after
-        self.causes = causes
-
-    @property
-    def permanent(self) -> bool:
-        """Whether asking the same again is in vain: a bad request, or a manifest of the wrong types (HTTP 500)."""
-        if self.code >= 500:
-            return _BAD_MANIFEST in self.message
-        return self.code not in (401, 408, 409, 429)
-
-    @property
-    def terminating(self) -> bool:
-        """Whether the namespace is going or gone."""
-        gone = self.code == 404 and self.message.startswith("namespaces ")
-        return gone or "NamespaceTerminating" in self.causes
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +76,18 @@ class Resource:
 
 LEASES = Resource("coordination.k8s.io/v1", "Lease", "leases")
 EVENTS = Resource("events.k8s.io/v1", "Event", "events")
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """A request; `writes`: whether it changes something."""
+
+    method: str
+    path: str
+    query: Mapping[str, str]
+    body: Object | None = None
+    content_type: str = _JSON
+    writes: bool = False
 
 
 class _ListMetadata(msgspec.Struct):
@@ -196,9 +159,9 @@ class Client:
         query = {"labelSelector": labels, "fieldSelector": fields}
         rest, restarts = "", 0
         while True:
-            asked = {key: value for key, value in {**query, "limit": str(size), "continue": rest}.items() if value}
+            page = {key: value for key, value in {**query, "limit": str(size), "continue": rest}.items() if value}
             try:
-                text = await self._asked("GET", resource.path(namespace), asked)
+                text = await self._send(_Request("GET", resource.path(namespace), page))
             except ApiError as error:
                 if error.code != 410 or not rest or restarts == _RESTARTS:
                     raise
@@ -324,29 +287,22 @@ class Client:
         *,
         writes: bool | None = None,
     ) -> Object:
-        return cast("Object", self._decode(await self._asked(method, path, query, body, content_type, writes=writes)))
+        changes = method != "GET" if writes is None else writes
+        return cast(
+            "Object", self._decode(await self._send(_Request(method, path, query or {}, body, content_type, changes)))
+        )
 
-    async def _asked(
-        self,
-        method: str,
-        path: str,
-        query: Mapping[str, str] | None = None,
-        body: Object | None = None,
-        content_type: str = _JSON,
-        *,
-        writes: bool | None = None,
-    ) -> bytes:
+    async def _send(self, request: _Request) -> bytes:
         """Send a request, and retry it for up to 30 s while the API server rejects it unprocessed."""
         deadline = time.monotonic() + _PATIENCE
-        changes = method != "GET" if writes is None else writes
-        found = _NAMESPACE.search(path)
-        namespace = found[1] if found is not None else ""
-        if namespace and changes and self.may_write is not None and not await self.may_write(namespace):
+        found = _NAMESPACE.search(request.path)
+        namespace = found[1] if found is not None and request.writes else ""
+        if namespace and self.may_write is not None and not await self.may_write(namespace):
             raise NotGranted(namespace)
         while True:
             try:
-                async with self._pacing.turn(namespace if changes else ""):
-                    return await self._ask(method, path, dict(query or {}), body, content_type, changes)
+                async with self._pacing.turn(namespace):
+                    return await self._send_once(request)
             except ApiError as error:
                 if error.code not in (429, 503) or error.retry_after is None:
                     raise
@@ -354,35 +310,34 @@ class Client:
                 if time.monotonic() + error.retry_after > deadline:
                     raise
 
-    async def _ask(
-        self, method: str, path: str, query: dict[str, str], body: Object | None, content_type: str, writes: bool
-    ) -> bytes:
-        headers = {"Accept": _JSON, "Content-Type": content_type, "User-Agent": "wayside-application-manager"}
+    async def _send_once(self, request: _Request) -> bytes:
+        headers = {"Accept": _JSON, "Content-Type": request.content_type, "User-Agent": "wayside-application-manager"}
         token = await self.configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
         if token:
             headers["Authorization"] = token
-        seconds = self._timeout
-        writing.set(self.may_act if writes else None)
-        if writes:
+        seconds, query = self._timeout, dict(request.query)
+        writing.set(self.may_act if request.writes else None)
+        if request.writes:
             seconds = min(seconds, self.may_act())
             if seconds <= 0:
                 raise NotActive
             query["timeout"] = f"{max(1, int(seconds * 1000))}ms"  # the API server gives up when we do
-        limit = aiohttp.ClientTimeout(total=seconds, connect=_CONNECTING if writes else None)
-        url = self.configuration.host + path + (f"?{urlencode(query)}" if query else "")
+        limit = aiohttp.ClientTimeout(total=seconds, connect=_CONNECTING if request.writes else None)
+        url = self.configuration.host + request.path + (f"?{urlencode(query)}" if query else "")
         began, code = time.monotonic(), NO_ANSWER
         try:
             response = await self._api.rest_client.request(
-                method, url, headers=headers, body=body, _request_timeout=limit
+                request.method, url, headers=headers, body=request.body, _request_timeout=limit
             )
             raw = await response.read()
             code = str(response.status)
         except (TimeoutError, aiohttp.ClientError, OSError) as error:
-            raise Unreachable(f"{method} {path}: {type(error).__name__} {error}".rstrip()) from error
+            what = f"{request.method} {request.path}: {type(error).__name__} {error}"
+            raise Unreachable(what.rstrip()) from error
         finally:
-            if writes and code == NO_ANSWER:
+            if request.writes and code == NO_ANSWER:
                 self.open_until = max(self.open_until, began + seconds)
-            self._measures.asked(method, time.monotonic() - began, code)
+            self._measures.asked(request.method, time.monotonic() - began, code)
         if response.status >= 400:
             raise self._error(response.status, raw, response.headers.get("Retry-After"))
         return cast("bytes", raw)

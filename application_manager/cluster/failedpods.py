@@ -8,7 +8,8 @@ from __future__ import annotations
 import logging
 import time
 
-from application_manager.cluster.client import EVENTS, ApiError, Client, Object, Unreachable
+from application_manager.cluster.client import EVENTS, Client, Object
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.health.refusals import FAILED_CREATE
 
 FORBIDDEN_FOR = 60.0  # s until it is asked again whether Events may be listed

@@ -11,8 +11,9 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from application_manager.cluster.client import ApiError, Client, Unreachable
+from application_manager.cluster.client import Client
 from application_manager.cluster.entitlement import may
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.objects.rights import granting
 
 LOOK_EVERY = 5.0  # s between two questions about a namespace, while something is to be written there

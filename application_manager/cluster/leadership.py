@@ -14,7 +14,8 @@ import socket
 import time
 from dataclasses import dataclass
 
-from application_manager.cluster.client import LEASES, ApiError, Client, Unreachable
+from application_manager.cluster.client import LEASES, Client
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.podaccount import FOLDER
 from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, Candidate
 from application_manager.measures import Measures

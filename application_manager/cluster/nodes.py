@@ -9,7 +9,8 @@ import asyncio
 import logging
 import time
 
-from application_manager.cluster.client import ApiError, Client, Resource, Unreachable
+from application_manager.cluster.client import Client, Resource
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.health.placement import Nodes
 
 NODES = Resource("v1", "Node", "nodes", namespaced=False)

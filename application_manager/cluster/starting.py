@@ -7,7 +7,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
-from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.cluster.errors import ApiError, Unreachable
 
 PAUSE = 1.0  # s between two attempts, unless the API server asks for more
 

@@ -12,8 +12,9 @@ from typing import Any
 import typer
 import yaml
 
-from application_manager.cluster.client import ApiError, Client, Resource, Unreachable
+from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError, load_configuration
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.findings.injections import detector_of, injection
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import added, has_sidecar

@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 
 from kubernetes.aio.config import ConfigException, list_kube_config_contexts
 
-from application_manager.cluster.client import LEASES, ApiError, Client, Object, Resource, Unreachable
+from application_manager.cluster.client import LEASES, Client, Object, Resource
 from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.statuses.explaining import Found, explain, serving

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from application_manager.cluster.client import ApiError, Client, Unreachable
+from application_manager.cluster.client import Client
 from application_manager.cluster.connection import ConfigurationError, load_configuration
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.leadership import LEASE_NAME, lease_key
 from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.core.objects.detectors import detector_roles, sidecar_roles

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.cluster.client import ApiError, Client, Object, Resource, Unreachable
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.objects.detectors import KINDS, SELECTOR
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import SIDECAR_LABEL

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import LEASES, ApiError, Client, Resource, Unreachable
+from application_manager.cluster.client import LEASES, Client, Resource
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.objects.policy import Name
 from wayside.leases import lease_name

@@ -17,19 +17,19 @@ from application_manager.cluster.client import LEASES, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
 from application_manager.watching.relay import Handler, Relist, relaying
+from wayside.backoff import Backoff
 from wayside.leases import HOLDER_LEASE_LABEL
 
-_PAUSES = (0.1, 0.2, 0.5)  # s, between attempts to reach the API server; then the last again and again
-_LONG_PAUSE = 1.0  # s
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 1.0  # s between attempts to reach the API server
 
 
 class _Pauses:
-    """An endless series of pauses, which can be begun anew: a watch never gives up."""
+    """An endless series of pauses, which restarts whenever kopf iterates: a watch never gives up."""
 
     def __iter__(self) -> Iterator[float]:
-        yield from _PAUSES
+        backoff = Backoff(_FIRST_PAUSE, _LONGEST_PAUSE)
         while True:
-            yield _LONG_PAUSE
+            yield backoff.fail()
 
 
 async def watch(

@@ -15,7 +15,8 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 
 from application_manager.cache.store import Store
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.refusals import (
     ADMISSION_REFUSED,
@@ -36,7 +37,7 @@ from application_manager.core.objects.ownership import (
 )
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.objects.rendering import Manifest, Rendering, object_key, owned
-from wayside.api import ApplicationInstance
+from wayside.api import ApplicationInstance, Kind
 
 _WORST_FIRST = ("ObjectExists", APPLY_REFUSED, ADMISSION_REFUSED, QUOTA_EXCEEDED, "Waiting")
 _WORKLOADS = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod"})
@@ -163,29 +164,17 @@ class Applier:
         looked: Mapping[ObjectKey, Object | None],
     ) -> Object | Obstacle:
         key = object_key(manifest)
-        what = f"{key[1]} {key[2]}"
         live = self.live(instance.namespace, key) or looked.get(key)
         body = owned(manifest, instance)
-        if live is not None:
-            problem = foreign(live, instance, recorded.get(key), what)
-            if problem is not None:
-                return problem
-            body["metadata"]["uid"] = live["metadata"]["uid"]
-        try:
-            raw = await self._client.apply(await self.resource(key), body)
-        except ApiError as error:
-            if error.code == 409:  # vanished or replaced since we looked
-                return Obstacle("Waiting", f"{what} changed hands while it was applied; looking again")
-            if not error.permanent or error.terminating:
-                raise
-            reason = reason_of(error.code, error.message)
-            return Obstacle(reason, with_remedy(reason, f"{what}: {_readable(error.message)}"))
+        raw = await apply_owned(self._client, await self.resource(key), body, instance, live, recorded.get(key))
+        if isinstance(raw, Obstacle):
+            return raw
         uid = raw["metadata"]["uid"]
         self._fields[uid] = our_fields(raw)
         self._drifted.discard(uid)
         self.note(raw)
         self._store.put(raw)
-        log.info("instance %s/%s: applied %s", instance.namespace, instance.name, what)
+        log.info("instance %s/%s: applied %s %s", instance.namespace, instance.name, key[1], key[2])
         return raw
 
     async def _prune(self, instance: ApplicationInstance, key: ObjectKey) -> None:
@@ -206,6 +195,43 @@ class Applier:
         if kind not in self._resources:
             raise ApiError(404, f"the cluster has no kind {key[0]}/{key[1]}")
         return self._resources[kind]
+
+
+async def apply_owned(
+    client: Client,
+    resource: Resource,
+    manifest: Manifest,
+    owner: Kind,
+    live: Object | None,
+    recorded: str | None = None,
+) -> Object | Obstacle:
+    """Apply an object with its owner as controller, unless it is somebody else's; the object, or what prevents it.
+
+    Args:
+        client: for the API server.
+        resource: where the kind lives.
+        manifest: the object, with its owner reference.
+        owner: the instance or Detector.
+        live: the object as it is; None where there is none. Its uid is a precondition.
+        recorded: its uid, if the owner's status lists it.
+
+    Raises ApiError or Unreachable for what may pass, and for a namespace that is being deleted.
+    """
+    what = f"{manifest['kind']} {manifest['metadata']['name']}"
+    if live is not None:
+        problem = foreign(live, owner, what, recorded)
+        if problem is not None:
+            return problem
+        manifest = {**manifest, "metadata": {**manifest["metadata"], "uid": live["metadata"]["uid"]}}
+    try:
+        return await client.apply(resource, manifest)
+    except ApiError as error:
+        if error.code == 409:  # deleted or replaced since the manager read it
+            return Obstacle("Waiting", f"{what} was deleted or replaced meanwhile; it is read again")
+        if not error.permanent or error.terminating:
+            raise
+        reason = reason_of(error.code, error.message)
+        return Obstacle(reason, with_remedy(reason, f"{what}: {_readable(error.message)}"))
 
 
 def _refused(problems: Sequence[Obstacle]) -> Aspect:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import random
 from dataclasses import dataclass
 
 from application_manager.core.objects.policy import Name
+from wayside.backoff import pause_after
 
 FIRST_PAUSE = 1.0  # s, doubled with every refusal of the same
 LONGEST_PAUSE = 30.0  # s
@@ -33,8 +33,7 @@ class Attempts:
         """Note that it was refused; when it is to be tried again, in seconds since 1970."""
         known = self._refused.get(name)
         times = known.times + 1 if known is not None and known.what == what else 1
-        pause: float = min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** (min(times, 10) - 1))
-        until = now + pause * random.uniform(0.8, 1.0)  # noqa: S311  jitter, not a secret
+        until = now + pause_after(times, FIRST_PAUSE, LONGEST_PAUSE)
         self._refused[name] = _Refused(what, times, until)
         return until
 

@@ -10,7 +10,8 @@ import logging
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.objects import following
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.ownership import controller_uid

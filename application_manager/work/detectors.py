@@ -10,20 +10,21 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Client, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.conditions import Aspect
 from application_manager.core.findings.rulefindings import detector_findings
-from application_manager.core.health.refusals import reason_of, with_remedy
 from application_manager.core.objects.detectors import KINDS, Manifest, detector_objects
-from application_manager.core.objects.ownership import controller_uid, our_fields
+from application_manager.core.objects.ownership import Obstacle, controller_uid, our_fields
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
 from application_manager.core.statuses.running import NOT_ACCEPTED, NOT_RUN, RUNNING, carried, running
+from application_manager.work.applying import apply_owned
 from application_manager.work.sidecars import SidecarNews
 from wayside.api import Detector
 from wayside.api.pod import DetectorMode
@@ -109,33 +110,26 @@ class DetectorWork:
     async def _apply(self, name: Name, detector: Detector, manifest: Manifest) -> Aspect | None:
         """Make one object as the manifest says; what keeps it from being so, if anything."""
         kind, called = manifest["kind"], manifest["metadata"]["name"]
-        what = f"{kind} {called}"
         known = self.book.owned(detector.metadata.uid)
         live = known.get(kind) or await self.client.get(_RESOURCES[kind], name[0], called)
         digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
-        if live is not None:
-            problem = _foreign(live, detector, what)
-            if problem is not None:
-                return problem
+        if live is not None and controller_uid(live) == detector.metadata.uid:
             known[kind] = live
-            uid = live["metadata"]["uid"]
-            if self._applied.get(uid) == (digest, our_fields(live)):
+            as_applied = self._applied.get(live["metadata"]["uid"]) == (digest, our_fields(live))
+            if as_applied and not live["metadata"].get("deletionTimestamp"):
                 return None
-            manifest = manifest | {"metadata": manifest["metadata"] | {"uid": uid}}
         try:
-            raw = await self.client.apply(_RESOURCES[kind], manifest)
+            raw = await apply_owned(self.client, _RESOURCES[kind], manifest, detector, live)
         except ApiError as error:
-            if error.code == 409:  # vanished or replaced since we looked
-                known.pop(kind, None)
-                return Aspect(RUNNING, False, "Waiting", f"{what} changed hands while it was applied; looking again")
-            if error.terminating:
-                return Aspect(RUNNING, False, "Waiting", "the namespace is being deleted")
-            if not error.permanent:
+            if not error.terminating:
                 raise
-            reason = reason_of(error.code, error.message)
-            return Aspect(RUNNING, False, reason, with_remedy(reason, f"{what}: {error.message}"))
+            return Aspect(RUNNING, False, "Waiting", "the namespace is being deleted")
+        if isinstance(raw, Obstacle):
+            if raw.reason == "Waiting":
+                known.pop(kind, None)  # to be read again
+            return Aspect(RUNNING, False, raw.reason, raw.message)
         if live is None:
-            log.info("detector %s/%s: made %s", *name, what)
+            log.info("detector %s/%s: made %s %s", *name, kind, called)
         known[kind] = raw
         self._applied[raw["metadata"]["uid"]] = digest, our_fields(raw)
         return None
@@ -148,21 +142,3 @@ class DetectorWork:
             self.book.owned(uid).pop(kind, None)
             self._applied.pop(raw["metadata"]["uid"], None)
             log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
-
-
-def _foreign(live: Object, detector: Detector, what: str) -> Aspect | None:
-    """Why the object may not be applied over, or None if it is the Detector's own."""
-    waiting = Aspect(RUNNING, False, "Waiting", "")
-    if live["metadata"].get("deletionTimestamp"):
-        return replace(waiting, message=f"{what} is being deleted; it is made again once it is gone")
-    if controller_uid(live) == detector.metadata.uid:
-        return None
-    owners = live["metadata"].get("ownerReferences") or []
-    if any((each["kind"], each["name"]) == ("Detector", detector.name) for each in owners):
-        return replace(waiting, message=f"{what} of the previous Detector of this name is still being removed")
-    return Aspect(
-        RUNNING,
-        False,
-        "ObjectExists",
-        f"{what} exists already, is not this Detector's and is left alone: delete or rename it, or rename the Detector",
-    )

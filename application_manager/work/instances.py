@@ -14,7 +14,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from application_manager.cache.cluster_cache import ClusterCache, Record
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.claims.sizes import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting

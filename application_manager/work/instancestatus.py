@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache, Record, Served
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Object, Resource
 from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
 from application_manager.core.conditions import Aspect
@@ -25,9 +25,10 @@ from application_manager.core.health.readiness import is_unseen, not_ready
 from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
 from application_manager.core.objects.ownership import Applied, ObjectKey
 from application_manager.core.objects.policy import Name
-from application_manager.core.statuses.status import Service, difference, instance_status, suspension_aspect
+from application_manager.core.statuses.status import Service, instance_status, suspension_aspect
 from application_manager.work.applying import Applier
-from application_manager.work.recorder import Reason, Recorder
+from application_manager.work.recorder import Reason
+from application_manager.work.statuses import StatusWriter
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus
 
@@ -45,19 +46,16 @@ class InstanceStatusWork:
     Attributes:
         instances: where ApplicationInstances live.
         task_changed: asks for a task's status to be looked at.
-        observe: takes an object that was read.
         nodes: tells of the cluster's nodes.
         failed_pods: tells why pods could not be made.
         again: asks for an instance at a time, in seconds since 1970.
     """
 
     cache: ClusterCache
-    client: Client
+    statuses: StatusWriter
     applier: Applier
-    recorder: Recorder
     instances: Resource
     task_changed: Callable[[Name], None]
-    observe: Callable[[Object], None]
     nodes: NodeLook
     failed_pods: FailedPodsLook
     again: Callable[[Name, float], None]
@@ -85,21 +83,13 @@ class InstanceStatusWork:
         new = instance_status(
             instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now, suspended
         )
-        patch = difference(old.to_json() if instance.status else {}, new.to_json())
-        if patch and until > now:
+        if until > now and instance.status != new:
             self.again(name, until)
-        elif patch:
-            uid = instance.metadata.uid
-            try:
-                self.observe(await self.client.patch_status(self.instances, name[0], name[1], uid, patch))
-            except ApiError as error:
-                if error.terminating or error.code in (404, 409):  # the instance is gone, or another has its name
-                    return
-                raise
-            self.recorder.transitions(instance, old.conditions, new.conditions, now)
-            if old.release_time is None and new.release_time is not None:
-                note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
-                self.recorder.say(instance, Reason.LINGERING, note, now)
+        elif not await self.statuses.write(self.instances, instance, instance.status, new, now):
+            return
+        elif old.release_time is None and new.release_time is not None:
+            note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
+            self.statuses.recorder.say(instance, Reason.LINGERING, note, now)
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message
         reason = ""

@@ -23,10 +23,10 @@ import zenoh
 
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.objects.policy import Name
+from wayside.backoff import Backoff
 
 _ALL = "wayside/instances/*/*/configuration"
-_RETRIES = (0.2, 0.5, 1.0, 2.0)
-"""Seconds between attempts to reach the network; the last one repeats."""
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 2.0  # s between attempts to reach the network
 _REPEATS = (0.0, 1.0, 5.0)
 """Seconds after a new connection at which all is published: what is put before the other side has told of its
 subscribers reaches nobody."""
@@ -165,17 +165,16 @@ class Publisher:
             del queryable, listener
 
     def _opened(self, config: zenoh.Config) -> zenoh.Session | None:
-        attempt = 0
+        backoff = Backoff(_FIRST_PAUSE, _LONGEST_PAUSE)
         while True:
             try:
                 return zenoh.open(config)
             except zenoh.ZError as error:
-                if attempt == 0:
+                if backoff.failures == 0:
                     log.warning("zenoh cannot be reached, configurations are not published there; trying on: %s", error)
             with self._lock:
-                if self._lock.wait_for(lambda: self._ended, _RETRIES[min(attempt, len(_RETRIES) - 1)]):
+                if self._lock.wait_for(lambda: self._ended, backoff.fail()):
                     return None
-            attempt += 1
 
     def _next(self) -> list[tuple[str, bytes | None]] | None:
         """Wait for news; None once we are to end."""

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from application_manager.cluster.client import EVENTS, ApiError, Client, Unreachable
+from application_manager.cluster.client import EVENTS, Client
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.conditions import changed
 from application_manager.core.health.pods import TroubleReason
 from application_manager.core.statuses.allowance import Allowance

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cache.store import Entry
 from application_manager.cache.surroundings import surroundings
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Resource
 from application_manager.core.objects.policy import KindKey, Name
 from application_manager.core.statuses.rulestatus import DETECTOR_INVALID, RULE_INVALID, unreadable_status
-from application_manager.core.statuses.status import difference
-from application_manager.work.recorder import Recorder
+from application_manager.work.statuses import StatusWriter
 from application_manager.workers.jobs import DetectorStatusJob, RuleJob, RuleStatusJob
 from application_manager.workers.pool import ExceededError, Runs
 from wayside.api import Detector, EventRule
@@ -34,16 +32,13 @@ class RuleWork:
 
     Attributes:
         resources: where EventRules and Detectors live.
-        observe: takes an object that was read.
         pool: where they are judged.
         detectors: what is known of those that the manager runs.
     """
 
     cache: ClusterCache
-    client: Client
-    recorder: Recorder
+    statuses: StatusWriter
     resources: dict[KindKey, Resource]
-    observe: Callable[[Object], None]
     pool: Runs
     detectors: DetectorIndex = field(default_factory=DetectorIndex)
 
@@ -58,19 +53,9 @@ class RuleWork:
             return
         now = time.time()
         metadata = Metadata.model_validate(entry.raw["metadata"])
-        written = entry.raw.get("status")
         old, new = await self._judged(kind, name, entry, now)
-        patch = difference(old.to_json() if written else {}, new.to_json())
-        if not patch:
-            return
-        try:
-            self.observe(await self.client.patch_status(self.resources[kind], name[0], name[1], metadata.uid, patch))
-        except ApiError as error:
-            if error.terminating or error.code == 404:
-                return
-            raise
-        about = Kind(kind=self.resources[kind].kind, metadata=metadata)
-        self.recorder.transitions(about, old.conditions, new.conditions, now)
+        regarding = Kind(kind=self.resources[kind].kind, metadata=metadata)
+        await self.statuses.write(self.resources[kind], regarding, old if entry.raw.get("status") else None, new, now)
 
     async def _judged(self, kind: KindKey, name: Name, entry: Entry, now: float) -> tuple[Status, Status]:
         """The status as it is and as it should be."""

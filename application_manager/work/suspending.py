@@ -10,7 +10,8 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.objects.ownership import controller_uid
 from application_manager.core.objects.rendering import Rendering
 from application_manager.core.objects.suspension import ObjectKey

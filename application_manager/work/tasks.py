@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict, gathered
 from application_manager.core.conditions import changed
@@ -16,10 +17,10 @@ from application_manager.core.demand.demand import finished
 from application_manager.core.demand.fallback import FALLEN_BACK, turned
 from application_manager.core.objects import trimming
 from application_manager.core.objects.policy import Name
-from application_manager.core.statuses.status import Service, difference, finished_since, task_status, together
+from application_manager.core.statuses.status import Service, finished_since, task_status, together
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces
-from application_manager.work.recorder import Recorder
+from application_manager.work.statuses import StatusWriter
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import ApplicationTaskStatus
 from wayside.api.documents import parse_object
@@ -52,7 +53,7 @@ class TaskWork:
 
     cache: ClusterCache
     client: Client
-    recorder: Recorder
+    statuses: StatusWriter
     tasks: Resource
     templates: Resource
     ttl: float
@@ -92,22 +93,17 @@ class TaskWork:
         now = time.time()
         old = task.status or ApplicationTaskStatus()
         new = task_status(task, verdict, service, now)
-        patch = difference(old.to_json() if task.status else {}, new.to_json())
         try:
-            if patch:
-                uid = task.metadata.uid
-                self.observe(await self.client.patch_status(self.tasks, name[0], name[1], uid, patch))
-                own = [each for each in new.conditions if each.type in _OWN_CONDITIONS]
-                self.recorder.transitions(task, old.conditions, own, now)
-                self._measure(task, old, new, now)
-                if self.traces is not None:
-                    self.traces.told(task, old, new)
+            if not await self.statuses.write(self.tasks, task, task.status, new, now, _OWN_CONDITIONS):
+                return
+            self._measure(task, old, new, now)
+            if self.traces is not None:
+                self.traces.told(task, old, new)
             if verdict.standing is Standing.FINISHED:
                 await self._expire(name)
         except ApiError as error:
-            if error.terminating or error.code == 404:  # the task or its namespace is gone
-                return
-            raise
+            if not error.terminating:
+                raise
 
     def _measure(
         self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus, now: float

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 
 from application_manager.cache.cluster_cache import TEMPLATE, ClusterCache
 from application_manager.cache.overlap_index import Turn
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Resource
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
 from application_manager.core.objects.policy import Name
-from application_manager.core.statuses.status import difference, template_status
-from application_manager.work.recorder import Reason, Recorder
+from application_manager.core.statuses.status import template_status
+from application_manager.work.recorder import Reason
+from application_manager.work.statuses import StatusWriter
 from application_manager.workers.jobs import TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
 from wayside.api.applicationtemplate import ApplicationTemplateStatus, TemplateManager
@@ -26,16 +27,13 @@ class TemplateWork:
 
     Attributes:
         templates: where ApplicationTemplates live.
-        observe: takes an object that was read.
         pool: where templates are judged.
         again: asks for a template at a time, in seconds since 1970.
     """
 
     cache: ClusterCache
-    client: Client
-    recorder: Recorder
+    statuses: StatusWriter
     templates: Resource
-    observe: Callable[[Object], None]
     pool: Runs
     again: Callable[[Name, float], None]
 
@@ -48,6 +46,7 @@ class TemplateWork:
         if entry is None:
             return
         metadata = Metadata.model_validate(entry.raw["metadata"])
+        regarding = Kind(kind=self.templates.kind, metadata=metadata)
         now = time.time()
         old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
         own = self.cache.overlap.own()
@@ -55,33 +54,18 @@ class TemplateWork:
         if turn is not Turn.ACT:
             self.again(name, when)
             if turn is Turn.CHALLENGE and own is not None:
-                await self._challenge(name, metadata, own, now)
+                await self._challenge(regarding, own, now)
             return
         findings = await self._findings(name)
         new = template_status(old, metadata.generation, findings, len(self.cache.instances_of(name)), now, own)
-        patch = difference(old.to_json() if entry.raw.get("status") else {}, new.to_json())
-        if not patch:
-            return
-        if await self._write(name, metadata, patch):
-            about = Kind(kind=self.templates.kind, metadata=metadata)
-            self.recorder.transitions(about, old.conditions, new.conditions, now)
+        await self.statuses.write(self.templates, regarding, old if entry.raw.get("status") else None, new, now)
 
-    async def _challenge(self, name: Name, metadata: Metadata, own: TemplateManager, now: float) -> None:
-        """See by the template's status whether the manager is alive that looks after the namespace as well."""
-        about, other = Kind(kind=self.templates.kind, metadata=metadata), self.cache.overlap.waits_for(name[0])
+    async def _challenge(self, regarding: Kind, own: TemplateManager, now: float) -> None:
+        """Find out by the template's status whether the manager is alive that looks after the namespace as well."""
+        other = self.cache.overlap.waits_for(regarding.namespace)
         note = f"the managers of the Leases {other} and {own.lease} look after this namespace: the second one waits"
-        self.recorder.say(about, Reason.MANAGERS_OVERLAP, note, now, once=True)
-        await self._write(name, metadata, {"manager": own.to_json()})
-
-    async def _write(self, name: Name, metadata: Metadata, patch: Object) -> bool:
-        """Write the status; whether the template was there."""
-        try:
-            self.observe(await self.client.patch_status(self.templates, name[0], name[1], metadata.uid, patch))
-        except ApiError as error:
-            if error.terminating or error.code == 404:
-                return False
-            raise
-        return True
+        self.statuses.recorder.say(regarding, Reason.MANAGERS_OVERLAP, note, now, once=True)
+        await self.statuses.merge(self.templates, regarding, {"manager": own.to_json()})
 
     async def _findings(self, name: Name) -> Findings:
         template = self.cache.template(name)

@@ -12,16 +12,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import random
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Hashable
 from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
-from application_manager.cluster.client import ApiError, NotGranted, Unreachable
+from application_manager.cluster.errors import ApiError, NotGranted, Unreachable
 from application_manager.core.turns import Turns
 from application_manager.measures import Measures
+from wayside.backoff import pause_after
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -71,7 +71,7 @@ class WorkQueue(Generic[Key]):
         self._queued: set[Key] = set()
         self._running: dict[Key, float] = {}  # and since when, on the monotonic clock
         self._again: set[Key] = set()
-        self._failures: dict[Key, int] = {}
+        self._failures: Counter[Key] = Counter()
         self._timers: dict[Key, asyncio.TimerHandle] = {}
         self._wake = asyncio.Event()
         self._ending = False
@@ -199,10 +199,8 @@ class WorkQueue(Generic[Key]):
         self._measures.reconciled(self.name, time.monotonic() - began, failed=failed)
 
     def _pause(self, key: Key, asked: float | None) -> float:
-        failures = self._failures.get(key, 0)
-        self._failures[key] = failures + 1
-        pause: float = min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** min(failures, 10))
-        return max(asked or 0.0, pause * random.uniform(0.7, 1.3))  # noqa: S311  jitter, not a secret
+        self._failures[key] += 1
+        return max(asked or 0.0, pause_after(self._failures[key], FIRST_PAUSE, LONGEST_PAUSE))
 
 
 def _heed_cancellation() -> None:

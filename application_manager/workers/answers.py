@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from application_manager.workers.pool import ExceededError, JobError, Pool, unpickled
 from application_manager.workers.process import Job
+from wayside.backoff import pause_after
 
 KEPT = 64 * 1024 * 1024  # bytes of answers
 FIRST_PAUSE = 60.0  # s until what was ended is tried again, doubled with each further time
@@ -110,8 +111,7 @@ class AnswerCache:
         kept = _Kept(question, answer)
         if isinstance(answer, Exceeded):
             kept.times = before.times + 1 if before is not None and before.question == question else 1
-            pause = min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** min(kept.times - 1, 10))
-            kept.until = time.monotonic() + pause
+            kept.until = time.monotonic() + pause_after(kept.times, FIRST_PAUSE, LONGEST_PAUSE)
         self.forget(key)
         self._kept[key] = kept
         self._size += kept.size

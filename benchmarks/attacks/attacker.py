@@ -16,8 +16,9 @@ import os
 from collections.abc import Iterator
 from typing import Any
 
-from application_manager.cluster.client import ApiError, Client
+from application_manager.cluster.client import Client
 from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.errors import ApiError
 from benchmarks.manager_memory import large as small
 from benchmarks.task_to_deployment import AT_ONCE, TASKS, TEMPLATE, TEMPLATES, task
 from tests.worker_jobs import TEXT

@@ -14,8 +14,8 @@ from contextlib import aclosing
 from dataclasses import dataclass
 
 from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.backoff import Backoff
 from detector.cluster.errors import ApiError, GoneError, UnavailableError
+from wayside.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 

@@ -11,7 +11,8 @@ import pytest
 import yaml
 from kubernetes.aio.client import Configuration
 
-from application_manager.cluster.client import LEASES, ApiError, Client
+from application_manager.cluster.client import LEASES, Client
+from application_manager.cluster.errors import ApiError
 from application_manager.cluster.podaccount import use_pod_account
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane

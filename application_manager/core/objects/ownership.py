@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from application_manager.core.conditions import Aspect
-from wayside.api import API_VERSION, ApplicationInstance
+from wayside.api import API_VERSION, Kind
 from wayside.api.applicationinstance import ObjectReference
 
 FIELD_MANAGER = "wayside"
@@ -72,27 +72,28 @@ def _controller(live: Mapping[str, Any]) -> Mapping[str, Any] | None:
     return next((each for each in owners if each.get("controller")), None)
 
 
-def foreign(live: Mapping[str, Any], instance: ApplicationInstance, recorded: str | None, what: str) -> Obstacle | None:
-    """Why the object may not be applied over, or None if it is the instance's own."""
+def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | None = None) -> Obstacle | None:
+    """Why the object may not be applied over, or None if it is the owner's.
+
+    Args:
+        live: the object.
+        owner: the instance or Detector that wants to have it.
+        what: the object's kind and name.
+        recorded: its uid, if the owner's status lists it; None: it does not.
+    """
     if live["metadata"].get("deletionTimestamp"):
         return Obstacle("Waiting", f"{what} is being deleted; it is applied again once it is gone")
     controller = _controller(live)
     if controller is None:
         if live["metadata"]["uid"] == recorded:
             return None
-    elif controller["uid"] == instance.metadata.uid:
+    elif controller["uid"] == owner.metadata.uid:
         return None
-    elif (controller["apiVersion"], controller["kind"], controller["name"]) == (
-        API_VERSION,
-        instance.kind,
-        instance.name,
-    ):
-        return Obstacle("Waiting", f"{what} of the previous instance of this name is still being removed")
-    owner = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
-    return Obstacle(
-        "ObjectExists",
-        f"{what} exists already, {owner} and is left alone: delete or rename it, or give another name in the template",
-    )
+    elif (controller["apiVersion"], controller["kind"], controller["name"]) == (API_VERSION, owner.kind, owner.name):
+        return Obstacle("Waiting", f"{what} of the previous {owner.kind} {owner.name} is still being removed")
+    whose = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
+    remedy = f"delete or rename it, or choose another name for the one of {owner.kind} {owner.name}"
+    return Obstacle("ObjectExists", f"{what} exists already, {whose} and is left alone: {remedy}")
 
 
 def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:

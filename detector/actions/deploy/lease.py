@@ -30,8 +30,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.backoff import Backoff
 from detector.cluster.errors import AlreadyExistsError, ApiError, ConflictError, NotFoundError
+from wayside.backoff import Backoff
 from wayside.leases import DEFAULT_DURATION, HOLDER_LEASE_LABEL, lease_name
 
 _log = logging.getLogger(__name__)

@@ -28,10 +28,10 @@ from detector.actions.deploy.stores import (
     TaskRefusedError,
     TaskStore,
 )
-from detector.cluster.backoff import Backoff
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.plain import plain
 from detector.tracing import EpisodeTraces
+from wayside.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from detector.actions.deploy.queue import WorkQueue
-from detector.cluster.backoff import Backoff
+from wayside.backoff import Backoff
 
 
 def test_names_come_in_order_and_once() -> None:

@@ -12,7 +12,8 @@ from kubernetes.aio.client import Configuration
 
 from application_manager.admission.admission import Admission
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
-from application_manager.cluster.client import ApiError, Client, Resource
+from application_manager.cluster.client import Client, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import LONGEST, MOST_TOLD, ReviewError, answer, read
 from application_manager.core.findings.webhooks import Place, webhook_configuration

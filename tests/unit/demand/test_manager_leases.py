@@ -10,7 +10,8 @@ from kubernetes.aio.client import Configuration
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
-from application_manager.cluster.client import LEASES, ApiError, Client, Resource
+from application_manager.cluster.client import LEASES, Client, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.holders.leases import (
     RAREST_LOOK,
     HealthyTime,

@@ -8,7 +8,8 @@ from typing import cast
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
-from application_manager.cluster.client import ApiError, Client, Object, Resource
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError
 from application_manager.core.objects.policy import Name, Policy
 from application_manager.work.applying import Applier
 from application_manager.work.instances import InstanceWork

@@ -12,7 +12,8 @@ from aiohttp import web
 from kubernetes.aio.client import Configuration
 
 from application_manager.cluster import fence
-from application_manager.cluster.client import LEASES, ApiError, Client, NotActive, Unreachable
+from application_manager.cluster.client import LEASES, Client
+from application_manager.cluster.errors import ApiError, NotActive, Unreachable
 from application_manager.cluster.pacing import Pacing
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]

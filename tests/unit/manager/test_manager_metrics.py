@@ -12,8 +12,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import ApiError
 from application_manager.cluster.connection import ConfigurationError
+from application_manager.cluster.errors import ApiError
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
 from application_manager.headroom import Headroom

@@ -12,7 +12,7 @@ import kopf
 import pytest
 from kopf._cogs.clients import api, watching
 
-from application_manager.cluster.client import Unreachable
+from application_manager.cluster.errors import Unreachable
 from application_manager.measures import Measures
 from application_manager.watching.relay import relaying
 

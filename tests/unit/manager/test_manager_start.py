@@ -7,7 +7,7 @@ import logging
 
 import pytest
 
-from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.starting import until_answered
 
 

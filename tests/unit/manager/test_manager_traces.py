@@ -14,6 +14,7 @@ from application_manager.cluster.client import Client, Object, Resource
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces
 from application_manager.work.recorder import Recorder
+from application_manager.work.statuses import StatusWriter
 from application_manager.work.tasks import TaskWork
 from tests.otlp import Received, Receiver
 from tests.unit.manager.memory_server import CONFIG_MAPS, TASKS, MemoryServer, a_world, raw, work_on
@@ -66,7 +67,7 @@ def spans(monkeypatch: pytest.MonkeyPatch, run: Run) -> dict[str, Received]:
             work = TaskWork(
                 cache=cache,
                 client=client,
-                recorder=Recorder(client),
+                statuses=StatusWriter(client, Recorder(client), cache.store.put),
                 tasks=TASKS,
                 templates=TASKS,
                 ttl=60,

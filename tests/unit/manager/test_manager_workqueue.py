@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from application_manager.cluster.client import ApiError, Unreachable
+from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.work import workqueue
 from application_manager.work.workqueue import WorkQueue
 

@@ -14,6 +14,7 @@ from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.rulestatus import detector_status, rule_status
 from application_manager.work.recorder import Recorder
 from application_manager.work.rulework import RuleWork
+from application_manager.work.statuses import StatusWriter
 from tests.inprocess import InProcess
 from tests.unit.manager_objects import NOW
 from wayside.api import API_VERSION, Detector, EventRule
@@ -143,7 +144,7 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
     async def reconcile_twice() -> None:
         client = Accepting(Configuration())
         resources = {(API_VERSION, kind): Resource(API_VERSION, kind, f"{kind.lower()}s")}
-        work = RuleWork(cache, client, Recorder(client), resources, observe, InProcess())
+        work = RuleWork(cache, StatusWriter(client, Recorder(client), observe), resources, InProcess())
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await client.close()

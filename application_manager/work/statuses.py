@@ -1,0 +1,78 @@
+"""Writing the statuses of all kinds: only what differs, and Events about the conditions that changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from application_manager.cluster.client import Client, Object, Resource
+from application_manager.cluster.errors import ApiError
+from application_manager.core.statuses.status import difference
+from application_manager.work.recorder import Recorder
+from wayside.api.base import Condition, Kind
+
+
+class Status(Protocol):
+    """The status of one of our kinds."""
+
+    @property
+    def conditions(self) -> Sequence[Condition]:
+        """Its conditions."""
+
+    def to_json(self) -> dict[str, Any]:
+        """It as the API server has it."""
+
+
+@dataclass(frozen=True, slots=True)
+class StatusWriter:
+    """Writes statuses.
+
+    Attributes:
+        observe: puts the API server's answer into the cache.
+    """
+
+    client: Client
+    recorder: Recorder
+    observe: Callable[[Object], None]
+
+    async def write(
+        self,
+        resource: Resource,
+        regarding: Kind,
+        old: Status | None,
+        new: Status,
+        now: float,
+        conditions: Collection[str] | None = None,
+    ) -> bool:
+        """Write what of a status is new, if anything; whether the object is there.
+
+        Args:
+            resource: where the kind lives.
+            regarding: the object.
+            old: its status; None where it has none.
+            new: its status from now on.
+            now: seconds since 1970.
+            conditions: the types of conditions whose changes are worth an Event; None: all.
+
+        Raises ApiError or Unreachable for what may pass.
+        """
+        patch = difference(old.to_json() if old is not None else {}, new.to_json())
+        if not patch:
+            return True
+        if not await self.merge(resource, regarding, patch):
+            return False
+        worth = [each for each in new.conditions if conditions is None or each.type in conditions]
+        self.recorder.transitions(regarding, old.conditions if old is not None else (), worth, now)
+        return True
+
+    async def merge(self, resource: Resource, regarding: Kind, patch: Object) -> bool:
+        """Merge into the status, null removes a field; whether the object is there. Raises the same."""
+        namespace, name, uid = regarding.namespace, regarding.name, regarding.metadata.uid
+        try:
+            self.observe(await self.client.patch_status(resource, namespace, name, uid, patch))
+        except ApiError as error:
+            if error.terminating or error.code == 404 or error.replaced:
+                return False
+            raise
+        return True
