@@ -12,6 +12,7 @@ from detector.engine.samples.liveliness import LIVELINESS
 from detector.engine.samples.sample import Decoder
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
+from detector.maps import known_places
 from detector.models.binding import bind_models
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import plugin_problems
@@ -27,6 +28,7 @@ from wayside.keys import KeyPattern
 from wayside.rules import (
     CompiledRule,
     Fields,
+    KnownPlaces,
     RuleError,
     RuleProblem,
     compile_rule,
@@ -53,6 +55,8 @@ class Inlets:
     read_key: KeyReader
     fields: Mapping[str, Fields]
     types: RosTypes
+    places: KnownPlaces
+    """Those that rules can name, the ones of map files among them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +103,8 @@ def inlets(detector: Detector) -> Inlets:
         problems += stream_problems(stream, index, known)
     problems += source_problems(detector)
     problems += place_problems(detector)
+    places, of_maps = known_places(detector)
+    problems += of_maps
     if problems:
         raise DetectorError(problems)
     patterns = {stream.name: KeyPattern.parse(stream.key) for stream in detector.spec.streams}
@@ -117,7 +123,7 @@ def inlets(detector: Detector) -> Inlets:
         client = clients[stream] or captures["client"]
         return (client, captures) if CLIENT_NAME.fullmatch(client) else None
 
-    return Inlets(decoders, read_key, fields, types)
+    return Inlets(decoders, read_key, fields, types, places)
 
 
 def detector_problems(detector: Detector) -> tuple[RuleProblem, ...]:
@@ -188,7 +194,11 @@ class RuleIndex:
         return list(self._good.values())
 
     def compile(
-        self, rules: Sequence[EventRule], detector: Detector, fields: Mapping[str, Fields]
+        self,
+        rules: Sequence[EventRule],
+        detector: Detector,
+        fields: Mapping[str, Fields],
+        places: KnownPlaces | None = None,
     ) -> tuple[list[CompiledRule], list[Refusal]]:
         """The rules to evaluate, and the refused ones."""
         compiled: list[CompiledRule] = []
@@ -198,11 +208,11 @@ class RuleIndex:
         for rule in rules:
             try:
                 known = (*wrong.get(rule.name, ()), *offer_problems(rule, detector))
-                compiled.append(bind_models(compile_rule(rule, detector, fields, known)))
+                compiled.append(bind_models(compile_rule(rule, detector, fields, known, places)))
                 good[rule.name] = rule
             except RuleError as error:
                 before = self._good.get(rule.name)
-                last = None if before is None else _compiled(before, detector, fields)
+                last = None if before is None else _compiled(before, detector, fields, places)
                 refused.append(Refusal(rule, error.problems, kept=last is not None))
                 if before is not None and last is not None:
                     compiled.append(last)
@@ -211,10 +221,12 @@ class RuleIndex:
         return compiled, refused
 
 
-def _compiled(rule: EventRule, detector: Detector, fields: Mapping[str, Fields]) -> CompiledRule | None:
+def _compiled(
+    rule: EventRule, detector: Detector, fields: Mapping[str, Fields], places: KnownPlaces | None
+) -> CompiledRule | None:
     """The rule, or None where the Detector no longer allows it."""
     try:
-        return bind_models(compile_rule(rule, detector, fields, offer_problems(rule, detector)))
+        return bind_models(compile_rule(rule, detector, fields, offer_problems(rule, detector), places))
     except RuleError:
         return None
 

@@ -137,7 +137,7 @@ def _rule_problems(
     for of_detector, detector, entries in selecting:
         try:
             known = (*wrong[detector.name].get(rule.name, ()), *offer_problems(rule, detector))
-            compiled = compile_rule(rule, detector, entries.fields, known)
+            compiled = compile_rule(rule, detector, entries.fields, known, entries.places)
             bind_models(compiled)
         except RuleError as error:
             for each in error.problems:

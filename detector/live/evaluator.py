@@ -332,7 +332,7 @@ class Evaluator:
 
     def _apply_rules(self, rule_set: RuleSet) -> list[Event]:
         entries = inlets(rule_set.detector)
-        compiled, refused = self._rule_index.compile(rule_set.rules, rule_set.detector, entries.fields)
+        compiled, refused = self._rule_index.compile(rule_set.rules, rule_set.detector, entries.fields, entries.places)
         for refusal in refused:
             _log.error("%s", refusal)
         self.status.refused(refused)

@@ -153,7 +153,7 @@ class Replay:
 
     def set_rules(self, rules: Sequence[EventRule]) -> None:
         """Go on with these rules."""
-        compiled, refused = self._rule_index.compile(rules, self._detector, self._entries.fields)
+        compiled, refused = self._rule_index.compile(rules, self._detector, self._entries.fields, self._entries.places)
         self.outcome.refusals += refused
         self.outcome.rules |= {rule.name: rule for rule in rules}
         if self._recorders is not None:

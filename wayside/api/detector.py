@@ -22,7 +22,7 @@ from wayside.api.base import (
 )
 from wayside.api.constants import Constants
 from wayside.api.database import Database
-from wayside.api.place import Place
+from wayside.api.place import MapFile, Place
 from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
 from wayside.api.selector import LabelSelector
@@ -169,6 +169,12 @@ class DetectorSpec(Model):
         max_length=512,
         description='The areas, lines and lanes that rules can name, as in at(position, "crossing").',
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+    )
+    maps: list[MapFile] = Field(
+        default_factory=list,
+        max_length=16,
+        description="Files with more places. Lanelet2 maps, and origin, need the extra maps.",
+        json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
     buffer: Buffer = Field(default=Buffer(), description="The limits of the buffer of samples.")
     client_timeout: PositiveDuration = Field(

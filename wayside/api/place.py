@@ -64,3 +64,39 @@ class Place(Model):
         if self.width is not None and (self.line is None or self.area is not None):
             raise ValueError(_WIDTH)
         return self
+
+
+class Origin(Model):
+    """The point of the Earth at which the metres of a map begin."""
+
+    latitude: float = Field(ge=-90, le=90, description="Degrees north (WGS 84).")
+    longitude: float = Field(ge=-180, le=180, description="Degrees east (WGS 84).")
+
+
+class Projection(StrEnum):
+    """How a map becomes flat."""
+
+    UTM = "Utm"
+    LOCAL_CARTESIAN = "LocalCartesian"
+
+
+class MapFile(Model):
+    """A file with places."""
+
+    file: str = Field(
+        min_length=1,
+        max_length=1024,
+        description="The path of a GeoJSON file (.geojson, .json) or a lanelet2 map (.osm), as the detector sees it: "
+        "relative to its working directory, or on a mounted volume. Names of places are the name in its properties or "
+        "tags, or the id.",
+    )
+    origin: Origin | None = Field(
+        default=None,
+        description="The point at which x and y are 0: the places are in metres, by projection. Default: they are "
+        "on the Earth, in degrees.",
+    )
+    projection: Projection = Field(
+        default=Projection.UTM,
+        description="Only with origin. Utm: metres of the UTM zone of the origin. LocalCartesian: metres east and "
+        "north on the plane that touches the Earth there.",
+    )

@@ -21,7 +21,7 @@ from wayside.rules.compiling import compile_rule
 from wayside.rules.dependencies import dependency_problems, depends, in_order
 from wayside.rules.fields import BYTES, Fields
 from wayside.rules.parameters import unknown_rules
-from wayside.rules.places import KnownPlaces, place_problems
+from wayside.rules.places import KnownPlaces, place_problems, places_of, shape_problems
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.sources import source_problems
 from wayside.rules.streams import compile_stream, stream_problems
@@ -53,6 +53,8 @@ __all__ = [
     "in_order",
     "own_problems",
     "place_problems",
+    "places_of",
+    "shape_problems",
     "source_problems",
     "stream_problems",
     "unknown_rules",

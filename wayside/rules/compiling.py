@@ -41,7 +41,7 @@ from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.models import compile_models
 from wayside.rules.naming import signal_name_problem
 from wayside.rules.parameters import kinds_of, override_problems, parameters_of
-from wayside.rules.places import KnownPlaces, located, of_conditions, of_samples, places_of
+from wayside.rules.places import KnownPlaces, located, of_conditions, of_samples, own_places
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.scopes import (
     closing_speed_problem,
@@ -71,12 +71,12 @@ def compile_rule(
 
     `fields` has the message fields of the streams that are known to have no others; what an expression reads beside
     them is a problem. `known` has problems that were found beside it, among several rules. `places` are those that it
-    can name; None: those that the Detector defines itself.
+    can name; None: those that the Detector defines itself, and any other if it has maps.
 
     Raises:
         RuleError: with every problem of the rule.
     """
-    compiler = _RuleCompiler(rule, detector, fields or {}, places or KnownPlaces(places_of(detector)))
+    compiler = _RuleCompiler(rule, detector, fields or {}, places or own_places(detector))
     compiler.problems += known
     compiled = compiler.compile()
     if compiler.problems or compiled is None:

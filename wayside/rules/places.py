@@ -79,6 +79,11 @@ def places_of(detector: Detector) -> Mapping[str, Shape]:
     return {place.name: shape_of_place(place) for at, place in enumerate(detector.spec.places) if at not in wrong}
 
 
+def own_places(detector: Detector) -> KnownPlaces:
+    """The places that rules can name, where the Detector's maps cannot be read."""
+    return KnownPlaces(places_of(detector), complete=not detector.spec.maps)
+
+
 def shape_of_place(place: Place) -> Shape:
     """The geometry of a place without problems."""
     rings = () if place.area is None else (tuple(map(_point, place.area)),)

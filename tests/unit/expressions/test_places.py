@@ -234,8 +234,9 @@ def test_every_field_is_a_field_of_some_place() -> None:
 
 def test_the_guide_is_in_step() -> None:
     text = guide("places")
-    detector, rule, pair = (yaml.safe_load(block) for block in yaml_blocks(text))
+    detector, rule, maps, pair = (yaml.safe_load(block) for block in yaml_blocks(text))
     known = a_detector(*detector["spec"]["streams"], places=detector["spec"]["places"])
+    a_detector(a_stream("pose"), **maps["spec"])
     for each in (rule, pair):
         compile_rule(a_rule(**each["spec"]), known)
     rows = re.findall(r"^\| `(\w+)` \|(?: [a-z, ]+ \|)? (.*) \|$", text, re.MULTILINE)
