@@ -1,0 +1,1 @@
+"""A generated intersection, and rules of everyday field work over it."""
