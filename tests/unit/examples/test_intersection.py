@@ -261,6 +261,13 @@ def stop_line() -> list[Span]:
     return clients(running)
 
 
+def red_light() -> list[Span]:
+    ticks = np.arange(TICKS) / 10
+    red = np.any([(ticks >= begin - 0.01) & (ticks < end - 0.01) for begin, end in RED], axis=0)
+    rows = {f"{name}+light-east": true(red, _crossed(user)) for name, user in USERS.items() if name != "light-east"}
+    return spans(rows)
+
+
 def _count(flag: Callable[[User], Doubles]) -> list[Span]:
     rows = [user.held(flag(user)) == 1 for user in USERS.values()]
     return spans({"~fleet": (np.sum(rows, axis=0) >= 3).astype(float)})
@@ -342,6 +349,7 @@ TRUTHS: dict[str, Callable[[], list[Span]]] = {
     "overtaking": overtaking,
     "wrong-way": wrong_way,
     "stop-line": stop_line,
+    "red-light": red_light,
     "queue": queue,
     "vanished": vanished,
     "position-jump": position_jump,
