@@ -92,8 +92,9 @@ load: $(BIN)/.installed-dev ## attacks on the manager from one namespace, while 
 soak: $(BIN)/.installed-dev ## an hour of traffic, faster than it happens: nothing grows, every loss is counted
 	@$(BIN)/python -m benchmarks.soak
 
-crds: $(BIN)/.installed ## write crds/ anew from the models, and what of the chart follows from the code
+crds: $(BIN)/.installed ## write crds/ anew from the models, and what of the chart and of docs/ follows from the code
 	@$(BIN)/python -m wayside.api crds
+	@$(BIN)/python -m wayside.expressions docs
 	@$(BIN)/python -m charts.generate
 
 requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by the newest that pyproject.toml allows

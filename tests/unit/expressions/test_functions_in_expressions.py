@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 
 from tests.guides import guide
 from wayside.expressions import UNKNOWN, Environment, EvaluationError, ExpressionError, Kind, Reason
+from wayside.expressions.__main__ import tables, written
 from wayside.expressions.functions import FUNCTIONS
 
 ENVIRONMENT = Environment({"msg": Kind.DYN, "area": Kind.DYN, "streams": Kind.LIST, "a": Kind.MAP, "x": Kind.DOUBLE})
@@ -172,9 +172,9 @@ def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str
         assert isinstance(result, float | bool | str | list)
 
 
-def test_every_function_is_documented_as_it_is_called_and_nothing_else() -> None:
-    text = guide("rules")
-    section = text.split("## Functions", 1)[1].split("\n## ", 1)[0]
-    rows = re.findall(r"^\| `((\w+)\([^|]*\))` \|", section, re.MULTILINE)
-    documented = {name: calls.replace("`, `", " or ") for calls, name in rows}
-    assert documented == {name: function.usage() for name, function in FUNCTIONS.items()}
+def test_the_tables_in_the_guides_are_those_of_the_code() -> None:
+    for page, of_page in tables().items():
+        text = guide(page.removesuffix(".md"))
+        assert written(text, of_page) == text, "run `make crds`"
+    with pytest.raises(ValueError, match="there is no table with the first column function"):
+        written("# A page\n", tables()["rules.md"])

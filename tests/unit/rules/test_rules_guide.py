@@ -10,6 +10,7 @@ import yaml
 
 from tests.driving import a_detector, a_rule, a_stream
 from tests.guides import guide, yaml_blocks
+from wayside.api.eventrule import Aggregate
 from wayside.expressions import UNKNOWN, Environment, Kind
 from wayside.rules import CompiledRule, compile_rule
 
@@ -67,3 +68,9 @@ def test_the_value_that_the_example_sets_for_a_client_is_the_one_it_has() -> Non
     )
     assert compiled.parameters.of("truck-1")["maxSpeed"] == 8.3
     assert compiled.parameters.of("car")["maxSpeed"] == 13.9
+
+
+def test_every_aggregate_is_in_the_table() -> None:
+    section = GUIDE.split("### Aggregates", 1)[1].split("\n## ", 1)[0]
+    rows = re.findall(r"^\| ([A-Z][A-Za-z, ]+?)(?: \(default\))? \|", section, re.MULTILINE)
+    assert {name for row in rows for name in row.split(", ")} == {*Aggregate}
