@@ -24,6 +24,7 @@ from detector.findings import (
     ZERO_STAMPS,
 )
 from detector.streams.tally import Tally
+from wayside.api.detector import DetectorSpec
 from wayside.findings import Finding
 from wayside.rules import PairSubject
 
@@ -197,11 +198,12 @@ class Losses:
             last = counters.last_undecodable.get(name, "")
             unread = f"times a sample of stream {name} could not be read"
             yield Loss(unread, count, last, cause="undecodable", stream=name)
+        spec = self._engine.detector.spec
         for name, count in counters.unnamed.items():
-            unnamed = f"samples of stream {name} dropped because neither key nor message names a client"
+            unnamed = f"{_samples(spec, name)} of stream {name} dropped because neither key nor message names a client"
             yield Loss(unnamed, count, counters.last_unnamed.get(name, ""), cause="unnamed", stream=name)
         for name, count in counters.crowded.items():
-            crowded = f"samples of stream {name} dropped because too many clients are known"
+            crowded = f"{_samples(spec, name)} of stream {name} dropped because too many clients are known"
             yield Loss(crowded, count, cause="crowded", stream=name)
         for name, rule in counters.rules.items():
             yield Loss(f"evaluation errors in EventRule {name}", rule.errors, rule.last_error, cause="error", rule=name)
@@ -246,3 +248,9 @@ def _right(delays: Mapping[str, int]) -> tuple[str, int]:
     nearest = {name: delay for name, delay in delays.items() if name not in ahead} or ahead
     name = min(nearest, key=nearest.__getitem__, default="")
     return name, delays.get(name, 0)
+
+
+def _samples(spec: DetectorSpec, stream: str) -> str:
+    """What the stream's samples are."""
+    found = spec.stream(stream)
+    return "samples" if found is None or found.items is None else "items"

@@ -198,7 +198,7 @@ class Engine:
         self._starts.started(event)
         self.consequences.begin(run.rule.actions, run.rule, event, resumed=True)
         for client in episode.subject.clients:
-            self.clients.heard(client, now)
+            self.clients.restore(client, now)
         return []
 
     def _ended_while_away(self, episode: OpenEpisode, now: int) -> Event:
@@ -309,7 +309,7 @@ class Engine:
             alone_after=spec.client_timeout.ns,
             maximum_bytes=spec.buffer.bytes.bytes,
             stamp_of=self._known.stamp_of,
-            client_of=self._known.ingest.client_of,
+            client_of=self._known.ingest.sender_of,
             latched=_latched(self.detector),
             exact=self._exact,
         )

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from detector.engine.buffering.buffer import Buffer, bytes_of
 from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.ingest import Ingest
+from detector.engine.buffering.items import Items
 from detector.engine.buffering.lanes import lane_makers
 from detector.engine.buffering.messages import KeyReader, Messages
 from detector.engine.buffering.naming import MessageClients
@@ -100,9 +101,10 @@ class Knowledge:
             now,
         )
         self._lane_makers = lane_makers(detector, decoders)
-        names = MessageClients(decoders, compiled, self._counters)
+        items = Items(decoders, compiled)
+        names = MessageClients(decoders, compiled, items, self._counters)
         self.ingest.configure(detector, read_key, self._lane_makers, names)
-        self.messages = Messages(decoders, compiled, read_key, self._counters)
+        self.messages = Messages(decoders, compiled, read_key, items, self._counters)
         self.transforms = Transforms(_transform_streams(detector), self.buffer, self.messages, self._counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
         possible = Possible(spec.streams)
@@ -144,7 +146,7 @@ class Knowledge:
 
     def fits(self, arrivals: Sequence[Arrival]) -> bool:
         """Whether the buffer takes in the arrivals without pushing anything out."""
-        return self.buffer.bytes + bytes_of(arrivals) <= self.buffer.maximum_bytes
+        return self.buffer.bytes + bytes_of(arrivals) + self.ingest.overhead_of(arrivals) <= self.buffer.maximum_bytes
 
     def new_tables(self) -> None:
         """Begin with new tables: rules that are evaluated in columns have to be set again."""
@@ -190,9 +192,9 @@ class Knowledge:
         """By stream, the known clients of which these samples are."""
         found: dict[str, set[str]] = {}
         for arrival in arrivals:
-            client = self.ingest.client_of(arrival)
-            if client is not None and client in self.clients:
-                found.setdefault(arrival.stream, set()).add(client)
+            for client in self.ingest.clients_of(arrival):
+                if client in self.clients:
+                    found.setdefault(arrival.stream, set()).add(client)
         return {stream: frozenset(clients) for stream, clients in found.items()}
 
     def latency(self, sample: Sample, stream: str) -> float | None:
@@ -236,10 +238,8 @@ def _transform_streams(detector: Detector) -> list[TransformStream]:
 
 def _reads_like(stream: Stream, before: Stream | None) -> bool:
     """Whether samples taken in before can be read as ones of the stream."""
-    return before is not None and (stream.key, stream.client, stream.encoding, stream.type, stream.latched) == (
-        before.key,
-        before.client,
-        before.encoding,
-        before.type,
-        before.latched,
-    )
+    return before is not None and _reading(stream) == _reading(before)
+
+
+def _reading(stream: Stream) -> tuple[object, ...]:
+    return stream.key, stream.client, stream.items, stream.encoding, stream.type, stream.latched

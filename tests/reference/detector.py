@@ -102,8 +102,19 @@ class Reference:
             self.now = self.world.floor = sample.time - 1
         self.waiting.append(sample)
         self._enter(self.now)
+        self._heard(sample.time)
+
+    def nothing(self, time: int) -> None:
+        """A message without any item comes."""
+        if self.lateness is None:
+            self.advance(time - 1)
+        elif self._begins(time):
+            self.now = self.world.floor = time - 1
+        self._heard(time)
+
+    def _heard(self, time: int) -> None:
         if self.lateness is not None:
-            self.newest = max(self.newest, sample.time)
+            self.newest = max(self.newest, time)
             self.advance(self.newest - max(self.lateness, 1))
 
     def finish(self) -> None:

@@ -161,7 +161,9 @@ def _place(position: dict[str, str], client: str, world: World, then: int, now: 
         return None
     if mine[-1].message is None:
         return None
-    axes = [mine[-1].message.get(position[axis].removeprefix("msg.")) for axis in ("x", "y")]
+    seen = {"msg": mine[-1].message, "item": mine[-1].item}
+    read = [position[axis].split(".") for axis in ("x", "y")]
+    axes = [seen[variable].get(field) for variable, field in read]
     if not all(isinstance(axis, float) and abs(axis) <= 1e12 for axis in axes):
         return None
     return (axes[0], axes[1], 0.0)

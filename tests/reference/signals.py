@@ -12,6 +12,9 @@ from tests.reference.places import Where, with_fields
 from tests.reference.world import SECOND, World
 from wayside.expressions import UNKNOWN, Environment, Expression, Kind
 
+VARIABLES = ("msg", "item", "key", "sample")
+"""Of expressions over one sample."""
+
 
 @cache
 def _compiled(source: str, names: tuple[str, ...]) -> Expression:
@@ -59,6 +62,7 @@ class Item:
     message: Any
     """None where it cannot be read."""
     sample: dict[str, float]
+    item: Any = None
 
 
 @dataclass
@@ -104,7 +108,12 @@ class Sources:
     def _items(self, signal: dict[str, Any], client: str, now: int) -> list[Item]:
         if "stream" in signal:
             return [
-                Item(each.time, each.message, {"received": each.received / SECOND, "size": float(len(each.payload))})
+                Item(
+                    each.time,
+                    each.message,
+                    {"received": each.received / SECOND, "size": float(len(each.payload))},
+                    each.item,
+                )
                 for each in self.world.kept(client, signal["stream"], now)
             ]
         mine = [
@@ -117,16 +126,16 @@ class Sources:
 
     def _picked(self, signal: dict[str, Any], items: list[Item]) -> Iterator[Item]:
         for item in items:
-            if truth(signal.get("where"), _variables(item), ("msg", "key", "sample")) is True:
+            if truth(signal.get("where"), _variables(item), VARIABLES) is True:
                 yield item
 
 
 def _value(signal: dict[str, Any], item: Item) -> Any:
-    return _evaluated(signal["value"], _variables(item), ("msg", "key", "sample")) if "value" in signal else True
+    return _evaluated(signal["value"], _variables(item), VARIABLES) if "value" in signal else True
 
 
 def _variables(item: Item) -> dict[str, Any]:
-    known = {"key": {}, "sample": item.sample}
+    known = {"key": {}, "sample": item.sample, **({} if item.item is None else {"item": item.item})}
     return known if item.message is None else {"msg": item.message, **known}
 
 

@@ -17,12 +17,27 @@ class Sample:
     """One message, None where it cannot be read. `number` is the order of arrival."""
 
     time: int
-    number: int
+    number: float
     client: str
     stream: str
     message: Any
     payload: bytes
     received: int
+    item: Any = None
+    """The client's item of the message's list, where the stream has items."""
+    share: int | None = None
+    """How many bytes of the payload count for it; None: all."""
+
+
+def listed(message: Any) -> dict[str, Any]:
+    """The items of a message by the names of their clients: of items of one name the first."""
+    items = message.get("list") if isinstance(message, dict) else None
+    found: dict[str, Any] = {}
+    for item in items if isinstance(items, list) else []:
+        name = item.get("id") if isinstance(item, dict) else None
+        if isinstance(name, str) and name:
+            found.setdefault(name, item)
+    return found
 
 
 @dataclass
@@ -31,6 +46,8 @@ class Known:
 
     since: int
     last: int
+    items: bool
+    """Whether it is nothing but an item of lists."""
 
 
 @dataclass
@@ -51,14 +68,18 @@ class World:
     known: dict[str, Known] = field(default_factory=dict)
     floor: int | None = None
     """Windows reach back to the last gap at most."""
-    gone: dict[int, int] = field(default_factory=dict)
+    gone: dict[float, int] = field(default_factory=dict)
     """The numbers of the samples that the buffer has no more, and since when."""
+    items: frozenset[str] = frozenset()
+    """The streams with items."""
 
     def take(self, sample: Sample) -> None:
         """A sample arrives."""
         self.samples.append(sample)
-        known = self.known.setdefault(sample.client, Known(sample.time, sample.time))
+        of_items = sample.stream in self.items
+        known = self.known.setdefault(sample.client, Known(sample.time, sample.time, of_items))
         known.last = max(known.last, sample.time)
+        known.items = known.items and of_items
         held = self._held(sample.client, sample.stream)
         while len(held) > self.counts.get(sample.stream, len(held)):
             self.gone[held.pop(0).number] = sample.time
@@ -93,9 +114,15 @@ class World:
 
     def lose(self, now: int) -> set[str]:
         """Who has been silent for too long."""
-        lost = {name for name, known in self.known.items() if now - known.last > self.timeout}
+        stale = [limit for limit in (self.stale_after[stream] for stream in self.items) if limit is not None]
+        patience = min([*stale, self.timeout])
+        lost = {
+            name for name, known in self.known.items() if now - known.last > (patience if known.items else self.timeout)
+        }
         for name in lost:
             del self.known[name]
+        # An item that comes under the name of a lost client is another object.
+        self.samples = [each for each in self.samples if each.client not in lost or each.stream not in self.items]
         return lost
 
     def of(self, client: str, stream: str, now: int) -> list[Sample]:
@@ -115,4 +142,4 @@ class World:
 
 
 def _size(samples: list[Sample]) -> int:
-    return sum(len(each.payload) + OVERHEAD for each in samples)
+    return sum((len(each.payload) if each.share is None else each.share) + OVERHEAD for each in samples)

@@ -178,6 +178,17 @@ class Stream(Model):
             ".domain",
             "Forbidden",
         ),
+        (
+            "!has(self.items) || (has(self.client) && self.client.contains('item'))",
+            "items needs client, a template that names the client of each item, e.g. ${item.id}",
+            ".items",
+        ),
+        (
+            "!has(self.items) || !(self.latched || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage'))",
+            "items is not for latched streams and transforms: remove items or latched",
+            ".items",
+            "Forbidden",
+        ),
     )
 
     name: ObjectName = Field(description="The name by which rules refer to the stream.")
@@ -216,8 +227,14 @@ class Stream(Model):
         max_length=512,
         pattern=r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$",
         description="The client of the samples, if the key does not capture it: a name, or a template over the "
-        "message such as its-${msg.header.stationId}. The template is CEL over msg, and over key for the captures of "
-        "the key.",
+        "message such as its-${msg.header.stationId}. The template is CEL over msg, over key for the captures of the "
+        "key, and with items over item.",
+    )
+    items: Expression | None = Field(
+        default=None,
+        description="CEL over msg: a list, e.g. msg.objects. Each item becomes a sample of the client that "
+        "`client` names, e.g. ${item.id}, and expressions over the stream see item beside msg. Such a client is lost "
+        "when its newest sample is older than staleAfter; the same name is a new client then.",
     )
     encoding: Encoding = Field(
         description="The encoding of the payload: cdr (ROS 2 messages), json, cbor, uper (ETSI ITS messages), or raw "
@@ -293,6 +310,8 @@ class Stream(Model):
             raise ValueError("key captures the client and client names one: remove one of them")
         if not captures and self.client is None:
             raise ValueError("key does not capture the client: write ${client:*} in place of its name, or set client")
+        if self.items is not None:
+            self._check_items()
         if self.frame_prefix is not None and not self.carries_transforms:
             raise ValueError("framePrefix is for streams of type tf2_msgs/msg/TFMessage: remove it")
         if self.stale_after is not None and self.stale_after != "Never":
@@ -301,6 +320,13 @@ class Stream(Model):
             except ValueError as error:
                 raise ValueError(f"staleAfter: {error}; or Never") from None
         return self
+
+    def _check_items(self) -> None:
+        if not self.names_by_message:
+            raise ValueError("items needs client, a template that names the client of each item, e.g. ${item.id}")
+        if self.latched or self.carries_transforms:
+            what = "latched streams" if self.latched else "transforms"
+            raise ValueError(f"items is not for {what}: remove items{' or latched' if self.latched else ''}")
 
     @property
     def names_by_message(self) -> bool:

@@ -31,7 +31,18 @@ from wayside.expressions.lexer import tokens
 from wayside.expressions.numbers import MAX_EXACT, doubled
 from wayside.expressions.projection import Leaf, missing_path, no_member, normalise, project, tree
 from wayside.expressions.regex import LARGEST_PATTERN, pattern_size
-from wayside.expressions.syntax import Constant, Node, Path, arguments, calls, nothing_but_arguments, parse, paths
+from wayside.expressions.syntax import (
+    Constant,
+    Node,
+    Path,
+    Select,
+    arguments,
+    calls,
+    nothing_but_arguments,
+    parse,
+    path_of,
+    paths,
+)
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
 from wayside.geometry import Shape
 
@@ -201,6 +212,12 @@ class Expression:
     def tree(self) -> Node:
         """The syntax tree as CEL runs it: macros unfolded, numbers as doubles. Decoded at each call."""
         return parse(self._program.serialize())
+
+    @property
+    def path(self) -> Path | None:
+        """The literal path that the whole expression is; None: it is something else. Decoded at each call."""
+        tree = self.tree
+        return None if isinstance(tree, Select) and tree.test_only else path_of(tree, self.names)
 
     def evaluate(self, values: Mapping[str, object]) -> Value:
         """The result on `values`, in which null stays null; integral results are doubles, maps are sorted by key.

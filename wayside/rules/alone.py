@@ -31,7 +31,7 @@ class _AllStreams(DetectorSpec):
     """A Detector's spec with a stream of every name."""
 
     def stream(self, name: str) -> Stream | None:
-        return self.streams[0].model_copy(update={"name": name})
+        return self.streams[0].model_copy(update={"name": name, "items": "msg"})  # so that rules may read item
 
 
 @lru_cache(maxsize=1)

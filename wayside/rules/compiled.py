@@ -266,3 +266,4 @@ class CompiledStream:
     name: str
     stamp: Expression | None
     client: CompiledTemplate | None = None
+    items: Expression | None = None

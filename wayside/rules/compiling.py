@@ -51,6 +51,7 @@ from wayside.rules.scopes import (
     known_members,
     with_signals,
 )
+from wayside.rules.streams import item_fields
 from wayside.rules.variables import (
     EPISODE_MEMBERS,
     SAMPLE_MEMBERS,
@@ -252,31 +253,43 @@ class _RuleCompiler:
         self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind, element: str | None = None
     ) -> Expression | None:
         """An expression over one sample, and the element's variable; None where there is none, or it is wrong."""
-        expression = self._expression(path, source, sample_environment(element), kind, of_samples(stream, self._places))
+        items = stream is not None and stream.items is not None
+        without = "" if stream is None or items else f"; item is for streams with items, and {stream.name} has none"
+        environment = sample_environment(element, items=items)
+        expression = self._expression(path, source, environment, kind, of_samples(stream, self._places), without)
         if expression is None:
             return None
         if element is not None:
             self._members(path, expression.paths)
-        known: Fields = dict.fromkeys(SAMPLE_MEMBERS)
-        for variable, members in (("sample", known), ("parameters", dict.fromkeys(self.spec.parameters))):
+        of_sample: Fields = dict.fromkeys(SAMPLE_MEMBERS)
+        for variable, members in (("sample", of_sample), ("parameters", dict.fromkeys(self.spec.parameters))):
             for text in unknown_fields(expression.paths, variable, members):
                 self.problem(path, text)
         if stream is not None and stream.name in self.fields:
             of_type = "" if stream.type is None else f", type {stream.type}"
-            for text in unknown_fields(expression.paths, "msg", self.fields[stream.name]):
-                self.problem(path, f"{text} (stream {stream.name}{of_type})")
+            fields = self.fields[stream.name]
+            for variable, known in (("msg", fields), ("item", item_fields(stream, fields) or {})):
+                for text in unknown_fields(expression.paths, variable, known) if known else ():
+                    self.problem(path, f"{text} (stream {stream.name}{of_type})")
         return expression
 
     def _expression(
-        self, path: FieldPath, source: str | None, environment: Environment, kind: Kind, places: Places | None = None
+        self,
+        path: FieldPath,
+        source: str | None,
+        environment: Environment,
+        kind: Kind,
+        places: Places | None = None,
+        without_item: str = "",
     ) -> Expression | None:
+        """`without_item`: why there is no item, which is added to a problem about it."""
         if source is None:
             return None
         try:
             expression = self._typed(environment, places).compile(source, result=kind)
         except ExpressionError as error:
             for each in (error, *error.others):
-                self.problem(path, str(each))
+                self.problem(path, f"{each}{without_item if '`item`' in str(each) else ''}")
             return None
         self._use(expression)
         return expression

@@ -15,6 +15,10 @@ BYTES: Fields = {}
 """Those of a message that is bytes: none."""
 
 
+class Each(dict[str, "Fields | None"]):
+    """The fields of each item of a list."""
+
+
 def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iterable[str]:
     """A message for each path that starts at the variable and names a field that is not there."""
     for path in sorted(paths, key=str):
@@ -22,12 +26,31 @@ def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iter
             continue
         here: Fields | None = fields
         for depth, step in enumerate(path[1:], start=1):
+            if isinstance(here, Each):
+                if isinstance(step, str):
+                    parent = ".".join(map(str, path[:depth]))
+                    yield f"{parent} is a list and has no field {step}; read an item, e.g. {parent}[0].{step}"
+                    break
+                here = dict(here)
+                continue
             if here is None or not isinstance(step, str):
                 break
             if step not in here:
                 yield _message(".".join(map(str, path[:depth])), step, here)
                 break
             here = here[step]
+
+
+def fields_at(path: Path, fields: Fields | None) -> Fields | None:
+    """The fields of what a path below a message leads to; None where they are not known."""
+    for step in path:
+        if fields is None:
+            return None
+        if isinstance(fields, Each):
+            fields = dict(fields) if isinstance(step, int) else None
+        else:
+            fields = fields.get(str(step))
+    return fields
 
 
 def _message(parent: str, step: str, here: Fields) -> str:

@@ -23,7 +23,12 @@ _PAIRS = {
     "closingSpeed": "how fast the two come nearer",
 }
 _FLEET = {"members": "the list of the clients that belong to it"}
-_SAMPLE = {"msg": "the message", "key": "what the key captures", "sample": "the sample's times and size"}
+_SAMPLE = {
+    "msg": "the message",
+    "item": "the item of the message's list",
+    "key": "what the key captures",
+    "sample": "the sample's times and size",
+}
 
 
 def signal_name_problem(name: str, spec: EventRuleSpec) -> str | None:

@@ -9,9 +9,9 @@ from wayside.api.wording import FieldPath
 from wayside.expressions import ExpressionError, InterpolationError, Kind, compile_template
 from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.compiled import CompiledStream
-from wayside.rules.fields import Fields, unknown_fields
+from wayside.rules.fields import Each, Fields, fields_at, unknown_fields
 from wayside.rules.problems import RuleError, RuleProblem
-from wayside.rules.variables import naming_environment, sample_environment, stamp_environment
+from wayside.rules.variables import items_environment, naming_environment, sample_environment, stamp_environment
 
 
 def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> CompiledStream:
@@ -24,8 +24,10 @@ def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> 
     if problems:
         raise RuleError(problems)
     stamp = None if stream.stamp is None else stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
-    client = compile_template(stream.client, naming_environment()) if stream.names_by_message else None
-    return CompiledStream(stream.name, stamp, client)
+    of_items = stream.items is not None
+    client = compile_template(stream.client, naming_environment(items=of_items)) if stream.names_by_message else None
+    items = None if stream.items is None else items_environment().compile(stream.items, result=Kind.LIST)
+    return CompiledStream(stream.name, stamp, client, items)
 
 
 def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
@@ -34,10 +36,12 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
         KeyPattern.parse(stream.key)
     except KeyPatternError as error:
         yield RuleProblem(("spec", "streams", index, "key"), str(error))
+    if stream.items is not None:
+        yield from _items_problems(stream.items, ("spec", "streams", index, "items"), fields)
     if stream.names_by_message:
         yield from _naming_problems(stream, ("spec", "streams", index, "client"), fields)
     for axis, source in {} if stream.position is None else stream.position.axes.items():
-        yield from _sample_problems(("spec", "streams", index, "position", axis), source, fields)
+        yield from _sample_problems(("spec", "streams", index, "position", axis), source, stream, fields)
     if stream.stamp is None:
         return
     path: FieldPath = ("spec", "streams", index, "stamp")
@@ -52,25 +56,60 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
             yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, variable, members))
 
 
-def _sample_problems(path: FieldPath, source: str, fields: Fields | None) -> Iterable[RuleProblem]:
+def _sample_problems(path: FieldPath, source: str, stream: Stream, fields: Fields | None) -> Iterable[RuleProblem]:
     """The problems of an expression for a number of a sample."""
     try:
-        expression = sample_environment().compile(source, result=Kind.DOUBLE)
+        expression = sample_environment(items=stream.items is not None).compile(source, result=Kind.DOUBLE)
     except ExpressionError as error:
         yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
         return
     if "parameters" in expression.names:
         yield RuleProblem(path, "parameters belong to a rule, and a stream has none: write the number itself")
-    if fields is not None:
-        yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, "msg", fields))
+    for variable, known in (("msg", fields), ("item", item_fields(stream, fields))):
+        if known is not None:
+            yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, variable, known))
+
+
+def item_fields(stream: Stream, fields: Fields | None) -> Fields | None:
+    """The fields of the stream's items, of whose messages `fields` are known; None where they are not known."""
+    if stream.items is None or fields is None:
+        return None
+    try:
+        path = items_environment().compile(stream.items).path
+    except ExpressionError:
+        return None
+    found = None if path is None else fields_at(path[1:], fields)
+    return dict(found) if isinstance(found, Each) else None
+
+
+def _items_problems(items: str, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:
+    """The problems of an `items` expression."""
+    try:
+        expression = items_environment().compile(items, result=Kind.LIST)
+    except ExpressionError as error:
+        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        return
+    if fields is None:
+        return
+    wrong = [*unknown_fields(expression.paths, "msg", fields)]
+    yield from (RuleProblem(path, text) for text in wrong)
+    plain = expression.path
+    found = None if plain is None or wrong else fields_at(plain[1:], fields)
+    if found is not None and not isinstance(found, Each):
+        yield RuleProblem(path, f"{items} is not a list: name a field that holds a list of objects")
 
 
 def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:
     """The problems of a `client` template over the message."""
+    of_items = stream.items is not None
     try:
-        template = compile_template(stream.client, naming_environment())
+        template = compile_template(stream.client, naming_environment(items=of_items))
     except InterpolationError as error:
-        yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
+        unlisted = "" if of_items or "`item`" not in str(error) else "; item is for streams with items: add items"
+        yield from (RuleProblem(path, f"{each}{unlisted}") for each in (error, *error.others))
         return
-    if fields is not None:
-        yield from (RuleProblem(path, text) for text in unknown_fields(template.paths, "msg", fields))
+    if of_items and "item" not in template.names:
+        yield RuleProblem(path, "each item needs a client of its own: read item, e.g. ${item.id}")
+    for variable, known in (("msg", fields), ("item", item_fields(stream, fields))):
+        if known is not None:
+            yield from (RuleProblem(path, text) for text in unknown_fields(template.paths, variable, known))

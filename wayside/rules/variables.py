@@ -19,13 +19,15 @@ SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 
 
 @lru_cache(maxsize=256)
-def sample_environment(element: str | None = None) -> Environment:
+def sample_environment(element: str | None = None, *, items: bool = False) -> Environment:
     """For `value` and `where` of signals, and positions (without an element): one sample.
 
     msg is the decoded message, key the captured chunks, sample has stamp and received (seconds since the epoch),
-    latency (seconds) and size (bytes); parameters are those of the sample's client.
+    latency (seconds) and size (bytes); parameters are those of the sample's client. `items`: item is the client's item.
     """
     fixed = {"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP}
+    if items:
+        fixed["item"] = Kind.DYN
     members = {f"sample.{member}": Kind.DOUBLE for member in SAMPLE_MEMBERS}
     return Environment(_with_element(fixed, element), members)
 
@@ -37,9 +39,15 @@ def stamp_environment() -> Environment:
 
 
 @cache
-def naming_environment() -> Environment:
-    """For a stream's `client`: the decoded message, and the captured chunks of its key."""
-    return Environment({"msg": Kind.DYN, "key": Kind.MAP})
+def items_environment() -> Environment:
+    """For a stream's `items`: the decoded message."""
+    return Environment({"msg": Kind.DYN})
+
+
+@cache
+def naming_environment(*, items: bool = False) -> Environment:
+    """For a stream's `client`: the decoded message, the captured chunks of its key, and with `items` the item."""
+    return Environment({"msg": Kind.DYN, "key": Kind.MAP, **({"item": Kind.DYN} if items else {})})
 
 
 @lru_cache(maxsize=1024)

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from operator import attrgetter
 
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Item, Sample
 
 NEVER = -(2**63)
 """Before all times: nothing has come yet."""
@@ -102,7 +102,7 @@ class Lane:
                 later.append(samples.pop())
             samples.append(sample)
             samples.extend(reversed(later))
-        size = len(sample.payload) + SAMPLE_OVERHEAD
+        size = self.size_of(sample)
         self.bytes += size
         if self.maximum_bytes is not None:
             while self.bytes > self.maximum_bytes and len(samples) > 1:
@@ -116,17 +116,24 @@ class Lane:
 
     def drop_oldest(self) -> int:
         """Forget the oldest sample; returns the bytes freed."""
-        size = len(self.samples.popleft().payload) + SAMPLE_OVERHEAD
+        size = self.size_of(self.samples.popleft())
         self.bytes -= size
         return size
+
+    def size_of(self, sample: Sample) -> int:
+        """What the sample takes in the buffer, in bytes."""
+        return len(sample.payload) + SAMPLE_OVERHEAD
 
     def expire(self, now: int) -> int:
         """Forget what is older than the duration, but never the newest; returns the bytes freed."""
         samples = self.samples
         count = bisect_right(samples, now - self.duration, 0, max(len(samples) - 1, 0), key=_RECEIVED)
-        freed = bytes_of([samples.popleft() for _ in range(count)])
+        freed = self._freed([samples.popleft() for _ in range(count)])
         self.bytes -= freed
         return freed
+
+    def _freed(self, samples: Sequence[Sample]) -> int:
+        return bytes_of(samples)
 
     def step_back(self, to: int) -> None:
         """Time goes on from `to`, which is earlier: forget all samples, and that there were any."""
@@ -145,6 +152,23 @@ class Lane:
                 return
             if sample.time <= until:
                 yield sample
+
+
+class ItemLane(Lane):
+    """The items of one client on one stream with `items`: the items of a message share its payload."""
+
+    __slots__ = ()
+
+    def _decide(self) -> None:
+        """Every sample comes through `insert`."""
+        self.capped = True
+
+    def size_of(self, sample: Sample) -> int:
+        """See Lane."""
+        return (sample.share if isinstance(sample, Item) else len(sample.payload)) + SAMPLE_OVERHEAD
+
+    def _freed(self, samples: Sequence[Sample]) -> int:
+        return sum(map(self.size_of, samples))
 
 
 class Buffer:
@@ -196,10 +220,14 @@ class Buffer:
         for client, lanes in self._lanes.items():
             yield client, max(lane.latest for lane in lanes.values())
 
-    def forget(self, client: str) -> None:
-        """Drop all lanes of a client."""
-        for lane in self._lanes.pop(client, {}).values():
-            self._drop(lane)
+    def forget(self, client: str, streams: Collection[str] | None = None) -> None:
+        """Drop all lanes of a client, or those of some streams."""
+        lanes = self._lanes.pop(client, {})
+        for stream in list(lanes):
+            if streams is None or stream in streams:
+                self._drop(lanes.pop(stream))
+        if lanes:
+            self._lanes[client] = lanes
 
     def keep(self, streams: Collection[str]) -> None:
         """Drop the lanes of all other streams."""

@@ -19,6 +19,10 @@ class Presence:
 
     since: int
     last: int
+    patience: int | None = None
+    """How long it is known without a sample, in nanoseconds; None: for the Detector's `clientTimeout`."""
+    restored: bool = False
+    """Whether nothing has come from it yet: an episode about it was restored."""
 
 
 class Clients:
@@ -56,14 +60,30 @@ class Clients:
                 self._sorted = None
                 self.newest = max(self.newest, now)
 
-    def heard(self, client: str, time: int) -> None:
-        """A sample of the client, or a restored episode about it."""
-        if client not in self._present:
-            self._present[client] = Presence(time, time)
+    def heard(self, client: str, time: int, patience: int | None = None) -> None:
+        """The first sample of the client on a stream, or its liveliness token.
+
+        `patience` (ns) is given for a stream with items: a client of several streams has the longest of all.
+        """
+        presence = self._present.get(client)
+        if presence is None:
+            self._present[client] = Presence(time, time, patience)
             self._sorted = None
             self.newest = max(self.newest, time)
-            self._loss = NEVER if self._loss is None else min(self._loss, time + self._timeout)
+            timeout = self._timeout if patience is None else patience
+            self._loss = NEVER if self._loss is None else min(self._loss, time + timeout)
+        elif presence.restored:
+            presence.patience, presence.restored = patience, False
+            self._loss = NEVER
+        elif presence.patience is not None:
+            presence.patience = None if patience is None else max(patience, presence.patience)
         self.still_heard(client, time)
+
+    def restore(self, client: str, time: int) -> None:
+        """An episode about the client was restored: it is known until `clientTimeout` unless something comes."""
+        known = client in self._present
+        self.heard(client, time)
+        self._present[client].restored = not known
 
     def still_heard(self, client: str, time: int) -> None:
         """The newest sample of the client is of this time; one that is not known stays unknown."""
@@ -84,7 +104,7 @@ class Clients:
         lost = [
             name
             for name, presence in self._present.items()
-            if ((now - presence.last > self._timeout and not tokens.hold(name)) or tokens.dropped(name))
+            if ((now - presence.last > self._timeout_of(presence) and not tokens.hold(name)) or tokens.dropped(name))
             and name not in self._expected
         ]
         tokens.forget_dropped()
@@ -92,12 +112,15 @@ class Clients:
             del self._present[name]
             self._sorted = None
         waited = (
-            presence.last + self._timeout
+            presence.last + self._timeout_of(presence)
             for name, presence in self._present.items()
             if name not in self._expected and not tokens.hold(name)
         )
         self._loss = min(waited, default=None)
         return lost
+
+    def _timeout_of(self, presence: Presence) -> int:
+        return self._timeout if presence.patience is None else presence.patience
 
     def gap(self, time: int) -> None:
         """Nobody could be heard up to `time`: timeouts count from there at the earliest."""

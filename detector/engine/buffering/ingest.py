@@ -13,14 +13,17 @@ from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.lanes import LaneMaker
 from detector.engine.buffering.messages import KeyReader
-from detector.engine.buffering.naming import MessageClients
+from detector.engine.buffering.naming import MAXIMUM_ITEMS, MessageClients
 from detector.engine.counters import Counters
 from detector.engine.samples.liveliness import LIVELINESS, Token
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Sample, Stamped
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Item, Sample, Stamped
 from wayside.api import Detector
 
 MAXIMUM_CLIENTS = 100_000
 """Maximum number of known clients; samples of further ones are dropped and counted."""
+
+MAXIMUM_OBJECTS = 50_000
+"""Maximum number of known clients beyond which no item becomes a new one: object lists leave room for vehicles."""
 
 MAXIMUM_KEYS = 200_000
 """Maximum number of cached keys of a stream; further ones are read each time, which is only slower."""
@@ -63,28 +66,60 @@ class Ingest:
         self._message_clients = message_clients
         self._read_key = read_key
         self._lane_makers = lane_makers
+        self._of_items = frozenset(stream.name for stream in detector.spec.streams if stream.items is not None)
+        self._patience = {
+            stream.name: min(detector.spec.stale_after_ns(stream) or timeout, timeout)
+            for timeout in (detector.spec.client_timeout.ns,)
+            for stream in detector.spec.streams
+            if stream.items is not None
+        }
+        """By stream with items, how long a client that is nothing but such items is known without one; nanoseconds."""
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
         """By key; of streams whose messages name their client, by client, which no key is: see `_lane_of_message`."""
 
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
         """Everything that is received comes through here. `times`: None for the receive times, in order."""
         self._counters.samples.update(map(_STREAM, arrivals))
-        if times is None:
+        if times is None and (not self._of_items or self._of_items.isdisjoint(map(_STREAM, arrivals))):
             self._insert_in_order(arrivals)
             return
-        for time, arrival in zip(times, arrivals, strict=True):
+        for at, arrival in enumerate(arrivals):
             stream, key, payload = arrival.stream, arrival.key, arrival.payload
+            time = arrival.received if times is None else times[at]
+            if stream in self._of_items:
+                self._insert_items(arrival, time)
+                continue
             lane = self._lane(stream, key, time, payload)
             if lane is None:
                 if stream == LIVELINESS:
                     self._token(key, payload, time)
             else:
                 self._number += 1
-                sample = Stamped(time, self._number, payload, key)
-                self._buffer.grew(lane.insert(sample))
-                if self.noting:
-                    self.came.append(sample)
-                    self.lanes.append(lane)
+                self._put(lane, arrival if times is None else Stamped(time, self._number, payload, key))
+
+    def overhead_of(self, arrivals: Sequence[Arrival]) -> int:
+        """What the items of these take at most in the buffer beside the messages, in bytes."""
+        if not self._of_items:
+            return 0
+        return MAXIMUM_ITEMS * SAMPLE_OVERHEAD * sum(arrival.stream in self._of_items for arrival in arrivals)
+
+    def _insert_items(self, arrival: Arrival, time: int) -> None:
+        """Put each item of a message into the lane of its client."""
+        stream, key, payload = arrival.stream, arrival.key, arrival.payload
+        self._number += 1
+        found = self._read_items(stream, key, payload)
+        share = len(payload) // max(len(found), 1)
+        for client, place in found.items():
+            name = _BY_CLIENT + client
+            lane = self._lanes[stream].get(name) or self._new_lane(stream, name, client, time)
+            if lane is not None:
+                self._put(lane, Item(time, self._number, payload, key, place, share))
+
+    def _put(self, lane: Lane, sample: Sample) -> None:
+        self._buffer.grew(lane.insert(sample))
+        if self.noting:
+            self.came.append(sample)
+            self.lanes.append(lane)
 
     def _insert_in_order(self, arrivals: Sequence[Arrival]) -> None:
         """The hot path. What `Lane.insert` and `Buffer.grew` do is written out: a call costs as much as the rest."""
@@ -132,8 +167,20 @@ class Ingest:
             self._counters.samples[stream] -= 1
         return lane
 
-    def client_of(self, arrival: Arrival) -> str | None:
-        """Whose the arrival is; None, and counted, where its key names no valid client."""
+    def sender_of(self, arrival: Arrival) -> str | None:
+        """Who sent the arrival: its client, of a message with items its key; None as in `clients_of`."""
+        if arrival.stream in self._of_items:
+            return _BY_CLIENT + arrival.key
+        return self._client_of(arrival)
+
+    def clients_of(self, arrival: Arrival) -> Collection[str]:
+        """Whose the arrival is; none, and counted, where neither its key nor its message names a valid client."""
+        if arrival.stream in self._of_items:
+            return self._read_items(arrival.stream, arrival.key, arrival.payload)
+        client = self._client_of(arrival)
+        return () if client is None else (client,)
+
+    def _client_of(self, arrival: Arrival) -> str | None:
         if arrival.stream in self._message_clients:
             return self._read_message(arrival.stream, arrival.key, arrival.payload)
         lane = self._lanes.get(arrival.stream, _NO_LANES).get(arrival.key)
@@ -147,6 +194,8 @@ class Ingest:
         for lanes in self._lanes.values():
             for key in [key for key, lane in lanes.items() if lane.client in lost]:
                 del lanes[key]
+        for client in lost if self._of_items else ():
+            self._buffer.forget(client, self._of_items)  # an item that comes under that name is another object
         self._lost.update(dict.fromkeys(lost))
         while len(self._lost) > MAXIMUM_LOST:
             client = next(iter(self._lost))
@@ -194,7 +243,9 @@ class Ingest:
 
     def _new_lane(self, stream: str, key: str, client: str, time: int) -> Lane | None:
         """A lane to remember under the key; None, and counted, where there are too many clients."""
-        if client not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS:
+        of_items = stream in self._of_items
+        maximum = MAXIMUM_OBJECTS if of_items else MAXIMUM_CLIENTS
+        if client not in self._clients and len(self._clients) >= maximum:
             self._counters.crowded[stream] += 1
             return None
         lane = self._buffer.add(self._lane_makers[stream].lane(client))
@@ -202,8 +253,16 @@ class Ingest:
             self._lanes[stream].clear()
         self._lanes[stream][key] = lane
         self._lost.pop(client, None)
-        self._clients.heard(client, time)
+        self._clients.heard(client, time, self._patience.get(stream))
         return lane
+
+    def _read_items(self, stream: str, key: str, payload: bytes) -> dict[str, int]:
+        """The clients of a message's items, and their places in the list."""
+        whose = self._read_key(stream, key)
+        if whose is None:
+            self._unnamed(stream, key)
+            return {}
+        return self._message_clients.of_items(stream, key, whose[1], payload)
 
     def _read(self, stream: str, key: str) -> str | None:
         whose = self._read_key(stream, key) if stream in self._lane_makers else None

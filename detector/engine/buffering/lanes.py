@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from detector.engine.buffering.buffer import Lane
+from detector.engine.buffering.buffer import ItemLane, Lane
 from detector.engine.buffering.latched import LatchedLane, Topic, by_key, by_key_and_frames
 from detector.engine.samples.sample import Decoder
 from wayside.api import Detector
@@ -20,11 +20,12 @@ class LaneMaker:
         self._stream = stream.name
         self._limits = duration, None if maximum is None else maximum.bytes, stream.buffer.count
         self._topic = topic
+        self._of_items = stream.items is not None
 
     def lane(self, client: str) -> Lane:
         """A lane of the client, without samples."""
         if self._topic is None:
-            return Lane(client, self._stream, *self._limits)
+            return (ItemLane if self._of_items else Lane)(client, self._stream, *self._limits)
         return LatchedLane(client, self._stream, *self._limits, topic=self._topic)
 
     def limit(self, lane: Lane) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from detector.engine.buffering.items import Items
 from detector.engine.counters import Counters
-from detector.engine.samples.sample import DecodeError, Decoder, NearDecoder, Sample
+from detector.engine.samples.sample import DecodeError, Decoder, Item, NearDecoder, Sample
 from wayside.expressions import UNKNOWN, EvaluationError
 from wayside.rules import CompiledStream
 
@@ -34,8 +35,10 @@ class Messages:
         decoders: Mapping[str, Decoder],
         streams: Mapping[str, CompiledStream],
         read_key: KeyReader,
+        items: Items,
         counters: Counters,
     ) -> None:
+        self.items = items
         self._decoders = decoders
         self._near = {stream: each for stream, each in decoders.items() if isinstance(each, NearDecoder)}
         self._streams = streams
@@ -45,6 +48,7 @@ class Messages:
         self._stamps: dict[tuple[str, Sample], int | None] = {}
         self._stamps_before: dict[tuple[str, Sample], int | None] = {}
         """Those of the last tick at which stamps were read: plugins look at the same samples tick by tick."""
+        self._last_stamp: tuple[tuple[str, int, bytes], int | None] | None = None
 
     def forget(self) -> None:
         """Drop what was decoded: the tick is over."""
@@ -52,8 +56,17 @@ class Messages:
         if self._stamps:
             self._stamps_before, self._stamps = self._stamps, {}
 
+    def content(self, stream: str, sample: Sample) -> Any:
+        """What the client sent: the item of a stream with `items`, else the message; UNKNOWN as in `message`."""
+        message = self.message(stream, sample)
+        if message is UNKNOWN or not isinstance(sample, Item):
+            return message
+        return self.items.read(stream, sample.payload).items[sample.place]
+
     def message(self, stream: str, sample: Sample) -> Any:
-        """The decoded sample, or UNKNOWN where it cannot be read; that is counted."""
+        """The decoded message of a sample, or UNKNOWN where it cannot be read; that is counted."""
+        if isinstance(sample, Item):
+            return self.items.read(stream, sample.payload).message  # it could be read as it came
         at = (stream, sample)
         message = self._decoded.get(at, _MISSING)
         if message is _MISSING:
@@ -81,12 +94,14 @@ class Messages:
             if message is UNKNOWN:
                 return None
             values["msg"] = message
+        if "item" in names:
+            values["item"] = self.content(stream, sample)
         if "key" in names:
             whose = self._read_key(stream, sample.key)
             values["key"] = {} if whose is None else whose[1]
         if "sample" in names:
             try:
-                stamp = self._stamp(stream, sample.payload, sample.received)
+                stamp = self._stamp_of(stream, sample)
             except (DecodeError, EvaluationError, ValueError):
                 stamp = None
             values["sample"] = {
@@ -119,6 +134,15 @@ class Messages:
             return None
         self._counters.stamped(stream, received, stamp)
         return received if stamp is None else stamp
+
+    def _stamp_of(self, stream: str, sample: Sample) -> int | None:
+        """The same as `_stamp`; that of a message with items is read once for all that come one after the other."""
+        if not isinstance(sample, Item):
+            return self._stamp(stream, sample.payload, sample.received)
+        about = stream, sample.received, sample.payload
+        if self._last_stamp is None or self._last_stamp[0] != about:
+            self._last_stamp = about, self._stamp(stream, sample.payload, sample.received)
+        return self._last_stamp[1]
 
     def _stamp(self, stream: str, payload: bytes, received: int) -> int | None:
         """The sender's time in nanoseconds, where the message carries one."""

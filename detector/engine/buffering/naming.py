@@ -1,4 +1,4 @@
-"""The client of a message that names it: a stream's `client` is a template over the message.
+"""The clients of messages that name them: a stream's `client` is a template over the message, or over its items.
 
 Such messages are decoded as they enter the buffer, on the thread that evaluates, never on the one that receives.
 """
@@ -7,31 +7,42 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import Any
 
+from detector.engine.buffering.items import Items, below
 from detector.engine.counters import Counters
 from detector.engine.samples.sample import DecodeError, Decoder
-from wayside.expressions import CompiledTemplate, InterpolationError
+from wayside.expressions import CompiledTemplate, EvaluationError, InterpolationError
 from wayside.rules import CompiledStream
 
 CLIENT_NAME = re.compile(r"(?!\.*$)[A-Za-z0-9._:-]{1,63}")
 """What a client's name is made of. Dots alone are none: they would be a way out of a folder or of a URL's path."""
+
+MAXIMUM_ITEMS = 2048
+"""Maximum number of items of one message; further ones are dropped and counted."""
+
+_MAXIMUM_NAMES = 65_536
+"""Maximum number of cached names; beyond, the cache starts again."""
 
 
 class MessageClients:
     """Reads the names of clients out of messages."""
 
     def __init__(
-        self, decoders: Mapping[str, Decoder], streams: Mapping[str, CompiledStream], counters: Counters
+        self,
+        decoders: Mapping[str, Decoder],
+        streams: Mapping[str, CompiledStream],
+        items: Items,
+        counters: Counters,
     ) -> None:
         self._decoders = decoders
-        self._templates: dict[str, CompiledTemplate] = {
-            name: stream.client for name, stream in streams.items() if stream.client is not None
-        }
+        self._namers = {name: _Namer(stream.client) for name, stream in streams.items() if stream.client is not None}
+        self._items = items
         self._counters = counters
 
     def __contains__(self, stream: str) -> bool:
         """Whether the messages of the stream name their client."""
-        return stream in self._templates
+        return stream in self._namers
 
     def client(self, stream: str, key: str, captures: Mapping[str, str], payload: bytes) -> str | None:
         """The client's name; None, and counted, where the message cannot be read or yields no valid name."""
@@ -40,12 +51,39 @@ class MessageClients:
         except DecodeError as error:
             self._counters.unreadable(stream, key, error)
             return None
+        return self._name(stream, key, {"msg": message, "key": captures})
+
+    def of_items(self, stream: str, key: str, captures: Mapping[str, str], payload: bytes) -> dict[str, int]:
+        """The clients of a message's items, and the place of each; what is no list, or has no name, is counted.
+
+        A client has one item of a message: the first of its name.
+        """
         try:
-            rendered = self._templates[stream].render({"msg": message, "key": captures}, integers=True)
+            message, items = self._items.read(stream, payload)
+        except DecodeError as error:
+            self._counters.unreadable(stream, key, error)
+            return {}
+        except EvaluationError as error:
+            self._unnamed(stream, f"{key}: items: {error}")
+            return {}
+        found: dict[str, int] = {}
+        for place, item in enumerate(items[:MAXIMUM_ITEMS]):
+            name = self._name(stream, key, {"item": item, "msg": message, "key": captures})
+            if name is None:
+                continue
+            if found.setdefault(name, place) != place:
+                self._unnamed(stream, f"{key}: client: two items of one message have the name {name}")
+        if len(items) > MAXIMUM_ITEMS:
+            self._counters.crowded[stream] += len(items) - MAXIMUM_ITEMS
+        return found
+
+    def _name(self, stream: str, key: str, values: Mapping[str, Any]) -> str | None:
+        """A name; None, and counted, where these values yield none that is valid."""
+        try:
+            name = self._namers[stream].name(values)
         except InterpolationError as error:
             self._unnamed(stream, f"{key}: client: {error}")
             return None
-        name = rendered if isinstance(rendered, str) else None if rendered is None else str(rendered)
         if name is None or not CLIENT_NAME.fullmatch(name):
             self._unnamed(
                 stream, f"{key}: client: {name!r} is no name: it takes 1 to 63 of A-Z a-z 0-9 . _ : -, not dots alone"
@@ -56,3 +94,32 @@ class MessageClients:
     def _unnamed(self, stream: str, reason: str) -> None:
         self._counters.unnamed[stream] += 1
         self._counters.last_unnamed[stream] = reason
+
+
+class _Namer:
+    """Renders a `client` template: equal values of the fields that it reads have one name."""
+
+    def __init__(self, template: CompiledTemplate) -> None:
+        self._template = template
+        self._paths = sorted(template.paths, key=str)
+        self._names: dict[tuple[Any, ...], str] = {}
+
+    def name(self, values: Mapping[str, Any]) -> str | None:
+        """The name, which need not be a valid one. Raises InterpolationError."""
+        read = tuple([below(values, path) for path in self._paths])
+        plain = all(map(_is_plain, read))
+        kinds = (*read, *map(type, read))  # 1.0 and true are equal, but not one name
+        if plain and (name := self._names.get(kinds)) is not None:
+            return name
+        rendered = self._template.render(values, integers=True)
+        name = rendered if isinstance(rendered, str) else None if rendered is None else str(rendered)
+        if plain and name is not None:
+            if len(self._names) >= _MAXIMUM_NAMES:
+                self._names.clear()
+            self._names[kinds] = name
+        return name
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether equal values of this type are rendered alike: 0.0 and -0.0 are not, and NaN equals nothing."""
+    return type(value) in (str, bool) or (type(value) is float and value != 0 and value == value)  # noqa: PLR0124

@@ -6,24 +6,17 @@ that they cannot take, is left to CEL, row by row.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.buffering.messages import Messages
+from detector.engine.columns.fields import OF_A_SAMPLE, SampleFields
 from detector.engine.columns.table import Integers, StoredColumn, Table
 from detector.engine.counters import Counters
-from detector.engine.samples.sample import (
-    MISSING,
-    DecodeError,
-    Decoder,
-    FieldDecoder,
-    FieldReader,
-    Fields,
-    Sample,
-)
+from detector.engine.samples.sample import DecodeError, Decoder, Sample
 from wayside.expressions import UNKNOWN, Expression, Path, Reason, Unknown, Value
 from wayside.expressions.columns.graph import Graph
 from wayside.expressions.columns.lowering import Constant
@@ -89,7 +82,7 @@ class Reader:
         self._fields_at: dict[int, int] = {}
         """Of the nodes that are a field as it is, its place among the paths."""
         self._program: Program | None = None
-        self._fields: FieldReader | None = None
+        self._fields: SampleFields | None = None
 
     @property
     def count(self) -> int:
@@ -155,10 +148,7 @@ class Reader:
         self._program = Program(self._graph, nodes, self._texts)
         self._paths = [path for path in self._program.leaves if isinstance(path, tuple)]
         self._fields_at = {self._graph.leaf(path): at for at, path in enumerate(self._paths)}
-        read = (
-            self._decoder.field_reader(self._paths) if isinstance(self._decoder, FieldDecoder) and self._paths else None
-        )
-        self._fields = read or whole(self._decoder, self._paths)
+        self._fields = SampleFields(self._stream, self._decoder, self._messages.items, self._paths)
 
     def _leaves(self, samples: Sequence[Sample]) -> _Leaves:
         """The fields of the samples, and what the program makes of them."""
@@ -166,17 +156,17 @@ class Reader:
         assert self._fields is not None  # noqa: S101
         if not self._paths:
             return _Leaves([], None, {}, ())
-        fields = self._fields([sample.payload for sample in samples])
+        fields = self._fields.read(samples, self._texts)
         for at, error in fields.errors.items():
             self._messages.unreadable(self._stream, samples[at], error)
-        columns = [column_of(values, self._texts) for values in fields.columns]
+        columns = fields.columns
         tags = None
         if any(column.tags is not None for column in columns):
             tags = np.stack(
                 [np.full(len(samples), Tag.NUMBER, np.uint8) if each.tags is None else each.tags for each in columns]
             )
         results = self._program.run(np.stack([column.values for column in columns]), tags)
-        return _Leaves(columns, results, dict(fields.errors), fields.odd)
+        return _Leaves(columns, results, fields.errors, fields.odd)
 
     def _evaluated(self, batch: _Batch, at: int, node: int | None) -> tuple[Column, dict[int, tuple[Reason, str]]]:
         """A column's values for the batch, and why CEL has none, by row."""
@@ -279,7 +269,7 @@ class _Leaves(NamedTuple):
     columns: list[Column]
     results: Any
     errors: dict[int, DecodeError]
-    odd: Sequence[int]
+    odd: Collection[int]
 
 
 class _Batch(NamedTuple):
@@ -293,8 +283,8 @@ class _Batch(NamedTuple):
 def _leaf(path: Path, reading: Reading) -> Hashable | Constant | None:
     """What a path of an expression over one sample is in columns: a field, or the same for all samples."""
     name, below = path[0], path[1:]
-    if name == "msg":
-        return below or None
+    if name in OF_A_SAMPLE:
+        return path if below else None
     variables: Mapping[str, Any] = {} if reading.element is None else reading.element.variables
     if name == "parameters" and not reading.parameters.overridden:
         variables = {"parameters": reading.parameters.own}
@@ -309,36 +299,6 @@ def constant(variables: Mapping[str, Any], path: Path) -> Constant | None:
             return None
         value = value[step]
     return Constant(value) if type(value) in _CONSTANTS and value == value else None  # noqa: PLR0124 (no NaN)
-
-
-def whole(decoder: Decoder, paths: Sequence[Path]) -> FieldReader:
-    """Reads fields by decoding each message as a whole."""
-
-    def read(payloads: Sequence[bytes]) -> Fields:
-        columns: list[list[Any]] = [[MISSING] * len(payloads) for _ in paths]
-        errors: dict[int, DecodeError] = {}
-        odd: list[int] = []
-        for at, payload in enumerate(payloads):
-            try:
-                message = decoder.decode(payload)
-            except DecodeError as error:
-                errors[at] = error
-                continue
-            for column, path in zip(columns, paths, strict=True):
-                value = message
-                for step in path:
-                    if isinstance(value, dict):
-                        value = value.get(step, MISSING)
-                    elif isinstance(value, list) and isinstance(step, int):
-                        value = value[step] if 0 <= step < len(value) else MISSING
-                    elif value is not MISSING:
-                        value = MISSING
-                        if not odd or odd[-1] != at:
-                            odd.append(at)
-                column[at] = value
-        return Fields(columns, errors, odd)
-
-    return read
 
 
 def _store(stored: StoredColumn, rows: Integers, column: Column) -> None:

@@ -15,7 +15,7 @@ from operator import attrgetter
 from typing import NamedTuple
 
 from detector.engine.buffering.buffer import Buffer, Lane
-from detector.engine.samples.sample import Sample
+from detector.engine.samples.sample import Item, Sample
 from wayside.rules import CompiledWindow
 
 
@@ -31,10 +31,11 @@ class EpisodeSample(NamedTuple):
     received: int
     """Nanoseconds since the epoch; the stamp as well with clock Data."""
     payload: bytes
-    """As it came, undecoded."""
+    """As it came, undecoded; of a stream with `items` the whole message, once for all its clients."""
 
 
 _TIME = attrgetter("time")
+_CLIENT = attrgetter("client")
 
 
 @dataclass(slots=True, eq=False)
@@ -65,6 +66,8 @@ class Excerpt:
         """What time has reached, in order of time; what lies outside of the window is forgotten."""
         reached = now if self.until is None else min(now, self.until)
         taken: list[EpisodeSample] = []
+        listed: dict[tuple[str, int], EpisodeSample] = {}
+        """The messages of which items belong to it, by stream and number: each is one sample, of the first client."""
         waiting: list[tuple[Lane, Sample]] = []
         for lane, sample in self.waiting:
             time = sample.time
@@ -72,8 +75,14 @@ class Excerpt:
                 if self.until is None or time <= self.until:
                     waiting.append((lane, sample))
             elif time > self.begin or lane.latched:
-                taken.append(EpisodeSample(lane.client, lane.stream, sample.key, time, sample.received, sample.payload))
+                found = EpisodeSample(lane.client, lane.stream, sample.key, time, sample.received, sample.payload)
+                if isinstance(sample, Item):
+                    message = (lane.stream, sample.number)
+                    listed[message] = min(found, listed.get(message, found), key=_CLIENT)
+                else:
+                    taken.append(found)
         self.waiting = waiting
+        taken += listed.values()
         taken.sort(key=_TIME)
         return taken
 

@@ -44,7 +44,8 @@ class DecodedSample(NamedTuple):
     stamp: int
     """The sender's time in nanoseconds since the epoch; the receive time where the message carries none."""
     message: Any
-    """Maps, lists, strings, booleans, None, bytes and doubles, as expressions see it."""
+    """Maps, lists, strings, booleans, None, bytes and doubles, as expressions see it; of a stream with items, the
+    client's item."""
 
 
 class Queries(Protocol):
@@ -256,7 +257,7 @@ class BufferQueries:
 
     def _decoded(self, client: str, stream: str, stamped: tuple[int, int, Sample]) -> DecodedSample | None:
         stamp, _, sample = stamped
-        message = self._messages.message(stream, sample)
+        message = self._messages.content(stream, sample)
         if message is UNKNOWN:
             return None
         return DecodedSample(client, stream, sample.key, sample.time, stamp, message)

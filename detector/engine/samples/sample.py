@@ -51,8 +51,30 @@ class Stamped(msgspec.Struct, frozen=True, gc=False, order=True):
         return self.received
 
 
-Sample = Arrival | Stamped
-"""One message in the buffer. With clock Wall it is what the intake queued: no message is copied."""
+class Item(msgspec.Struct, frozen=True, gc=False, order=True):
+    """One item of a message in the buffer, of a stream with `items`. The items of a message share its payload."""
+
+    received: int
+    """As of a sample of the clock: when the intake took the message, or its stamp; nanoseconds."""
+    number: int
+    """The order of arrival of the messages."""
+    payload: bytes
+    """The whole message as it came, undecoded."""
+    key: str
+    """The full key it came on."""
+    place: int
+    """The item's place in the message's list."""
+    share: int
+    """What it takes of the payload in memory, in bytes."""
+
+    @property
+    def time(self) -> int:
+        """Its place on the engine's time axis; nanoseconds."""
+        return self.received
+
+
+Sample = Arrival | Stamped | Item
+"""One sample in the buffer. With clock Wall a message is what the intake queued: none is copied."""
 
 
 class DecodeError(ValueError):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import cast
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
 from detector.streams.codecs.ros import RosTypes, standard
 from wayside.api.stream import Encoding, Stream
-from wayside.rules import BYTES, Fields
+from wayside.rules import BYTES, Each, Fields
 
 
 def message_fields(stream: Stream, types: RosTypes | None = None) -> Fields | None:
@@ -28,6 +29,9 @@ def _fields(types: RosTypes, type_name: str) -> Fields:
 
 
 def _below(types: RosTypes, desc: FieldDesc) -> Fields | None:
-    """The fields below a field; None below numbers, texts and arrays."""
+    """The fields below a field, or of each of its items; None below numbers, texts and arrays of these."""
     kind, detail = desc
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        inner, name = cast("FieldDesc", detail[0])
+        return Each(_fields(types, str(name))) if inner is Nodetype.NAME else None
     return _fields(types, str(detail)) if kind is Nodetype.NAME else None

@@ -50,7 +50,7 @@ class Live:
         self.recording = Recording()
         self._failures: list[BaseException] = []
         self.engine = make_engine(detector, inlets(detector), holder="d", start=START)
-        intake = Intake(lambda: self.now)
+        intake = self.intake = Intake(lambda: self.now)
         self.evaluator = Evaluator(
             self.engine,
             intake,

@@ -90,16 +90,31 @@ class Scene:
     """With clock Wall, how many bytes are kept over all."""
 
 
+_items = st.one_of(
+    st.fixed_dictionaries(
+        {
+            "id": st.sampled_from(("a", "b", "o", "o", "p")),
+            "v": st.sampled_from([0.0, 1.0, 2.0, 3.0]),
+            "x": st.sampled_from([0.0, 3.0, 50.0]),
+            "y": st.sampled_from([0.0, 4.0]),
+        }
+    ),
+    st.sampled_from([{"id": "o", "v": "x"}, {"id": "p"}, {"id": "", "v": 1.0}, {"v": 1.0}, 1.0]),
+)
+
+_lists = st.builds(lambda n, items: {"n": n, "list": items}, st.sampled_from([0.0, 1.0]), st.lists(_items, max_size=3))
+
 _message = st.builds(
-    lambda time, delay, client, stream, value, place: Message(
-        time, delay, client, stream, place if stream == "pose" else value
+    lambda time, delay, client, stream, value, place, items: Message(
+        time, delay, client, stream, {"pose": place, "list": items}.get(stream, value)
     ),
     st.integers(1, 30),
     st.sampled_from([0, 0, 0, 1, 2, 4, 8]),
     st.sampled_from((*CLIENTS, "a", "a", "b")),
-    st.sampled_from(["speed", "speed", "speed", "pose", "pose", "rare"]),
+    st.sampled_from(["speed", "speed", "speed", "pose", "pose", "rare", "list", "list"]),
     _messages,
     _places,
+    _lists | st.sampled_from([{}, {"list": 1.0}, BROKEN]),
 )
 
 POSITION = {"x": "msg.x", "y": "msg.y", "yaw": "msg.v", "speed": "msg.v"}
@@ -146,18 +161,23 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
         if aggregate == "Active":
             return {**signal, "aggregate": aggregate}
     else:
-        signal["stream"] = draw(st.sampled_from(("speed", "speed", "speed", "pose", "rare")))
+        signal["stream"] = draw(st.sampled_from(("speed", "speed", "speed", "pose", "rare", "list", "list")))
     signal["aggregate"] = aggregate
     if aggregate == "Quantile":
         signal["quantile"] = draw(st.sampled_from((0.0, 0.25, 0.5, 1.0)))
     if aggregate not in ("Count", "Age"):
         field = "msg.values.s" if of_rule else "msg.v"
         of_places = AT_A_SAMPLE if signal.get("stream") == "pose" else ()
-        signal["value"] = draw(st.sampled_from((field, field, f"{field} > 1", "sample.received > 0", *of_places)))
+        more = "sample.received > 0"
+        if signal.get("stream") == "list":
+            field, more = draw(st.sampled_from(("item.v", "item.v * 2 - msg.n"))), "[item.v].exists(v, v > 1)"
+        signal["value"] = draw(st.sampled_from((field, field, f"{field} > 1", more, *of_places)))
     if aggregate in _WINDOWED or draw(st.integers(0, 3)) == 0:
         signal["over"] = draw(st.sampled_from(("500ms", "1s", "2s", "3s", "5s")))
     if draw(st.integers(0, 3)) == 0:
         signal["where"] = "msg.values.s > 1" if of_rule else draw(st.sampled_from(("msg.v > 0", "msg.w == 1")))
+        if signal.get("stream") == "list":
+            signal["where"] = draw(st.sampled_from(("item.v > 0", "msg.n == 1")))
     return signal
 
 
@@ -199,6 +219,7 @@ _scopes = st.sampled_from(
         {"pairs": {"position": {**_POSITION, "maxAge": "500ms"}, "within": 10}},
         {"pairs": {"position": {**_POSITION, "maxAge": "2s"}, "within": 10}},
         {"pairs": {"position": {**_POSITION, "maxAge": "10s"}, "within": 10}},
+        {"pairs": {"position": {"stream": "list", "x": "item.x", "y": "item.y"}, "within": 5}},
         {"pairs": {"position": {"stream": "rare", "x": "msg.w", "y": "msg.w"}, "within": 10}},
         {"pairs": {"position": _POSITION, "within": 10, "where": '"speed" in a.streams || distance < 5'}},
         {"pairs": {"position": _POSITION, "within": 10, "a": {"where": '"speed" in streams'}}},
@@ -257,7 +278,7 @@ def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
     if draw(st.integers(0, 3)):
         spec["evaluation"] = {"every": draw(st.sampled_from(("500ms", "1s", "1s", "2s")))}
     else:
-        spec["evaluation"] = {"onSample": draw(st.sampled_from(("speed", "speed", "pose")))}
+        spec["evaluation"] = {"onSample": draw(st.sampled_from(("speed", "speed", "pose", "list")))}
     if scope is not None or "onSample" in spec["evaluation"]:
         # Whether a sample that has left the buffer was seen depends on who was looked at meanwhile.
         for signal in spec["signals"]:
@@ -283,6 +304,12 @@ def scenes(draw: st.DrawFn) -> Scene:
             Message(time, 0, client, stream, {"x": float(time), "y": 0.0, "v": speeds[number % len(speeds)]})
             for number, (time, client, stream) in enumerate(draw(st.sampled_from([grid, grid[::-1]])) + twice)
         ]
+    if draw(st.integers(0, 2)) == 0:  # an object comes, is lost, and another comes under its name
+        pause = draw(st.sampled_from([3, 5, 6, 8]))
+        for time in (1, 2, 3, *(5 + pause + more for more in (0, 1, 2))):
+            value = draw(st.sampled_from([1.0, 2.0, 3.0]))
+            items = [{"id": name, "v": value, "x": 0.0, "y": 0.0} for name in ("o", "p")]
+            messages.append(Message(time, 0, "a", "list", {"n": 0.0, "list": items}))
     data = draw(st.booleans())
     gap = None if data or draw(st.integers(0, 3)) else draw(st.tuples(st.integers(5, 15), st.integers(16, 25)))
     return Scene(

@@ -44,6 +44,10 @@ _SIGNALS: list[tuple[str, dict[str, Any]]] = [
     ("truth", {"stream": "p", "value": "msg.on"}),
     ("text", {"stream": "p", "value": "msg.gear"}),
     ("list", {"stream": "p", "value": "msg.q"}),
+    ("number", {"stream": "o", "value": "item.v"}),
+    ("number", {"stream": "o", "value": "item.v * msg.f - item.at[0]", "over": "1s", "aggregate": "Max"}),
+    ("number", {"stream": "o", "over": "2s", "aggregate": "Count", "where": "item.v > 1"}),
+    ("text", {"stream": "o", "value": "[item].map(i, i.gear)[0]"}),
 ]  # fmt: skip
 
 _FORMS = {
@@ -153,6 +157,8 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
         spec["when"] = random.choice(["{1}", "{1} && ({0})", "({0}) || {1}"]).format(spec["when"], form)
     if kind == "pairs":
         position = {"stream": "p", "x": "msg.q.w", "y": "msg.q.z", "maxAge": "1s"}
+        if random.random() < 0.3:
+            position = {"stream": "o", "x": "item.v", "y": "msg.f"}
         spec["scope"] = {"pairs": {"position": position, "within": 3}}
         condition = spec["when"]
         for name, _ in names:
@@ -202,6 +208,12 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
 def _message(random: Random, stream: str) -> dict[str, Any]:
     if stream == "s":
         return dict(random.choice([{"v": round(random.uniform(-1, 5), 1)}] * 14 + _VALUES))
+    if stream == "o":
+        item = {"v": random.choice([0, 1, 2.5, None]), "at": random.choice([[1.0, 2.0]] * 5 + [3, []]), "gear": "D"}
+        return {
+            "f": random.choice([1, 2]),
+            "objects": [{**item, "id": number} for number in random.sample(range(6), 3)],
+        }
     place = {"w": random.uniform(0, 4), "z": random.choice([0, 1, 2.0])}
     message = {
         "gear": random.choice(["D", "D", "R", 1, None]),
@@ -220,7 +232,7 @@ def _arrivals(random: Random, data: bool) -> list[Arrival]:
             time += (
                 random.expovariate(random.choice([5, 20])) if random.random() > 0.03 else random.choice([0.6, 1.3, 3])
             )
-            sent.append((time, f"c{client}", random.choice("ssp")))
+            sent.append((time, f"c{client}", random.choice("sspo")))
     arrivals, last = [], START
     for time, client, stream in sorted(sent):
         last = max(last + (random.random() > 0.05), START + round(time * 1e8) * 10)
@@ -230,7 +242,8 @@ def _arrivals(random: Random, data: bool) -> list[Arrival]:
         if data:
             message["t"] = last / 1e9 + random.choice([0, 0, 0, -0.1, -0.3, 0.05])
         payload = b"{broken" if random.random() < 0.01 else json.dumps(message).encode()
-        arrivals.append(Arrival(last, stream, f"vehicles/{client}/{stream}", payload))
+        whose = "stations" if stream == "o" else "vehicles"
+        arrivals.append(Arrival(last, stream, f"{whose}/{client}/{stream}", payload))
     return arrivals
 
 
@@ -243,6 +256,8 @@ def a_scene(seed: int) -> Scene:
     detector = a_detector(
         a_stream("s", staleAfter=random.choice(["500ms", "1s", "Never"]), **capped, **stamp),
         a_stream("p", staleAfter="1s", **stamp),
+        {"name": "o", "key": "stations/${station:*}/o", "encoding": "json", "staleAfter": "500ms", **stamp,
+         "items": "msg.objects", "client": "c${item.id}"},
         clientTimeout="2s", buffer=buffer, clock="Data" if data else "Wall", **({"lateness": "200ms"} if data else {}),
         clients=[{"name": "c0", "labels": {"kind": "bus"}},
                  {"name": "c1", "labels": {"kind": "car"}, "parameters": {f"r{random.randrange(5)}": {"f": 2.5}}}],

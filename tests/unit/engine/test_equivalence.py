@@ -11,7 +11,7 @@ import os
 from itertools import groupby
 from typing import Any
 
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from detector.assembly import inlets
@@ -22,15 +22,20 @@ from tests.driving import START, a_detector, a_rule, a_stream, compiled
 from tests.reference.detector import Reference, Told
 from tests.reference.places import located
 from tests.reference.signals import tell_places
-from tests.reference.world import SECOND, Sample, World
+from tests.reference.world import SECOND, Sample, World, listed
 from tests.unit.engine.random_drives import BROKEN, HALF, PLACES, POSITION, Message, Scene, scenes
 from wayside.rules import dependency_problems
 
 TIMEOUT, KEPT = 4 * SECOND, 6 * SECOND
 END = START + 40 * HALF
 
-STREAMS = {"speed": 2 * SECOND, "pose": 3 * SECOND, "rare": None}
+STREAMS = {"speed": 2 * SECOND, "pose": 3 * SECOND, "rare": None, "list": 2 * SECOND}
 """How old the newest sample may be."""
+
+LISTS = frozenset({"list"})
+"""The streams with items."""
+
+LIST = {"key": "stations/${station:*}/list", "items": "msg.list", "client": "${item.id}"}
 
 
 class Plain:
@@ -66,6 +71,7 @@ def by_the_engine(scene: Scene, cut: int) -> list[Event]:
             staleAfter="Never" if stale is None else f"{stale // SECOND}s",
             buffer=_given(caps.get(name, {})),
             **({"position": POSITION} if name == "pose" else {}),
+            **(LIST if name in LISTS else {}),
         )
         for name, stale in STREAMS.items()
     ]
@@ -87,7 +93,7 @@ def by_the_engine(scene: Scene, cut: int) -> list[Event]:
             Arrival(
                 START + number if scene.data else time,
                 each.stream,
-                f"vehicles/{each.client}/{each.stream}",
+                f"{'stations' if each.stream in LISTS else 'vehicles'}/{each.client}/{each.stream}",
                 payload_of(time, each),
             )
             for number, (_, each) in messages
@@ -113,7 +119,7 @@ def payload_of(time: int, message: Message) -> bytes:
 def by_the_reference(scene: Scene) -> list[Told]:
     tell_places(PLACES, POSITION)
     counts, sizes = _given({"speed": scene.count}), _given({"pose": scene.pose_bytes})
-    world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes)
+    world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes, items=LISTS)
     lateness = scene.lateness * HALF if scene.data else None
     rules = {name: located(spec, {"pose": POSITION}) for name, spec in scene.rules.items()}
     reference = Reference(rules, world, lateness=lateness, start=START, keep_starts=KEPT)
@@ -125,7 +131,15 @@ def by_the_reference(scene: Scene) -> list[Told]:
             gap = None
         if scene.data and each.message is BROKEN:
             continue  # it has no stamp, so nobody knows when it was sent
-        reference.arrive(Sample(time, number, each.client, each.stream, each.message, payload_of(time, each), time))
+        payload = payload_of(time, each)
+        if each.stream not in LISTS:
+            reference.arrive(Sample(time, number, each.client, each.stream, each.message, payload, time))
+            continue
+        items = listed(each.message)
+        reference.nothing(time)
+        for place, (client, item) in enumerate(items.items()):
+            share, order = len(payload) // len(items), number + place / (len(items) + 1)
+            reference.arrive(Sample(time, order, client, each.stream, each.message, payload, time, item, share))
     if not scene.data:
         reference.advance(END)
     reference.finish()
@@ -157,6 +171,24 @@ def plainly(events: list[Event]) -> list[Told]:
     ]
 
 
+def objects(*values: tuple[int, float]) -> tuple[Message, ...]:
+    """Lists with one object, at these times."""
+    return tuple(
+        Message(time, 0, "a", "list", {"n": 0.0, "list": [{"id": "o", "v": value, "x": 0.0, "y": 0.0}]})
+        for time, value in values
+    )
+
+
+_FASTEST = {"name": "s", "stream": "list", "value": "item.v", "over": "5s", "aggregate": "Max"}
+_RETURNING = Scene(
+    {"r": {"signals": [_FASTEST], "when": "s > 2", "evaluation": {"every": "500ms"}}},
+    objects((1, 1.0), (3, 3.0), (11, 1.0), (12, 3.0)),
+    *(False, 0, None, None, None, None),
+)
+"""An object is lost, and another one comes under its name."""
+
+
+@example(_RETURNING, 1)
 @settings(
     max_examples=int(os.environ.get("WAYSIDE_EQUIVALENCE", "100")),
     deadline=None,

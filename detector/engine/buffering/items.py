@@ -1,0 +1,79 @@
+"""Messages that are lists of objects: a stream's `items` names the list, and each item is a sample of its own.
+
+The samples share the message's payload. A message is decoded when it enters the buffer, for the names of its clients,
+and soon afterwards again, when rules read it: so the newest messages are cached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from detector.engine.samples.sample import MISSING, Decoder
+from wayside.expressions import Expression, Path
+from wayside.rules import CompiledStream
+
+_MAXIMUM_BYTES = 4 * 2**20
+"""Of the payloads of cached messages; the oldest go first."""
+
+
+class Listed(NamedTuple):
+    """A decoded message, and the list in it."""
+
+    message: Any
+    items: list[Any]
+
+
+class Items:
+    """Reads the items of messages."""
+
+    def __init__(self, decoders: Mapping[str, Decoder], streams: Mapping[str, CompiledStream]) -> None:
+        self._decoders = decoders
+        self._lists = {
+            name: (stream.items, stream.items.path) for name, stream in streams.items() if stream.items is not None
+        }
+        self._cached: dict[tuple[str, bytes], Listed] = {}
+        self._bytes = 0
+
+    def __contains__(self, stream: str) -> bool:
+        """Whether the messages of the stream are lists of items."""
+        return stream in self._lists
+
+    def read(self, stream: str, payload: bytes) -> Listed:
+        """A message, and its list. Raises DecodeError, and EvaluationError where there is no list."""
+        listed = self._cached.get((stream, payload))
+        if listed is None:
+            message = self._decoders[stream].decode(payload)
+            listed = Listed(message, _list(*self._lists[stream], message))
+            self._keep(stream, payload, listed)
+        return listed
+
+    def _keep(self, stream: str, payload: bytes, listed: Listed) -> None:
+        self._bytes += len(payload)
+        while self._bytes > _MAXIMUM_BYTES and self._cached:
+            oldest = next(iter(self._cached))
+            del self._cached[oldest]
+            self._bytes -= len(oldest[1])
+        self._cached[stream, payload] = listed
+
+
+def below(value: Any, path: Path) -> Any:
+    """What the path leads to below a value; MISSING: nothing."""
+    for step in path:
+        if isinstance(value, dict):
+            value = value.get(step, MISSING)
+        elif isinstance(value, list) and isinstance(step, int) and step < len(value):
+            value = value[step]
+        else:
+            return MISSING
+    return value
+
+
+def _list(expression: Expression, path: Path | None, message: Any) -> list[Any]:
+    """The list. A plain path is followed here: CEL copies what it yields."""
+    found = MISSING if path is None else below(message, path[1:])
+    if isinstance(found, list):
+        return found
+    evaluated = expression.evaluate({"msg": message})
+    assert isinstance(evaluated, list)  # noqa: S101  of no other kind was it compiled
+    return evaluated
