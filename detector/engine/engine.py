@@ -164,6 +164,7 @@ class Engine:
             for event in runs[name].open_starts() if name in runs else ():
                 self._starts.started(event)
         self._known.forget_rules(kept)
+        self._known.ingest.linked = frozenset(stream for rule in rules for stream in rule.linked)
         self._plugins.configure(rules, kept)
         self.schedule.set_rules([run.rule for run in self._runs.values()])
         self._executor.set_rules(self._runs)

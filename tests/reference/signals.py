@@ -12,7 +12,7 @@ from tests.reference.places import Where, with_fields
 from tests.reference.world import SECOND, World
 from wayside.expressions import UNKNOWN, Environment, Expression, Kind
 
-VARIABLES = ("msg", "item", "key", "sample")
+VARIABLES = ("msg", "item", "before", "key", "sample")
 """Of expressions over one sample."""
 
 
@@ -63,6 +63,7 @@ class Item:
     """None where it cannot be read."""
     sample: dict[str, float]
     item: Any = None
+    before: Any = None
 
 
 @dataclass
@@ -113,6 +114,7 @@ class Sources:
                     each.message,
                     {"received": each.received / SECOND, "size": float(len(each.payload))},
                     each.item,
+                    each.before,
                 )
                 for each in self.world.kept(client, signal["stream"], now)
             ]
@@ -135,7 +137,8 @@ def _value(signal: dict[str, Any], item: Item) -> Any:
 
 
 def _variables(item: Item) -> dict[str, Any]:
-    known = {"key": {}, "sample": item.sample, **({} if item.item is None else {"item": item.item})}
+    known = {"key": {}, "sample": item.sample}
+    known |= {name: each for name, each in (("item", item.item), ("before", item.before)) if each is not None}
     return known if item.message is None else {"msg": item.message, **known}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 SECOND = 10**9
@@ -25,6 +25,8 @@ class Sample:
     received: int
     item: Any = None
     """The client's item of the message's list, where the stream has items."""
+    before: Any = None
+    """What the client sent before, unless that was stale by then."""
     share: int | None = None
     """How many bytes of the payload count for it; None: all."""
 
@@ -75,8 +77,12 @@ class World:
 
     def take(self, sample: Sample) -> None:
         """A sample arrives."""
-        self.samples.append(sample)
         of_items = sample.stream in self.items
+        earlier = [each for each in self._held(sample.client, sample.stream) if each.time <= sample.time]
+        limit = self.stale_after[sample.stream]
+        if earlier and (limit is None or sample.time - earlier[-1].time <= limit):
+            sample = replace(sample, before=earlier[-1].item if of_items else earlier[-1].message)
+        self.samples.append(sample)
         known = self.known.setdefault(sample.client, Known(sample.time, sample.time, of_items))
         known.last = max(known.last, sample.time)
         known.items = known.items and of_items

@@ -113,8 +113,9 @@ class Signal(Model):
     )
     value: Expression | None = Field(
         default=None,
-        description="CEL over msg (the decoded sample), key (the captured chunks), sample (stamp, received, latency, "
-        "size) and parameters. Required, except with the aggregates Count, Age and Active.",
+        description="CEL over msg (the decoded sample), item (its item, if the stream has items), before (the client's "
+        "message or item before, unless it was stale by then), key (the captured chunks), sample (stamp, received, "
+        "latency, size) and parameters. Required, except with the aggregates Count, Age and Active.",
     )
     where: Expression | None = Field(
         default=None, description="CEL over msg, key, sample and parameters. Only samples for which it is true count."

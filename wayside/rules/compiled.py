@@ -252,6 +252,14 @@ class CompiledRule:
         return tuple(signal for signal in self.signals if signal.name not in own)
 
     @property
+    def linked(self) -> frozenset[str]:
+        """The streams of whose samples it reads the one before."""
+        signals = [(signal.stream, each) for signal in self.signals for each in (signal.value, signal.where)]
+        position = self.subject.position if isinstance(self.subject, PairSubject) else None
+        axes = [] if position is None else [(position.stream, each) for each in position.axes.values()]
+        return frozenset(stream for stream, each in (*signals, *axes) if each is not None and "before" in each.names)
+
+    @property
     def streams(self) -> frozenset[str]:
         """The streams that it looks at."""
         position = {self.subject.position.stream} if isinstance(self.subject, PairSubject) else set()

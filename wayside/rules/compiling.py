@@ -60,6 +60,12 @@ from wayside.rules.variables import (
     sample_environment,
 )
 
+_WITHOUT = {
+    "item": "; item is for signals over streams with items, not over {}",
+    "before": "; before is for signals over streams, not over a {}",
+}
+"""What samples do not have, by the variable."""
+
 
 def compile_rule(
     rule: EventRule,
@@ -183,7 +189,7 @@ class _RuleCompiler:
     def _episode_signal(self, at: FieldPath, signal: Signal, rule: str) -> CompiledSignal:
         """A signal whose samples are the episode starts of another rule."""
         value, where = (
-            self.sample((*at, field), source, None, kind, element_of(self.spec))
+            self.sample((*at, field), source, None, kind, element_of(self.spec), of_rule=True)
             for field, source, kind in (("value", signal.value, Kind.DYN), ("where", signal.where, Kind.BOOL))
         )
         for field, expression in (("value", value), ("where", where)):
@@ -250,13 +256,23 @@ class _RuleCompiler:
         return expression
 
     def sample(
-        self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind, element: str | None = None
+        self,
+        path: FieldPath,
+        source: str | None,
+        stream: Stream | None,
+        kind: Kind,
+        element: str | None = None,
+        *,
+        of_rule: bool = False,
     ) -> Expression | None:
-        """An expression over one sample, and the element's variable; None where there is none, or it is wrong."""
-        items = stream is not None and stream.items is not None
-        without = "" if stream is None or items else f"; item is for streams with items, and {stream.name} has none"
-        environment = sample_environment(element, items=items)
-        expression = self._expression(path, source, environment, kind, of_samples(stream, self._places), without)
+        """An expression over one sample, and the element's variable; None where there is none, or it is wrong.
+
+        `of_rule`: the samples are those of a rule; else `stream` is None where the Detector has no such stream.
+        """
+        items = not of_rule and (stream is None or stream.items is not None)
+        environment = sample_environment(element, items=items, before=not of_rule)
+        whose = "rule" if stream is None else stream.name
+        expression = self._expression(path, source, environment, kind, of_samples(stream, self._places), whose)
         if expression is None:
             return None
         if element is not None:
@@ -268,7 +284,9 @@ class _RuleCompiler:
         if stream is not None and stream.name in self.fields:
             of_type = "" if stream.type is None else f", type {stream.type}"
             fields = self.fields[stream.name]
-            for variable, known in (("msg", fields), ("item", item_fields(stream, fields) or {})):
+            of_items = item_fields(stream, fields) or {}
+            before = fields if stream.items is None else of_items
+            for variable, known in (("msg", fields), ("item", of_items), ("before", before)):
                 for text in unknown_fields(expression.paths, variable, known) if known else ():
                     self.problem(path, f"{text} (stream {stream.name}{of_type})")
         return expression
@@ -280,16 +298,17 @@ class _RuleCompiler:
         environment: Environment,
         kind: Kind,
         places: Places | None = None,
-        without_item: str = "",
+        whose: str = "",
     ) -> Expression | None:
-        """`without_item`: why there is no item, which is added to a problem about it."""
+        """`whose` samples it is over: the stream's name, or `rule`."""
         if source is None:
             return None
         try:
             expression = self._typed(environment, places).compile(source, result=kind)
         except ExpressionError as error:
             for each in (error, *error.others):
-                self.problem(path, f"{each}{without_item if '`item`' in str(each) else ''}")
+                without = [text for name, text in _WITHOUT.items() if whose and f"`{name}` is not" in str(each)]
+                self.problem(path, f"{each}{''.join(without).format(whose)}")
             return None
         self._use(expression)
         return expression

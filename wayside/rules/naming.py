@@ -26,6 +26,7 @@ _FLEET = {"members": "the list of the clients that belong to it"}
 _SAMPLE = {
     "msg": "the message",
     "item": "the item of the message's list",
+    "before": "the message or item before",
     "key": "what the key captures",
     "sample": "the sample's times and size",
 }

@@ -19,15 +19,18 @@ SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 
 
 @lru_cache(maxsize=256)
-def sample_environment(element: str | None = None, *, items: bool = False) -> Environment:
+def sample_environment(element: str | None = None, *, items: bool = False, before: bool = True) -> Environment:
     """For `value` and `where` of signals, and positions (without an element): one sample.
 
     msg is the decoded message, key the captured chunks, sample has stamp and received (seconds since the epoch),
     latency (seconds) and size (bytes); parameters are those of the sample's client. `items`: item is the client's item.
+    `before`: before is the client's message or item before.
     """
     fixed = {"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP}
     if items:
         fixed["item"] = Kind.DYN
+    if before:
+        fixed["before"] = Kind.DYN
     members = {f"sample.{member}": Kind.DOUBLE for member in SAMPLE_MEMBERS}
     return Environment(_with_element(fixed, element), members)
 

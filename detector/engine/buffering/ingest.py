@@ -16,7 +16,7 @@ from detector.engine.buffering.messages import KeyReader
 from detector.engine.buffering.naming import MAXIMUM_ITEMS, MessageClients
 from detector.engine.counters import Counters
 from detector.engine.samples.liveliness import LIVELINESS, Token
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Item, Sample, Stamped
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Before, Item, Linked, Sample, Stamped
 from wayside.api import Detector
 
 MAXIMUM_CLIENTS = 100_000
@@ -52,6 +52,8 @@ class Ingest:
         self.lanes: list[Lane | None] = []
         """The lane of each of these; None: it was dropped."""
         self.noting = False
+        self.linked: frozenset[str] = frozenset()
+        """The streams whose samples take along the one before: some rule reads it."""
         self._lost: dict[str, None] = {}
         """The lost clients of which samples are kept, in the order of their loss."""
 
@@ -67,12 +69,9 @@ class Ingest:
         self._read_key = read_key
         self._lane_makers = lane_makers
         self._of_items = frozenset(stream.name for stream in detector.spec.streams if stream.items is not None)
-        self._patience = {
-            stream.name: min(detector.spec.stale_after_ns(stream) or timeout, timeout)
-            for timeout in (detector.spec.client_timeout.ns,)
-            for stream in detector.spec.streams
-            if stream.items is not None
-        }
+        self._stale_after = {stream.name: detector.spec.stale_after_ns(stream) for stream in detector.spec.streams}
+        timeout = detector.spec.client_timeout.ns
+        self._patience = {stream: min(self._stale_after[stream] or timeout, timeout) for stream in self._of_items}
         """By stream with items, how long a client that is nothing but such items is known without one; nanoseconds."""
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
         """By key; of streams whose messages name their client, by client, which no key is: see `_lane_of_message`."""
@@ -80,7 +79,8 @@ class Ingest:
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
         """Everything that is received comes through here. `times`: None for the receive times, in order."""
         self._counters.samples.update(map(_STREAM, arrivals))
-        if times is None and (not self._of_items or self._of_items.isdisjoint(map(_STREAM, arrivals))):
+        apart = self._of_items | self.linked
+        if times is None and (not apart or apart.isdisjoint(map(_STREAM, arrivals))):
             self._insert_in_order(arrivals)
             return
         for at, arrival in enumerate(arrivals):
@@ -95,7 +95,10 @@ class Ingest:
                     self._token(key, payload, time)
             else:
                 self._number += 1
-                self._put(lane, arrival if times is None else Stamped(time, self._number, payload, key))
+                if stream in self.linked:
+                    self._put(lane, Linked(time, self._number, payload, key, self._before(lane, time)))
+                else:
+                    self._put(lane, arrival if times is None else Stamped(time, self._number, payload, key))
 
     def overhead_of(self, arrivals: Sequence[Arrival]) -> int:
         """What the items of these take at most in the buffer beside the messages, in bytes."""
@@ -113,7 +116,18 @@ class Ingest:
             name = _BY_CLIENT + client
             lane = self._lanes[stream].get(name) or self._new_lane(stream, name, client, time)
             if lane is not None:
-                self._put(lane, Item(time, self._number, payload, key, place, share))
+                before = self._before(lane, time) if stream in self.linked else None
+                self._put(lane, Item(time, self._number, payload, key, place, share, before))
+
+    def _before(self, lane: Lane, time: int) -> Before | None:
+        """The newest sample in the buffer up to a time, unless it is stale then."""
+        newest = lane.newest
+        if newest is not None and newest.time > time:
+            newest = next((sample for sample in reversed(lane.samples) if sample.time <= time), None)
+        limit = self._stale_after[lane.stream]
+        if newest is None or (limit is not None and time - newest.time > limit):
+            return None
+        return Before(newest.payload, newest.place if isinstance(newest, Item) else -1)
 
     def _put(self, lane: Lane, sample: Sample) -> None:
         self._buffer.grew(lane.insert(sample))

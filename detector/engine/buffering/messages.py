@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from detector.engine.buffering.items import Items
 from detector.engine.counters import Counters
-from detector.engine.samples.sample import DecodeError, Decoder, Item, NearDecoder, Sample
+from detector.engine.samples.sample import Before, DecodeError, Decoder, Item, Linked, NearDecoder, Sample
 from wayside.expressions import UNKNOWN, EvaluationError
 from wayside.rules import CompiledStream
 
@@ -63,6 +63,17 @@ class Messages:
             return message
         return self.items.read(stream, sample.payload).items[sample.place]
 
+    def _before(self, stream: str, before: Before | None) -> Any:
+        """What the client sent before; UNKNOWN: nothing, or it cannot be read, which is counted already."""
+        if before is None:
+            return UNKNOWN
+        if before.place >= 0:
+            return self.items.read(stream, before.payload).items[before.place]
+        try:
+            return self._decoders[stream].decode(before.payload)
+        except DecodeError:
+            return UNKNOWN
+
     def message(self, stream: str, sample: Sample) -> Any:
         """The decoded message of a sample, or UNKNOWN where it cannot be read; that is counted."""
         if isinstance(sample, Item):
@@ -96,6 +107,10 @@ class Messages:
             values["msg"] = message
         if "item" in names:
             values["item"] = self.content(stream, sample)
+        if "before" in names and isinstance(sample, Linked | Item):
+            before = self._before(stream, sample.before)
+            if before is not UNKNOWN:
+                values["before"] = before
         if "key" in names:
             whose = self._read_key(stream, sample.key)
             values["key"] = {} if whose is None else whose[1]

@@ -10,18 +10,20 @@ import numpy as np
 from detector.engine.buffering.items import Items
 from detector.engine.samples.sample import (
     MISSING,
+    Before,
     DecodeError,
     Decoder,
     FieldDecoder,
     FieldReader,
     Fields,
     Item,
+    Linked,
     Sample,
 )
 from wayside.expressions import Path
 from wayside.expressions.columns.values import Column, Texts, column_of
 
-OF_A_SAMPLE = frozenset(("msg", "item"))
+OF_A_SAMPLE = frozenset(("msg", "item", "before"))
 """The variables whose fields are read here."""
 
 
@@ -44,49 +46,80 @@ class SampleFields:
         self._stream = stream
         self._items = items
         self._paths = paths
-        of_messages = [path[1:] for path in paths if path[0] == "msg"]
-        self._of_items = [path[1:] for path in paths if path[0] == "item"]
-        read = decoder.field_reader(of_messages) if isinstance(decoder, FieldDecoder) and of_messages else None
-        self._read_messages = read or whole(decoder, of_messages)
-        self._some = bool(of_messages)
+        self._of = {name: [path[1:] for path in paths if path[0] == name] for name in OF_A_SAMPLE}
+        self._messages = _reader(decoder, self._of["msg"])
+        self._before = _reader(decoder, self._of["before"])
 
     def read(self, samples: Sequence[Sample], texts: Texts) -> Found:
         """The fields of these samples."""
         errors: dict[int, DecodeError] = {}
         odd: set[int] = set()
-        if not self._some:
-            of_messages: list[Column] = []
-        elif self._stream in self._items:
-            of_messages = self._shared(samples, texts, odd)
-        else:
-            fields = self._read_messages([sample.payload for sample in samples])
+        shared = self._stream in self._items
+        found: dict[str, list[Column]] = {name: [] for name in OF_A_SAMPLE}
+        if self._of["msg"] and shared:
+            found["msg"] = self._shared(samples, texts, odd)
+        elif self._of["msg"]:
+            fields = self._messages([sample.payload for sample in samples])
             errors.update(fields.errors)
             odd.update(fields.odd)
-            of_messages = [column_of(values, texts) for values in fields.columns]
-        of_items = iter([column_of(values, texts) for values in self._walked(samples, odd)])
-        messages = iter(of_messages)
-        columns = [next(of_items if path[0] == "item" else messages) for path in self._paths]
-        return Found(columns, errors, frozenset(odd))
+            found["msg"] = [column_of(values, texts) for values in fields.columns]
+        if self._of["item"]:
+            items = [(sample.payload, sample.place) if isinstance(sample, Item) else None for sample in samples]
+            found["item"] = [column_of(values, texts) for values in self._walked(items, self._of["item"], odd)]
+        if self._of["before"]:
+            before = [sample.before if isinstance(sample, Linked | Item) else None for sample in samples]
+            odd.update(at for at, each in enumerate(before) if each is None)  # CEL says that nothing is known of it
+            if shared:
+                items = [None if each is None else (each.payload, each.place) for each in before]
+                columns = self._walked(items, self._of["before"], odd)
+            else:
+                columns = self._read_before(before, odd)
+            found["before"] = [column_of(values, texts) for values in columns]
+        ready = {name: iter(columns) for name, columns in found.items()}
+        return Found([next(ready[str(path[0])]) for path in self._paths], errors, frozenset(odd))
+
+    def _read_before(self, before: Sequence[Before | None], odd: set[int]) -> list[list[Any]]:
+        """The fields of the messages before, where there are some that can be read."""
+        there = [at for at, each in enumerate(before) if each is not None]
+        fields = self._before([each.payload for each in before if each is not None])
+        odd.update(there[at] for at in (*fields.odd, *fields.errors))
+        columns: list[list[Any]] = []
+        for values in fields.columns:
+            column: list[Any] = [MISSING] * len(before)
+            for at, value in zip(there, values, strict=True):
+                column[at] = value
+            columns.append(column)
+        return columns
 
     def _shared(self, samples: Sequence[Sample], texts: Texts, odd: set[int]) -> list[Column]:
         """The fields of messages that several samples share, each read once. All could be read as they came."""
         places: dict[bytes, int] = {}
         which = np.array([places.setdefault(sample.payload, len(places)) for sample in samples], np.int64)
-        fields = self._read_messages([*places])
+        fields = self._messages([*places])
         odd.update(np.flatnonzero(np.isin(which, np.array(fields.odd, np.int64))).tolist())
         return [_taken(column_of(values, texts), which) for values in fields.columns]
 
-    def _walked(self, samples: Sequence[Sample], odd: set[int]) -> list[list[Any]]:
-        if not self._of_items:
-            return []
+    def _walked(
+        self, items: Sequence[tuple[bytes, int] | None], paths: Sequence[Path], odd: set[int]
+    ) -> list[list[Any]]:
+        """The fields of items, given by their messages and their places in these."""
         lists: dict[bytes, list[Any]] = {}
-        items: list[Any] = []
-        for sample in samples:
-            listed = lists.get(sample.payload)
+        values: list[Any] = []
+        for item in items:
+            if item is None:
+                values.append(MISSING)
+                continue
+            payload, place = item
+            listed = lists.get(payload)
             if listed is None:
-                listed = lists[sample.payload] = self._items.read(self._stream, sample.payload).items
-            items.append(listed[sample.place] if isinstance(sample, Item) else MISSING)
-        return [walked(items, path, odd) for path in self._of_items]
+                listed = lists[payload] = self._items.read(self._stream, payload).items
+            values.append(listed[place])
+        return [walked(values, path, odd) for path in paths]
+
+
+def _reader(decoder: Decoder, paths: Sequence[Path]) -> FieldReader:
+    read = decoder.field_reader(paths) if isinstance(decoder, FieldDecoder) and paths else None
+    return read or whole(decoder, paths)
 
 
 def walked(values: Sequence[Any], path: Path, odd: set[int]) -> list[Any]:

@@ -51,6 +51,35 @@ class Stamped(msgspec.Struct, frozen=True, gc=False, order=True):
         return self.received
 
 
+class Before(msgspec.Struct, frozen=True, gc=False, order=True):
+    """The sample before another of the same client and stream."""
+
+    payload: bytes
+    """The whole message, undecoded."""
+    place: int
+    """The item's place in the message's list; -1: the stream has no items."""
+
+
+class Linked(msgspec.Struct, frozen=True, gc=False, order=True):
+    """One message in the buffer of a stream of which a rule reads `before`."""
+
+    received: int
+    """As of a sample of the clock: when the intake took the message, or its stamp; nanoseconds."""
+    number: int
+    """The order of arrival."""
+    payload: bytes
+    """The message as it came, undecoded."""
+    key: str
+    """The full key it came on."""
+    before: Before | None
+    """None: it is the first, or the one before it was stale."""
+
+    @property
+    def time(self) -> int:
+        """Its place on the engine's time axis; nanoseconds."""
+        return self.received
+
+
 class Item(msgspec.Struct, frozen=True, gc=False, order=True):
     """One item of a message in the buffer, of a stream with `items`. The items of a message share its payload."""
 
@@ -66,6 +95,8 @@ class Item(msgspec.Struct, frozen=True, gc=False, order=True):
     """The item's place in the message's list."""
     share: int
     """What it takes of the payload in memory, in bytes."""
+    before: Before | None
+    """As of a linked message; None as well where no rule reads it."""
 
     @property
     def time(self) -> int:
@@ -73,7 +104,7 @@ class Item(msgspec.Struct, frozen=True, gc=False, order=True):
         return self.received
 
 
-Sample = Arrival | Stamped | Item
+Sample = Arrival | Stamped | Linked | Item
 """One sample in the buffer. With clock Wall a message is what the intake queued: none is copied."""
 
 

@@ -170,14 +170,19 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
         of_places = AT_A_SAMPLE if signal.get("stream") == "pose" else ()
         more = "sample.received > 0"
         if signal.get("stream") == "list":
-            field, more = draw(st.sampled_from(("item.v", "item.v * 2 - msg.n"))), "[item.v].exists(v, v > 1)"
+            field = draw(st.sampled_from(("item.v", "item.v * 2 - msg.n", "item.v - before.v")))
+            more = "[item.v].exists(v, v > 1)"
+        elif not of_rule:
+            field = draw(st.sampled_from((field, field, "msg.v - before.v", "before.v")))
+            more = draw(st.sampled_from((more, "has(before.v)", "before == msg")))
         signal["value"] = draw(st.sampled_from((field, field, f"{field} > 1", more, *of_places)))
     if aggregate in _WINDOWED or draw(st.integers(0, 3)) == 0:
         signal["over"] = draw(st.sampled_from(("500ms", "1s", "2s", "3s", "5s")))
     if draw(st.integers(0, 3)) == 0:
-        signal["where"] = "msg.values.s > 1" if of_rule else draw(st.sampled_from(("msg.v > 0", "msg.w == 1")))
+        picked = ("msg.v > 0", "msg.w == 1", "before.v < msg.v")
         if signal.get("stream") == "list":
-            signal["where"] = draw(st.sampled_from(("item.v > 0", "msg.n == 1")))
+            picked = ("item.v > 0", "msg.n == 1", "before.v < item.v")
+        signal["where"] = "msg.values.s > 1" if of_rule else draw(st.sampled_from(picked))
     return signal
 
 

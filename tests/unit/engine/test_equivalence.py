@@ -139,7 +139,7 @@ def by_the_reference(scene: Scene) -> list[Told]:
         reference.nothing(time)
         for place, (client, item) in enumerate(items.items()):
             share, order = len(payload) // len(items), number + place / (len(items) + 1)
-            reference.arrive(Sample(time, order, client, each.stream, each.message, payload, time, item, share))
+            reference.arrive(Sample(time, order, client, each.stream, each.message, payload, time, item, share=share))
     if not scene.data:
         reference.advance(END)
     reference.finish()

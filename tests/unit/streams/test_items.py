@@ -277,7 +277,7 @@ def of(value: str, stream: str = "list") -> Sequence[dict[str, Any]]:
     [
         (
             a_rule(signals=of("item.v", "speed"), when="s > 1"),
-            r"signals\[0\].value: .*`item` is not declared here.*; item is for streams with items, and speed has none",
+            r"signals\[0\].value: .*`item` is not declared here.*; item is for signals over streams with items",
         ),
         (a_rule(signals=of("item.w"), when="s > 1"), r"signals\[0\].value: item has no field w; .*\(stream list"),
         (
