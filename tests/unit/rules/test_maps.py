@@ -16,6 +16,7 @@ import pytest
 from detector.assembly import DetectorError, inlets
 from tests.driving import a_detector, a_rule, a_stream
 from wayside.geometry import Shape
+from wayside.positions import positions_at
 from wayside.rules import RuleError, compile_rule, own_problems
 
 LATITUDE, LONGITUDE = 52.0, 10.0
@@ -84,10 +85,10 @@ def test_geojson_is_on_the_earth_and_its_holes_are_outside(tmp_path: Path) -> No
         "zone": ("inside", "distance"),
         "road": ("inside", "distance", "along", "across", "heading"),
     }
-    assert [bool(found["zone"].inside(at(each), at(each - 42))[0]) for each in (52.002, 52.005, 52.011)] == [
+    assert [bool(positions_at(found["zone"]).inside(at(each), at(each - 42))[0]) for each in (52.002, 52.005, 52.011)] == [
         True, False, False,
     ]  # fmt: skip
-    assert found["road"].inside(at(52.00002), at(10.005))[0]
+    assert positions_at(found["road"]).inside(at(52.00002), at(10.005))[0]
 
 
 def test_with_an_origin_places_are_in_metres_of_the_projection(tmp_path: Path) -> None:
@@ -105,16 +106,16 @@ def test_lanelets_are_lanes_and_stop_lines_are_lines(tmp_path: Path) -> None:
     found = shapes({"file": path, "origin": ORIGIN})
     assert found.keys() == {"4711", "77"}
     lane, stop = found["4711"], found["77"]
-    assert lane.inside(at(60.0), at(1.0))[0]
-    assert not lane.inside(at(60.0), at(2.5))[0]
-    assert lane.arc(at(60.0), at(1.0)).along[0] == pytest.approx(10, abs=1e-3)
-    assert lane.arc(at(60.0), at(1.0)).across[0] == pytest.approx(1, abs=1e-3)
-    assert stop.arc(at(85.0), at(0.0)).across[0] == pytest.approx(5, abs=1e-3)
+    assert positions_at(lane).inside(at(60.0), at(1.0))[0]
+    assert not positions_at(lane).inside(at(60.0), at(2.5))[0]
+    assert positions_at(lane).arc(at(60.0), at(1.0)).along[0] == pytest.approx(10, abs=1e-3)
+    assert positions_at(lane).arc(at(60.0), at(1.0)).across[0] == pytest.approx(1, abs=1e-3)
+    assert positions_at(stop).arc(at(85.0), at(0.0)).across[0] == pytest.approx(5, abs=1e-3)
     on_earth = shapes({"file": path})["4711"]
     assert on_earth.geographic
     projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(LATITUDE, LONGITUDE))
     there = projector.reverse(lanelet2.core.BasicPoint3d(60, 1, 0))
-    assert on_earth.arc(at(there.lat), at(there.lon)).across[0] == pytest.approx(1, abs=0.01)
+    assert positions_at(on_earth).arc(at(there.lat), at(there.lon)).across[0] == pytest.approx(1, abs=0.01)
 
 
 def test_rules_name_places_of_maps_and_the_manager_accepts_any(tmp_path: Path) -> None:

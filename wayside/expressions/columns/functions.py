@@ -15,8 +15,8 @@ import numpy as np
 from wayside.expressions.columns.values import Bools, Doubles
 from wayside.expressions.functions import FUNCTIONS, OF_FIELDS
 from wayside.expressions.functions.declaring import Takes, Yields
-from wayside.expressions.functions.whereabouts import OF_PLACES, allowed
 from wayside.geometry import Shape
+from wayside.positions import AT, positions_at
 
 Called = tuple[str, int] | tuple[str, int, Shape]
 """A function, how many numbers it takes, and perhaps the place that it is about."""
@@ -105,7 +105,7 @@ def takes_columns(name: str, count: int) -> bool:
 
 def about_place(name: str) -> bool:
     """Whether the last argument of the function is the key of a place."""
-    return name in OF_PLACES
+    return name in AT
 
 
 def calculate(called: Called, given: Sequence[Doubles], wanted: Bools) -> Answer:
@@ -136,9 +136,10 @@ def calculate(called: Called, given: Sequence[Doubles], wanted: Bools) -> Answer
 def _placed(name: str, shape: Shape, given: Sequence[Doubles], wanted: Bools) -> Answer:
     """A function of positions with regard to a place."""
     whole = [np.broadcast_to(each, wanted.shape) for each in given]
-    known = wanted & allowed(shape, whole[0], whole[1], *whole[2:])
+    at = positions_at(shape)
+    known = wanted & at.allows(*whole)
     results = np.zeros(wanted.shape)
-    results[known] = OF_PLACES[name][0](shape, *(each[known] for each in whole))
+    results[known] = AT[name](at, *(each[known] for each in whole))
     return results, known
 
 

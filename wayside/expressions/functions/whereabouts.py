@@ -10,58 +10,25 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-import numpy as np
-
 from wayside import geodesy
 from wayside.expressions.functions.declaring import Yields, function
-from wayside.geometry import Bools, Doubles, Shape, shape_of
 
-Placed = Callable[..., Doubles]
-"""Of a shape and columns of numbers."""
-
-
-def turn(start: Doubles, end: Doubles) -> Doubles:
-    """The turn from one direction to another, degrees in (-180, 180], positive to the left."""
-    by = np.remainder(end - start, 360.0)
-    return np.where(by > 180.0, by - 360.0, by)
-
-
-def _inside(shape: Shape, u: Doubles, v: Doubles) -> Doubles:
-    return shape.inside(u, v).astype(np.float64)
-
-
-def _heading(shape: Shape, u: Doubles, v: Doubles, heading: Doubles) -> Doubles:
-    return turn(shape.arc(u, v).direction, heading)
-
-
-OF_PLACES: Final[dict[str, tuple[Placed, str]]] = {
-    "at_inside": (_inside, "u v place:text"),
-    "at_distance": (Shape.distance, "u v place:text"),
-    "at_along": (lambda shape, u, v: shape.arc(u, v).along, "u v place:text"),
-    "at_across": (lambda shape, u, v: shape.arc(u, v).across, "u v place:text"),
-    "at_heading": (_heading, "u v heading place:text"),
+OF_PLACES: Final = {
+    "at_inside": "u v place:text",
+    "at_distance": "u v place:text",
+    "at_along": "u v place:text",
+    "at_across": "u v place:text",
+    "at_heading": "u v heading place:text",
 }
-"""By name: over columns, and the parameters."""
+"""The parameters of the functions that `positions` calculates, by name."""
 
 
-def allowed(shape: Shape, u: Doubles, v: Doubles, *heading: Doubles) -> Bools:
-    """Where there is an answer at all."""
-    found = shape.allows(u, v)
-    for each in heading:
-        found = found & np.isfinite(each)
-    return found
-
-
-def _alone(calculate: Placed) -> Callable[..., float]:
-    """The same for one position."""
-
+def _at(name: str) -> Callable[..., float]:
     def calculated(*given: object) -> float:
+        from wayside.positions import at_one  # noqa: PLC0415  numpy is loaded by those who evaluate
+
         *numbers, key = given
-        shape = shape_of(str(key))
-        columns = [np.array([number], np.float64) for number in numbers]
-        if not allowed(shape, *columns)[0]:
-            raise ValueError(f"{', '.join(f'{number:g}' for number in numbers)} is no position at {shape.name}")
-        return float(calculate(shape, *columns)[0])
+        return at_one(name, str(key), *numbers)  # type: ignore[arg-type]  # CEL has checked the types
 
     return calculated
 
@@ -112,10 +79,7 @@ def _finite(number: float) -> float:
 _SEEN = "u v yaw other_u other_v"
 
 FUNCTIONS = (
-    *(
-        function(name, Yields.NUMBER, "at", (_alone(calculate), parameters))
-        for name, (calculate, parameters) in OF_PLACES.items()
-    ),
+    *(function(name, Yields.NUMBER, "at", (_at(name), parameters)) for name, parameters in OF_PLACES.items()),
     function("seen_ahead", Yields.NUMBER, "seenFrom", (_ahead, _SEEN)),
     function("seen_left", Yields.NUMBER, "seenFrom", (_left, _SEEN)),
     function("seen_aheadWgs84", Yields.NUMBER, "seenFrom", (_ahead_wgs84, _SEEN)),
