@@ -20,6 +20,7 @@ kind: Detector
 metadata: {name: fleet}
 spec:
   mode: Standalone
+  clientTimeout: 10s
   streams:
     - {name: odom, key: 'vehicles/${client:*}/odom', encoding: json, staleAfter: 1s}
 """

@@ -100,6 +100,9 @@ def mine_recordings(
 
 def _finish(run: Run, summary: Summary, output: Path) -> None:
     """Print the errors and the last line."""
+    for cut in run.cut:
+        whole = ", ".join(f"{rule} ({why})" for rule, why in sorted(cut.whole.items()))
+        typer.echo(f"{cut.name}: cut into {cut.pieces} pieces" + (f", uncut for {whole}" if whole else ""), err=True)
     for error in summary.errors[:_ERRORS]:
         what = "" if error["kind"] == "unreadable" else f"{error['kind']}: "
         typer.echo(f"{error['recording']}: {what}{error['message']}", err=True)

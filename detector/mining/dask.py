@@ -35,6 +35,11 @@ class DaskWorkers:
             self.close()
             raise ClusterError(f"--dask {address}: it has no worker: start one with `dask worker {address}`") from error
 
+    @property
+    def count(self) -> int:
+        """See `Workers`."""
+        return sum(self._client.nthreads().values())  # type: ignore[no-untyped-call]
+
     def run(self, calls: Iterable[Call]) -> Iterator[tuple[Call, Any]]:
         """See `Workers`. The scheduler gives what a dead worker was at to another one, up to its `allowed-failures`."""
         running = {self._client.submit(*call, pure=False, retries=ATTEMPTS): call for call in calls}

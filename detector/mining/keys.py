@@ -15,19 +15,25 @@ _LAYOUT = 1
 """Counts the layouts of what is kept: what an earlier version kept is not read."""
 
 
-def rule_keys(detector: Detector, rules: Sequence[EventRule], *, record: bool) -> dict[str, str]:
-    """By rule, a digest of it, of the rules that it looks at, of its models, the Detector and this version.
+def rule_keys(detector: Detector, rules: Sequence[EventRule]) -> dict[str, str]:
+    """By rule, a digest of it, of the rules that it looks at, its models, the Detector and this version.
 
-    `record`: whether record actions run; that makes another key for rules that have one.
+    The rules have the actions that run (see `mined_rule`).
     """
     named = {rule.name: rule for rule in rules}
     common = [_LAYOUT, version("wayside"), detector.name, detector.namespace, detector.spec.model_dump(mode="json")]
     keys = {}
     for rule in rules:
         seen = sorted(with_dependencies([rule.name], named))
-        whole = [*common, [_document(named[name]) for name in seen], record and records(rule)]
+        whole = [*common, [_document(named[name]) for name in seen]]
         keys[rule.name] = hashlib.blake2b(json.dumps(whole, sort_keys=True).encode(), digest_size=16).hexdigest()
     return keys
+
+
+def mined_rule(rule: EventRule, *, record: bool) -> EventRule:
+    """The rule without actions, except record actions where they run: no other decides anything."""
+    actions = [action for action in rule.spec.actions if record and action.field == RECORD]
+    return rule.model_copy(update={"spec": rule.spec.model_copy(update={"actions": actions})})
 
 
 def records(rule: EventRule) -> bool:

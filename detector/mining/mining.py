@@ -20,10 +20,11 @@ import msgspec
 
 from detector.mining.cache import Cache, Entry, job_digest, mined_in, read_entry
 from detector.mining.dataset import EPISODES, TABLES, MinedRecording, write_dataset
-from detector.mining.keys import records, rule_keys, with_dependencies
+from detector.mining.keys import mined_rule, records, rule_keys, with_dependencies
 from detector.mining.sources import Seen, Source, look, stamp_of
-from detector.mining.work import Flaw, Job, Mined, mine
-from detector.mining.workers import Call, Lost, Workers
+from detector.mining.tasks import CutRecording, Done, run_jobs
+from detector.mining.work import Flaw, Job, Mined
+from detector.mining.workers import Lost, Workers
 from wayside.api import Detector, EventRule
 
 CLIPS = "clips"
@@ -64,6 +65,8 @@ class Run:
     rules_run: set[str] = field(default_factory=set)
     complete: bool = True
     """Whether the dataset was written, or is as it would be written; else others have not done their share yet."""
+    cut: list[CutRecording] = field(default_factory=list)
+    """The recordings that were cut into pieces."""
     changed: bool = False
     """Whether it was written."""
 
@@ -95,9 +98,8 @@ def run_mining(
         OSError: the output cannot be written.
     """
     cache = Cache(output / CACHE)
-    work = _Work(
-        output, detector, {rule.name: rule for rule in rules}, rule_keys(detector, rules, record=record), record
-    )
+    rules = [mined_rule(rule, record=record) for rule in rules]
+    work = _Work(output, detector, {rule.name: rule for rule in rules}, rule_keys(detector, rules), record)
     seen = _look_at(sources, cache)
     entries = _Entries(cache, work.keys)
     jobs: dict[str, tuple[Job, int]] = {}
@@ -108,12 +110,13 @@ def run_mining(
     own = {content: each for content, each in jobs.items() if share is None or share.takes(content)}
     run = Run(len(sources), len(own), {name for job, _ in own.values() for name in job.wanted})
     watch.expect(len(own), sum(size for _, size in own.values()))
-    # The longest first: the last one decides when all are done.
-    ordered = sorted(own.values(), key=lambda each: (-each[1], each[0].content))
-    for call, result in workers.run(Call(mine, job) for job, _ in ordered):
-        job = call.argument
-        cache.put(job.content, work.entry(job, result))
-        watch.done(own[job.content][1])
+    left_of = {content: job.wanted for content, (job, _) in own.items()}
+    for done in run_jobs(own.values(), workers, run.cut):
+        content = done.job.content
+        cache.put(content, work.entry(done))
+        left_of[content] -= done.rules
+        if not left_of[content]:
+            watch.done(own[content][1])
     entries = _Entries(cache, work.keys)
     run.complete = not any(entries.left(content, failed_too=True) for content in jobs)
     if run.complete:
@@ -137,12 +140,13 @@ class _Work(NamedTuple):
             clips = str((self.output / CLIPS / self._folder(content, wanted)).resolve())
         return Job(source, content, self.detector, evaluated, wanted, clips)
 
-    def entry(self, job: Job, result: bytes | Lost) -> Entry:
+    def entry(self, done: Done) -> Entry:
         """What is kept of a result."""
+        result = done.result
         if isinstance(result, Lost):
             result = msgspec.msgpack.encode(Mined(flaws=[Flaw("failed", result.reason)]))
-        keys = {name: self.keys[name] for name in sorted(job.wanted)}
-        clips = None if job.clips is None else Path(job.clips).name
+        keys = {name: self.keys[name] for name in sorted(done.rules)}
+        clips = None if done.job.clips is None else Path(done.job.clips).name
         entry = Entry(keys, result, clips)
         entry.failed = mined_in(entry).is_failed
         return entry

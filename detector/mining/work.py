@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
@@ -89,13 +89,14 @@ class Job(NamedTuple):
 
 def mine(job: Job) -> bytes:
     """Mine one recording; returns a `Mined` as msgpack. What is wrong with the recording is part of it."""
-    _tune()
+    tuned()
     return msgspec.msgpack.encode(_mined(job))
 
 
 @cache
-def _tune() -> None:
-    tune_garbage_collection()  # once: it takes all that is there for what stays
+def tuned() -> None:
+    """Tune this process once: what is there then is taken for what stays."""
+    tune_garbage_collection()
 
 
 def read(data: bytes) -> Mined:
@@ -158,11 +159,16 @@ def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
     for each in episodes:
         each.recording = ""
     return Mined(
-        episodes=sorted(episodes, key=lambda each: (each.rule, each.start_time, each.subject)),
+        episodes=in_their_order(episodes),
         counts=[RuleCount(name, *counts) for name, counts in sorted(result.counts.items()) if name in wanted],
         streams=[*result.streams],
         samples=result.samples,
     )
+
+
+def in_their_order(episodes: Iterable[Episode]) -> list[Episode]:
+    """As a `Mined` has them."""
+    return sorted(episodes, key=lambda each: (each.rule, each.start_time, each.subject))
 
 
 def _flaws(outcome: Outcome, job: Job, recording: Recording) -> list[Flaw]:

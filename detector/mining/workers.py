@@ -31,6 +31,10 @@ class Lost:
 class Workers(Protocol):
     """Where calls run."""
 
+    @property
+    def count(self) -> int:
+        """How many calls run side by side."""
+
     def run(self, calls: Iterable[Call]) -> Iterator[tuple[Call, Any]]:
         """Each call with its result, or `Lost`, in the order in which they are ready.
 
@@ -48,6 +52,11 @@ class Pool:
         """`processes` is how many there are at most, at least one; they start when they are needed."""
         self._processes = processes
         self._executor: ProcessPoolExecutor | None = None
+
+    @property
+    def count(self) -> int:
+        """See `Workers`."""
+        return self._processes
 
     def run(self, calls: Iterable[Call]) -> Iterator[tuple[Call, Any]]:
         """See `Workers`. A process that dies breaks its pool: what was under way begins again in another one.

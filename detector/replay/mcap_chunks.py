@@ -76,8 +76,13 @@ class Chunks:
         described: Callable[[McapChannel], Channel],
         wanted: Wanted,
         left: Left,
+        between: tuple[int, int] | None = None,
     ) -> None:
-        """`described` says of a channel what batches tell; it is called once the first message of the channel comes."""
+        """`described` says of a channel what batches tell; it is called once the first message of the channel comes.
+
+        `between`: only messages from the first to the second time, both included.
+        """
+        self._between = between
         self._file = file
         self._size = file.seek(0, 2)
         self._summary = summary
@@ -115,6 +120,10 @@ class Chunks:
 
     def _is_wanted(self, index: ChunkIndex) -> bool:
         """Whether the chunk may hold wanted messages; without message indexes nobody knows."""
+        if self._between is not None:
+            first, last = self._between
+            if index.message_end_time < first or index.message_start_time > last:
+                return False
         offsets = index.message_index_offsets
         return not offsets or any(self._wanted[self._summary.channels[number].id] for number in offsets)
 
@@ -138,6 +147,12 @@ class Chunks:
         times = rows["time"]
         if (times[1:] < times[:-1]).any():
             rows = rows[np.argsort(times, kind="stable")]
+        if self._between is not None:
+            begin, end = index.message_start_time, index.message_end_time
+            if len(rows) and not begin <= rows["time"][0] <= rows["time"][-1] <= end:
+                raise ValueError("a chunk has other times than its index")  # what else is in it would be missed
+            first, last = self._between
+            rows = rows[(rows["time"] >= first) & (rows["time"] <= last)]
         return _Waiting(index.chunk_start_offset, rows, data)
 
     def _begins(self, index: ChunkIndex, size: int) -> NDArray[np.uint64] | None:

@@ -23,7 +23,7 @@ from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wa
 from detector.replay.protobuf import ENCODING as PROTOBUF
 from detector.replay.protobuf import Decoders
 
-__all__ = ["MAGIC", "Left", "is_cut", "mcap_span", "mcap_types", "read_mcap"]
+__all__ = ["MAGIC", "Left", "is_cut", "mcap_chunks", "mcap_span", "mcap_types", "read_mcap"]
 
 _DAMAGE = (*DAMAGE, McapError, zstandard.ZstdError)
 
@@ -35,8 +35,16 @@ class _Index(NamedTuple):
     summary: Summary
 
 
-def read_mcap(path: Path, wanted: Wanted, on_cut: OnCut, left: Left = lambda channel: None) -> Iterator[Batch]:
+def read_mcap(
+    path: Path,
+    wanted: Wanted,
+    on_cut: OnCut,
+    left: Left = lambda channel: None,
+    between: tuple[int, int] | None = None,
+) -> Iterator[Batch]:
     """The file's messages, in the order of their log times. One that is cut is read up to there.
+
+    `between`: only those from the first to the second time, both included; for files that `mcap_chunks` knows.
 
     Raises RecordingError if it is damaged, or holds Protobuf messages that cannot be read.
     """
@@ -65,7 +73,7 @@ def read_mcap(path: Path, wanted: Wanted, on_cut: OnCut, left: Left = lambda cha
                 def of_summary(channel: McapChannel) -> Channel:
                     return described(summary.schemas[channel.schema_id] if channel.schema_id else None, channel)
 
-                yield from Chunks(file, summary, of_summary, wanted, left).batches()
+                yield from Chunks(file, summary, of_summary, wanted, left, between).batches()
                 return
             kept = _Kept(left)
             yield from batched(
@@ -154,6 +162,18 @@ def mcap_span(path: Path) -> tuple[int, int] | None:
         if statistics is None or not statistics.message_count:
             return None
         return statistics.message_start_time, statistics.message_end_time
+
+
+def mcap_chunks(path: Path) -> list[tuple[int, int]] | None:
+    """By chunk, its first time and its size in bytes, by time; None where the file has no index of chunks."""
+    try:
+        with path.open("rb") as file:
+            index = _index(file)
+    except (*_DAMAGE, OSError):
+        return None
+    if index is None or not index.summary.chunk_indexes:
+        return None
+    return sorted((each.message_start_time, each.uncompressed_size) for each in index.summary.chunk_indexes)
 
 
 def is_cut(path: Path) -> bool:

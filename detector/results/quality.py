@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from detector.engine.engine import Engine
+from detector.engine.counters import Counters
 from detector.engine.samples.sample import Arrival
+from wayside.api import Detector
 
 Record = TypeVar("Record")
 
@@ -83,11 +84,23 @@ class Arrivals:
         keys = self._keys.values()
         return min((key.first for key in keys), default=0), max((key.last for key in keys), default=0)
 
-    def by_stream(self, engine: Engine) -> list[StreamQuality]:
-        """What came on each stream of the Detector, in its order; the engine is the replay's."""
-        counters = engine.counters
+    def follow(self, later: Arrivals) -> None:
+        """Count what another one counted that watched what came afterwards."""
+        for at, other in later._keys.items():
+            seen = self._keys.get(at)
+            if seen is None:
+                self._keys[at] = other
+                continue
+            for gap, since in ((other.first - seen.last, seen.last), (other.gap, other.since)):
+                if gap > seen.gap:
+                    seen.gap, seen.since = gap, since
+            seen.last = other.last
+            seen.count += other.count
+
+    def by_stream(self, detector: Detector, counters: Counters) -> list[StreamQuality]:
+        """What came on each stream of the Detector, in its order; the counters are the engine's."""
         found = []
-        for stream in engine.detector.spec.streams:
+        for stream in detector.spec.streams:
             name = stream.name
             keys = {key: seen for (of, key), seen in self._keys.items() if of == name}
             rates = sorted((k.count - 1) * 1e9 / (k.last - k.first) for k in keys.values() if k.last > k.first)

@@ -68,7 +68,7 @@ def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -
         rules=rules,
         documents=outcome.rules,
         terms=terms,
-        streams=arrivals.by_stream(engine),
+        streams=arrivals.by_stream(engine.detector, engine.counters),
         counts={rule: (each.evaluations, each.unknowns, each.errors) for rule, each in counted.items()},
         notes=[*map(str, (*outcome.cuts, *outcome.doubts)), *outcome.notes],
         samples=outcome.samples,

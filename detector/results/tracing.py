@@ -239,7 +239,7 @@ class Tracer:
             for changes in parts.values():
                 for client, times, values, tags in changes.by_client(self._traced.get(rule)):
                     if (rule, element, client) in subjects:
-                        by_client.setdefault(client, []).append(_series(times, values, tags, texts))
+                        by_client.setdefault(client, []).append(series_of(times, values, tags, texts))
             for client, series in by_client.items():
                 subjects[rule, element, client].signals[signal] = _joined(series)
 
@@ -379,7 +379,8 @@ def _steps(times: Integers, codes: Bytes, reasons: Mapping[tuple[int, int], str]
     return Steps(times, codes, {at: why for at, why in found.items() if why is not None})
 
 
-def _series(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str]) -> Series:
+def series_of(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str]) -> Series:
+    """The series of one signal of one subject; `tags` are those of its values, of which texts are places in `texts`."""
     if (tags == Tag.NUMBER).all():
         return Series(times, values)
     known = (tags != Tag.ABSENT) & (tags != Tag.UNREACHABLE)

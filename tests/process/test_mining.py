@@ -28,7 +28,7 @@ from detector.mining.workers import Call, Lost, Pool
 from detector.results.kinds import Kind
 from tests import s3
 from tests.cluster.waiting import wait_until
-from tests.fleets import HARSH, write_fleet
+from tests.fleets import HARSH, write_fleet, write_mcap
 from wayside import commandline
 
 pytestmark = pytest.mark.xdist_group("mining")  # one fleet for all
@@ -152,6 +152,17 @@ def test_a_second_run_does_nothing_and_a_changed_rule_runs_alone(fleet: Path) ->
     (fleet / "harsh.yaml").write_text(HARSH)
     assert "nothing was left to do" in mine(fleet, "again", rules="harsh.yaml")
     assert [name for name in files(fleet / "again") if "rule=" in name] == ["episodes/rule=harsh/part-0.parquet"]
+
+
+def test_a_long_recording_is_cut_for_the_rules_for_which_that_is_exact(fleet: Path) -> None:
+    (fleet / "long").mkdir()
+    write_mcap(fleet / "long" / "drive.mcap", 7, 600.0, cars=2)
+    said = mine(fleet, "cut", "--processes", "2", drives="long")
+    assert "long/drive.mcap: cut into 4 pieces, uncut for close (pairs)" in said
+    assert "pieces" not in mine(fleet, "uncut", "--processes", "1", drives="long")
+    assert files(fleet / "cut") == files(fleet / "uncut")
+    ((episodes,),) = asked(fleet, "SELECT count(*) FROM 'cut/episodes/*/*.parquet'")
+    assert episodes > 200
 
 
 def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:

@@ -1,0 +1,118 @@
+"""What workers get for a job: the whole of it, or pieces of its recording and the rules that need the whole.
+
+A recording is cut only where it would hold the others up: pieces cost a little more than the whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import ceil
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from detector.assembly import DetectorError
+from detector.mining.cutting import Cutting, cutting_of
+from detector.mining.joining import flaw_of, joined
+from detector.mining.keys import with_dependencies
+from detector.mining.pieces import Observed, PieceJob, observe
+from detector.mining.work import Job, mine
+from detector.mining.workers import Call, Lost, Workers
+from detector.replay.errors import RecordingError
+
+_PER_WORKER = 2
+"""A recording is cut into pieces so small that each worker has at least this number of calls."""
+
+
+class Done(NamedTuple):
+    """What a job came to, or a part of its rules."""
+
+    job: Job
+    rules: frozenset[str]
+    result: bytes | Lost
+
+
+class CutRecording(NamedTuple):
+    """How a recording was cut."""
+
+    name: str
+    pieces: int
+    whole: Mapping[str, str]
+    """The rules that ran over the whole, and why."""
+
+
+def run_jobs(jobs: Iterable[tuple[Job, int]], workers: Workers, cut: list[CutRecording]) -> Iterator[Done]:
+    """Run the jobs, each with the size of its recording in bytes; results as they are ready, by parts of the rules.
+
+    Adds to `cut` which recordings were cut.
+    """
+    # The largest first: the last one decides when all are done.
+    ordered = sorted(jobs, key=lambda each: (-each[1], each[0].content))
+    total = sum(size for _, size in ordered)
+    calls: list[Call] = []
+    of_pieces: dict[int, _Pieces] = {}
+    for job, size in ordered:
+        most = _PER_WORKER * workers.count
+        cutting = _cutting(job, ceil(most * size / total)) if workers.count > 1 and total else None
+        if cutting is None:
+            calls.append(Call(mine, job))
+            continue
+        cut.append(CutRecording(job.source.name, len(cutting.spans), cutting.whole))
+        exact = job.wanted & cutting.rules
+        pieces = _Pieces(_with(job, exact), cutting)
+        of_pieces |= {id(call): pieces for call in pieces.calls}
+        calls += [*([Call(mine, _with(job, job.wanted - exact))] if job.wanted - exact else []), *pieces.calls]
+    again: list[Call] = []
+    for call, result in workers.run(calls):
+        found = of_pieces.get(id(call))
+        if found is None:
+            yield Done(call.argument, call.argument.wanted, result)
+        elif found.take(call, result):
+            done = found.result()
+            if done is None:
+                again.append(Call(mine, found.job))
+            else:
+                yield Done(found.job, found.job.wanted, done)
+    for call, result in workers.run(again):
+        yield Done(call.argument, call.argument.wanted, result)
+
+
+def _cutting(job: Job, count: int) -> Cutting | None:
+    """How to cut the recording of a job; what is wrong with it comes to light when it is mined."""
+    if count < 2 or job.source.is_remote:
+        return None
+    try:
+        cutting = cutting_of(tuple(map(Path, job.source.files)), job.detector, job.rules, count)
+    except (RecordingError, DetectorError, OSError):
+        return None
+    return cutting if cutting is not None and job.wanted & cutting.rules else None
+
+
+def _with(job: Job, wanted: frozenset[str]) -> Job:
+    """The job for some of its rules alone."""
+    needed = with_dependencies(wanted, {rule.name: rule for rule in job.rules})
+    return job._replace(wanted=wanted, rules=[rule for rule in job.rules if rule.name in needed])
+
+
+class _Pieces:
+    """The pieces of a recording, and what came of them so far."""
+
+    def __init__(self, job: Job, cutting: Cutting) -> None:
+        self.job = job._replace(clips=None)
+        given = job.source.files, job.detector, job.rules
+        self.calls = [Call(observe, PieceJob(span, *given)) for span in cutting.spans]
+        self._observed: dict[int, Observed] = {}
+
+    def take(self, call: Call, result: Observed | Lost) -> bool:
+        """What came of a piece; whether it was the last one."""
+        found = Observed(flaw=result.reason) if isinstance(result, Lost) else result
+        self._observed[[id(each) for each in self.calls].index(id(call))] = found
+        return len(self._observed) == len(self.calls)
+
+    def result(self) -> bytes | None:
+        """What they came to; None: the recording has to be mined whole."""
+        pieces: Sequence[Observed] = [self._observed[at] for at in range(len(self.calls))]
+        if flaw_of(pieces) is not None:
+            return None
+        return msgspec.msgpack.encode(joined(self.job, tuple(map(Path, self.job.source.files)), pieces))
