@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from detector.assembly import lasting_problems
 from detector.mining.mining import Run, Share, run_mining
+from detector.mining.report import REPORT, write_report
 from detector.mining.sources import sampled, sources_of
 from detector.mining.summary import Summary, show, summary_of
 from detector.mining.workers import Pool, Workers
@@ -94,12 +95,14 @@ def mine_recordings(
         typer.echo(f"{_did(run)}; others have not done their share yet: {output}", err=True)
         return
     summary = summary_of(output)
+    if run.changed or not (output / REPORT).exists():
+        write_report(output, summary)
     show(console if console.is_terminal else Console(stderr=True, width=_WIDTH), summary)
-    _finish(run, summary, output)
+    _finish(run, summary, output, shared=part is not None)
 
 
-def _finish(run: Run, summary: Summary, output: Path) -> None:
-    """Print the errors and the last line."""
+def _finish(run: Run, summary: Summary, output: Path, *, shared: bool) -> None:
+    """Print the errors and the last line. A share fails only where another attempt may help."""
     for cut in run.cut:
         whole = ", ".join(f"{rule} ({why})" for rule, why in sorted(cut.whole.items()))
         typer.echo(f"{cut.name}: cut into {cut.pieces} pieces" + (f", uncut for {whole}" if whole else ""), err=True)
@@ -113,7 +116,7 @@ def _finish(run: Run, summary: Summary, output: Path) -> None:
     parts = [f"{run.recordings} recordings", f"{summary.seconds / 3600:.1f} hours", f"{summary.samples} samples"]
     parts += [f"{episodes} episodes", *(f"{count} {kind}" for kind, count in sorted(kinds.items()))]
     typer.echo(f"{', '.join(parts)}; {_did(run)}: {output}", err=True)
-    if kinds - Counter(cut=len(summary.errors)):
+    if kinds["failed"] or (not shared and set(kinds) - {"cut"}):
         raise typer.Exit(1)
 
 

@@ -6,6 +6,7 @@ the work in one folder: each writes what it does, and the one that finds everyth
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -120,7 +121,9 @@ def run_mining(
     entries = _Entries(cache, work.keys)
     run.complete = not any(entries.left(content, failed_too=True) for content in jobs)
     if run.complete:
-        run.changed = _write(output, sources, seen, entries, work)
+        with (output / CACHE / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # two shares may be the last at once
+            run.changed = _write(output, sources, seen, entries, work)
     return run
 
 

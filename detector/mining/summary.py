@@ -53,6 +53,7 @@ class Summary:
     rarest: list[RareEpisode]
     errors: list[dict[str, Any]]
     """The rows of errors.parquet."""
+    recordings_read: int
     samples: int
     seconds: float
     """Of data, of all recordings together."""
@@ -85,6 +86,7 @@ def summary_of(folder: Path) -> Summary:
         sorted(by_recording.items(), key=lambda each: (-sum(each[1].values()), each[0])),
         _rarest(folder, rules),
         pq.read_table(folder / "errors.parquet").to_pylist(),
+        sum(row["samples"] > 0 for row in whole),
         sum(row["samples"] for row in whole),
         sum(row["duration"] or 0.0 for row in whole),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import json
 import os
 import re
 import signal
@@ -163,6 +164,29 @@ def test_a_long_recording_is_cut_for_the_rules_for_which_that_is_exact(fleet: Pa
     assert files(fleet / "cut") == files(fleet / "uncut")
     ((episodes,),) = asked(fleet, "SELECT count(*) FROM 'cut/episodes/*/*.parquet'")
     assert episodes > 200
+
+
+def test_clips_are_linked_from_the_episodes_and_the_report(fleet: Path) -> None:
+    action = """
+  actions: [{name: clip, record: {streams: [odom], before: 1s, after: 1s}}]"""
+    (fleet / "record.yaml").write_text(HARSH.rstrip() + action)
+    drive = "drives/car-000-drive.mcap"
+    mine(fleet, "clips", "--record", rules="record.yaml", drives=drive)
+    found = asked(fleet, "SELECT episode, clips FROM 'clips/episodes/*/*.parquet'")
+    page = (fleet / "clips" / "report.html").read_text()
+    assert len(found) > 3
+    for episode, (clip,) in found:
+        description = json.loads((fleet / "clips" / clip / "recording.json").read_text())
+        assert (description["episode"], description["rule"]) == (episode, "harsh")
+        assert f'<a href="{clip}/">' in page.replace("%7E", "~")
+    changed = (fleet / "record.yaml").read_text().replace("cooldown: 2s", "cooldown: 60s")
+    (fleet / "record.yaml").write_text(changed)
+    mine(fleet, "clips", "--record", rules="record.yaml", drives=drive)
+    kept = asked(fleet, "SELECT clips FROM 'clips/episodes/*/*.parquet'")
+    assert 0 < len(kept) < len(found)
+    assert {clip for (of_one,) in kept for clip in of_one} == {
+        str(path.parent.relative_to(fleet / "clips")) for path in (fleet / "clips" / "clips").rglob("recording.json")
+    }
 
 
 def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:
