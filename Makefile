@@ -102,7 +102,7 @@ requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by th
 	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra etsi --extra mqtt --extra otel --upgrade \
 	  --generate-hashes --universal --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements.txt
 	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra etsi --extra mqtt --extra otel --extra onnx \
-	  --extra protobuf --extra results --constraint docker/requirements.txt --generate-hashes --universal \
+	  --extra mining --extra protobuf --extra results --constraint docker/requirements.txt --generate-hashes --universal \
 	  --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements-full.txt
 
 wheels: $(BIN)/.installed-dev ## whether the images' packages are there as wheels for both architectures, and how large they are

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from application_manager.core.objects.detectors import detector_objects
 from application_manager.core.objects.poddefaults import PodDefaults, parse_environment
 from application_manager.core.objects.sidecars import SIDECAR_LABEL, addition
 from tests import programs
+from tests.fleets import write_fleet
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import CHART, Helm, HelmError, Rendered, Values
 from wayside.api import Detector
@@ -207,6 +210,31 @@ def test_the_linter_finds_nothing(helm: Helm) -> None:
 def test_a_value_that_is_none_is_refused_by_its_name(helm: Helm, values: Values, message: str) -> None:
     with pytest.raises(HelmError, match=message):
         helm.rendered(values)
+
+
+def test_the_pods_of_the_mining_job_make_one_dataset(helm: Helm, tmp_path: Path) -> None:
+    """What their containers run, here, one after another."""
+    write_fleet(tmp_path, 4, 5.0, broken=1)
+    given: Values = {"enabled": True, "shares": 2, "claim": "datasets", "recordings": [str(tmp_path / "drives")]}
+    given |= {name: (tmp_path / f"{name}.yaml").read_text() for name in ("detector", "rules")}
+    rendered = helm.rendered({"mining": given})
+    job = rendered.one("Job")["spec"]
+    assert (job["completionMode"], job["completions"], job["parallelism"]) == ("Indexed", 2, 2)
+    (container,) = job["template"]["spec"]["containers"]
+    assert {mount["mountPath"] for mount in container["volumeMounts"]} == {"/configuration", "/dataset", "/tmp"}
+    (configuration,) = (each for each in rendered.of("ConfigMap") if "mining" in each["metadata"]["name"])
+    for name, text in configuration["data"].items():
+        (tmp_path / name).write_text(text)
+    variables = {"/configuration": str(tmp_path), "/dataset": str(tmp_path / "claim")}
+    for index in range(2):
+        arguments = [*container["command"], *container["args"]]
+        for name, value in {**variables, "$(JOB_COMPLETION_INDEX)": str(index)}.items():
+            arguments = [each.replace(name, value, 1) for each in arguments]
+        assert arguments.pop(0) == "detector"
+        subprocess.run([sys.executable, "-m", "detector.cli", *arguments], check=True)
+        assert (tmp_path / "claim" / "dataset" / "report.html").exists() is (index == 1)
+    with pytest.raises(HelmError, match="mining needs detector, rules, recordings and claim"):
+        helm.rendered({"mining": {"enabled": True}})
 
 
 def test_more_can_be_mounted_into_the_manager(helm: Helm) -> None:
