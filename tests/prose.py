@@ -35,6 +35,7 @@ CLEAN = (
     "docs/recording.md",
     "docs/regions.md",
     "docs/rules.md",
+    "docs/scale.md",
     "docs/scopes.md",
     "docs/templates.md",
     "docs/trigger.md",

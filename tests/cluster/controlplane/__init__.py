@@ -101,6 +101,11 @@ class ControlPlane:
         """The one that runs now."""
         return self._controller_manager
 
+    def pids(self) -> list[int]:
+        """The process ids of what runs now."""
+        children = (self._etcd, self._api_server, self._controller_manager)
+        return [child.pid for child in children if child is not None]
+
     def api(self, namespace: str = "default") -> Api:
         """Return an administrator's client whose default namespace is `namespace`."""
         return Api(self.kubeconfig, namespace)
