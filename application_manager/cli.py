@@ -182,6 +182,13 @@ def run(
             help="As whom detectors run: a number, or `cluster` where that chooses (OpenShift). Default: 65532.",
         ),
     ] = None,
+    detector_metrics_secret: Annotated[
+        str | None,
+        typer.Option(
+            help="A Secret with tls.crt and tls.key, in each namespace with detectors, by which they serve metrics and "
+            "health. Default: without TLS."
+        ),
+    ] = None,
     admission_port: Annotated[
         int | None,
         typer.Option(
@@ -245,7 +252,14 @@ def run(
         chart_folder=chart_folder,
         admission=serving_of(admission_port, admission_certificates, admission_service, admission_webhooks),
         lease=lease_of(lease, tuple(namespace or ())),
-        detectors=detectors_of(detector_image, detector_pull_policy, detector_pull_secret, detector_env, detector_user),
+        detectors=detectors_of(
+            detector_image,
+            detector_pull_policy,
+            detector_pull_secret,
+            detector_env,
+            detector_user,
+            detector_metrics_secret,
+        ),
     )
     asyncio.run(serve(options))
     commandline.leave()

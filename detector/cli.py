@@ -88,6 +88,10 @@ def run(
         int | None,
         typer.Option(help="Serve /metrics, /healthz and /readyz on this port; 0: on any free port.", min=0, max=65535),
     ] = None,
+    metrics_certificates: Annotated[
+        Path | None,
+        typer.Option(help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."),
+    ] = None,
     foxglove: Annotated[
         str | None,
         typer.Option(
@@ -111,19 +115,23 @@ def run(
         refuse("--namespace requires --name; a Detector in a file names its namespace itself")
     if detector is not None and as_pod:
         refuse("--as-pod requires --name; the holder of a Detector in a file is its name")
+    if metrics_certificates is not None and metrics_port is None:
+        refuse("--metrics-certificates requires --metrics-port")
     with importing():
         import asyncio
 
         from detector.live.service import Files, Named, Options
         from detector.live.service import run as run_service
+        from detector.status.server import PagesAddress
 
+    pages = None if metrics_port is None else PagesAddress(metrics_port, metrics_certificates)
     if name is not None:
         holder = _holder_in_pod(name) if as_pod else name
         source: Files | Named = Named(name, namespace, output, holder)
     else:
         assert detector is not None  # noqa: S101  one of both is given
         source = Files(detector, tuple(rules or ()), output or Path("out"))
-    asyncio.run(run_service(Options(source, record_intake, metrics_port, _view(foxglove))))
+    asyncio.run(run_service(Options(source, record_intake, pages, _view(foxglove))))
     leave()
 
 

@@ -22,12 +22,12 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from application_manager.admission.authority import AUTHORITY, VALID, issued, written
 from application_manager.admission.reviewing import Serving
-from application_manager.cluster.certificate import CERTIFICATE, KEY
 from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.starting import until_answered
 from application_manager.core.findings.webhooks import Place
+from wayside.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret
 _RENEWED_AT = 1 / 3  # of its life that is left

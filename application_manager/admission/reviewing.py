@@ -18,11 +18,12 @@ from typing import Any
 import msgspec
 from aiohttp import web
 
-from application_manager.cluster.certificate import ServingCertificate
+from application_manager.cluster.certificate import follow
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.measures import Measures
+from wayside.servingcertificate import ServingCertificate
 
 AT_ONCE = 32
 """Questions of one kind that are answered at the same time; those beyond get 503 at once."""
@@ -96,7 +97,7 @@ class Desk:
 async def webhook(serving: Serving | None, desks: Mapping[str, Desk]) -> AsyncIterator[None]:
     """Serve the desks, by their paths, on all addresses while the block runs; nothing where `serving` is None.
 
-    Raises ConfigurationError where the port is taken, or there is no certificate.
+    Raises ConfigurationError where the port is taken, CertificateError where there is no valid certificate.
     """
     if serving is None:
         yield
@@ -110,7 +111,7 @@ async def webhook(serving: Serving | None, desks: Mapping[str, Desk]) -> AsyncIt
         application, access_log=None, handle_signals=False, shutdown_timeout=1, handler_cancellation=True
     )
     await runner.setup()
-    following = asyncio.create_task(certificate.follow(), name="certificate")
+    following = asyncio.create_task(follow(certificate), name="certificate")
     try:
         try:
             await web.TCPSite(runner, port=serving.port, ssl_context=certificate.context).start()

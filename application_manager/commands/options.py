@@ -98,6 +98,7 @@ def detectors_of(
     secrets: list[str] | None,
     variables: list[str] | None,
     user: str | None,
+    metrics_secret: str | None = None,
 ) -> PodDefaults | None:
     """What holds for the pods of detectors; None: no detector is run."""
     from application_manager.core.objects.poddefaults import USER, PodDefaults, parse_environment, parse_user
@@ -110,8 +111,8 @@ def detectors_of(
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint=option) from None
     if image:
-        return PodDefaults(image, policy, tuple(secrets or ()), environment, number)
-    if policy or secrets or environment or user:
+        return PodDefaults(image, policy, tuple(secrets or ()), environment, number, metrics_secret)
+    if policy or secrets or environment or user or metrics_secret:
         commandline.refuse(
             "options for detectors' pods do nothing without --detector-image: give it, or leave them out"
         )

@@ -11,9 +11,10 @@ from typing import Protocol
 
 from aiohttp import web
 
-from application_manager.cluster.certificate import ServingCertificate
+from application_manager.cluster.certificate import follow
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.measures import Measures
+from wayside.servingcertificate import ServingCertificate
 
 FOLDER_OPTION = "--metrics-certificates"
 
@@ -73,7 +74,7 @@ async def pages(
 
     `certificates`: the folder with tls.crt and tls.key, which may change; None: without TLS.
 
-    Raises ConfigurationError where the port is taken, or there is no certificate that can be used.
+    Raises ConfigurationError where the port is taken, CertificateError where there is no valid certificate.
     """
     if port is None:
         yield None
@@ -94,7 +95,7 @@ async def pages(
         application.router.add_get(path, page)
     runner = web.AppRunner(application, access_log=None, handle_signals=False, shutdown_timeout=1)
     await runner.setup()
-    following = None if certificate is None else asyncio.create_task(certificate.follow(), name="metrics certificate")
+    following = None if certificate is None else asyncio.create_task(follow(certificate), name="metrics certificate")
     try:
         try:
             await web.TCPSite(runner, port=port, ssl_context=certificate.context if certificate else None).start()

@@ -19,6 +19,7 @@ from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
 from detector.live.state import state_file
 from detector.rules.kubernetes import ClusterRules
+from detector.status.server import PagesAddress
 from detector.tracing import EpisodeTraces
 
 Result = TypeVar("Result")
@@ -32,7 +33,7 @@ async def run_in_cluster(
     output: Path | None,
     record: Path | None,
     stopping: asyncio.Event,
-    metrics_port: int | None,
+    pages: PagesAddress | None,
     traces: EpisodeTraces | None,
     view: View | None = None,
 ) -> None:
@@ -50,7 +51,7 @@ async def run_in_cluster(
             group.create_task(lease.run())
             try:
                 await _run_while_held(
-                    holder, output, record, stopping, rules, lease, store, reconciler, metrics_port, traces, view
+                    holder, output, record, stopping, rules, lease, store, reconciler, pages, traces, view
                 )
             finally:
                 lease.stop()
@@ -65,7 +66,7 @@ async def _run_while_held(
     lease: HolderLease,
     store: TaskStore,
     reconciler: DemandReconciler,
-    metrics_port: int | None,
+    pages: PagesAddress | None,
     traces: EpisodeTraces | None,
     view: View | None = None,
 ) -> None:
@@ -80,9 +81,7 @@ async def _run_while_held(
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            with Running(
-                first, holder, reconciler, output, record, restored, metrics_port, state, traces, view
-            ) as running:
+            with Running(first, holder, reconciler, output, record, restored, pages, state, traces, view) as running:
                 following = group.create_task(running.follow(changes))
                 await running.until(stopping)
                 following.cancel()

@@ -30,7 +30,7 @@ from detector.rules.selection import RuleSet
 from detector.sources.registry import source_problems
 from detector.sources.supervision import Sources
 from detector.status.pulse import Pulse
-from detector.status.server import StatusServer
+from detector.status.server import PagesAddress, StatusServer
 from detector.streams.answering import Answering
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
@@ -70,12 +70,18 @@ class Running:
         output: Path | None,
         record: Path | None,
         restored: Restored,
-        metrics_port: int | None = None,
+        pages: PagesAddress | None = None,
         state: StateFile | None = None,
         traces: EpisodeTraces | None = None,
         view: View | None = None,
     ) -> None:
-        """Raises DetectorError where the Detector cannot run, OSError if a file or the port is unavailable."""
+        """Start nothing yet.
+
+        Raises:
+            DetectorError: the Detector cannot run.
+            OSError: a file or the port is unavailable.
+            CertificateError: the pages have no valid certificate.
+        """
         self._loop = asyncio.get_running_loop()
         self._failed: asyncio.Future[None] = self._loop.create_future()
         self._rule_set = rule_set
@@ -107,7 +113,7 @@ class Running:
         self.answers = Answers(
             self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence
         )
-        self._server = None if metrics_port is None else _server(metrics_port, self.answers)
+        self._server = None if pages is None else _server(pages, self.answers)
 
         self._evaluator.losses.watch(self._tally)
         self._evaluator.losses.watch_also(lambda: _of_actions(self._outlet.actions.outcomes))
@@ -223,13 +229,13 @@ def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:
     return IntakeWriter(_unused(path), detector.spec.streams, entries.types)
 
 
-def _server(port: int, answers: Answers) -> StatusServer:
+def _server(address: PagesAddress, answers: Answers) -> StatusServer:
     # Not at the top: only a detector that is scraped needs the import.
     from detector.status.metrics import Metrics  # noqa: PLC0415
 
     metrics = Metrics(answers.status)
     return StatusServer(
-        port, {"/metrics": lambda: (True, metrics.text()), "/healthz": answers.healthy, "/readyz": answers.ready}
+        address, {"/metrics": lambda: (True, metrics.text()), "/healthz": answers.healthy, "/readyz": answers.ready}
     )
 
 

@@ -22,6 +22,7 @@ from detector.live.state import state_file
 from detector.memory import tune_garbage_collection
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files, hangups
+from detector.status.server import PagesAddress
 from detector.tracing import EpisodeTraces, episode_traces
 
 _log = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ class Options:
 
     source: Files | Named
     record_intake: Path | None = None
-    metrics_port: int | None = None
+    pages: PagesAddress | None = None
     """Where /metrics, /healthz and /readyz are served; None: nowhere."""
     view: View | None = None
 
@@ -82,9 +83,9 @@ async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces 
             # Not at the top: the Kubernetes client takes half a second to import, which is only needed with a cluster.
             from detector.live.in_cluster import run_in_cluster  # noqa: PLC0415
 
-            record, port = options.record_intake, options.metrics_port
+            record, pages = options.record_intake, options.pages
             await run_in_cluster(
-                named.name, named.namespace, named.holder, named.output, record, stopping, port, traces, options.view
+                named.name, named.namespace, named.holder, named.output, record, stopping, pages, traces, options.view
             )
 
 
@@ -104,9 +105,9 @@ async def _run_from_files(
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            record, port = options.record_intake, options.metrics_port
+            record, pages = options.record_intake, options.pages
             with Running(
-                loaded.rule_set, holder, reconciler, files.output, record, restored, port, state, traces, options.view
+                loaded.rule_set, holder, reconciler, files.output, record, restored, pages, state, traces, options.view
             ) as running:
                 following = group.create_task(
                     running.follow(follow_files(files.detector, files.rules, detector_problems, changed))

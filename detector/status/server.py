@@ -1,10 +1,18 @@
-"""/metrics, /healthz and /readyz over HTTP, on threads of their own."""
+"""/metrics, /healthz and /readyz over HTTP or HTTPS, on threads of their own."""
 
 from __future__ import annotations
 
+import socket
+import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from wayside.servingcertificate import EVERY, ServingCertificate
 
 Page = Callable[[], tuple[bool, bytes]]
 """Whether all is well, and the text."""
@@ -18,11 +26,26 @@ _PATIENCE = 10.0
 """Seconds that a client may take to send its request, so that none keeps a thread for ever."""
 
 
+@dataclass(frozen=True, slots=True)
+class PagesAddress:
+    """Where pages are served, on all addresses of the machine."""
+
+    port: int
+    """0 selects a free one."""
+    certificates: Path | None = None
+    """The folder with tls.crt and tls.key, whose changes are followed; None: HTTP."""
+
+
 class StatusServer:
     """Serves pages from `start` to `close`."""
 
-    def __init__(self, port: int, pages: Mapping[str, Page]) -> None:
-        """Listens on all addresses of the machine; port 0 selects a free one. Raises OSError if the port is in use."""
+    def __init__(self, address: PagesAddress, pages: Mapping[str, Page]) -> None:
+        """Listens at the address.
+
+        Raises:
+            OSError: the port is in use.
+            CertificateError: the folder holds no valid certificate and key.
+        """
 
         class Handler(BaseHTTPRequestHandler):
             timeout = _PATIENCE
@@ -45,10 +68,13 @@ class StatusServer:
             def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the base class names it
                 """Log nothing: a probe comes every few seconds."""
 
+        folder = address.certificates
+        certificate = None if folder is None else ServingCertificate(folder, "--metrics-certificates")
         try:
-            self._server = _Server(("", port), Handler)
+            self._server = _Server(("", address.port), Handler, certificate)
         except OSError as error:
-            raise OSError(f"--metrics-port {port}: {error.strerror or error}: give another port") from error
+            reason = error.strerror or error
+            raise OSError(f"--metrics-port {address.port}: {reason}: give another port") from error
         self._thread = threading.Thread(
             target=self._server.serve_forever, kwargs={"poll_interval": _POLL}, name="metrics", daemon=True
         )
@@ -73,3 +99,29 @@ class StatusServer:
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
+
+    def __init__(
+        self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler], certificate: ServingCertificate | None
+    ) -> None:
+        self._certificate = certificate
+        self._refreshed = time.monotonic()
+        super().__init__(address, handler)
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        connection, client = super().get_request()
+        if self._certificate is None:
+            return connection, client
+        # The handshake is made by the first read, on the thread of the connection and within its timeout.
+        context = self._certificate.context
+        return context.wrap_socket(connection, server_side=True, do_handshake_on_connect=False), client
+
+    def service_actions(self) -> None:
+        """Called by `serve_forever` at each poll."""
+        if self._certificate is not None and time.monotonic() - self._refreshed >= EVERY:
+            self._refreshed = time.monotonic()
+            self._certificate.refresh()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log nothing of a client that closes early, or that speaks no TLS: it is no error of the detector."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)

@@ -260,7 +260,7 @@ def test_a_renewed_certificate_is_shown_and_one_that_cannot_be_used_is_not(api: 
         key = webhook.folder / "tls.key"
         old = key.read_bytes()
         key.write_text("no key")
-        webhook.manager.wait_for_output("are no certificate and key .* the certificate of before stays")
+        webhook.manager.wait_for_output("are no certificate and key .* the previous certificate stays")
         webhook.wait_answering()
         key.write_bytes(old)
         api.apply(webhook.certified())  # another authority: what it did not sign is not trusted

@@ -273,13 +273,14 @@ def test_detectors_are_pulled_like_the_manager_and_found_by_what_the_manager_lab
     values: Values = {
         "image": {"repository": "registry.test/wayside", "tag": "7", "pullPolicy": "Always"},
         "imagePullSecrets": [{"name": "registry"}],
-        "manager": {"namespaces": ["north"]},
+        "manager": {"namespaces": ["north"], "detectors": {"metrics": {"tlsSecret": "metrics"}}},
         "detectors": [DETECTOR | {"namespace": "north", "service": {"ports": [7447], "type": "NodePort"}}],
         "monitoring": {"podMonitor": {"enabled": True}},
     }
     rendered = helm.rendered(values)
-    assert manager_arguments(rendered)[-3:] == [
+    assert manager_arguments(rendered)[-4:] == [
         "--detector-image=registry.test/wayside:7",
+        "--detector-metrics-secret=metrics",
         "--detector-pull-policy=Always",
         "--detector-pull-secret=registry",
     ]
@@ -287,10 +288,8 @@ def test_detectors_are_pulled_like_the_manager_and_found_by_what_the_manager_lab
     town = Detector.model_validate({"kind": "Detector", "metadata": metadata, "spec": DETECTOR["spec"]})
     *_, deployment = detector_objects(town, PodDefaults("wayside:1"))
     labels = deployment["spec"]["template"]["metadata"]["labels"]
-    service, policy = (
-        rendered.one("Service", "wayside-detector-town"),
-        rendered.one("NetworkPolicy", "wayside-detector-town"),
-    )
+    service = rendered.one("Service", "wayside-detector-town")
+    policy = rendered.one("NetworkPolicy", "wayside-detector-town")
     monitor = rendered.one("PodMonitor", "wayside-detectors")["spec"]
     selectors = [service["spec"]["selector"], policy["spec"]["podSelector"]["matchLabels"]]
     for selector in (*selectors, monitor["selector"]["matchLabels"]):
@@ -300,6 +299,9 @@ def test_detectors_are_pulled_like_the_manager_and_found_by_what_the_manager_lab
     (container,) = deployment["spec"]["template"]["spec"]["containers"]
     (monitored,) = monitor["podMetricsEndpoints"]
     assert monitored["port"] in {each["name"] for each in container["ports"]}
+    tls = {"ca": {"secret": {"name": "metrics", "key": "ca.crt"}}, "serverName": "wayside-detectors"}
+    for each in rendered.of("PodMonitor"):
+        assert [(it["scheme"], it["tlsConfig"]) for it in each["spec"]["podMetricsEndpoints"]] == [("https", tls)]
 
 
 def test_sidecars_are_scraped_by_the_port_that_they_have(helm: Helm) -> None:

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
+import ssl
 import subprocess
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +17,9 @@ import pytest
 from detector.status.model import RuleState, Status, read_status
 from detector.streams.querying import NoAnswerError, query_detectors
 from tests import programs
+from tests.certificates import Authority
 from tests.driving import a_rule, a_stream
+from tests.networks import wait_for
 from tests.process.running import PATIENCE, Process
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "5m"}
@@ -130,3 +136,59 @@ def test_a_detector_that_is_stopped_evaluates_the_last_lateness_and_so_does_the_
         "fast 1970-01-01T00:16:40.500000000Z",
         "sampled 1970-01-01T00:16:40.500000000Z",
     ]
+
+
+def test_metrics_and_health_by_tls_follow_a_renewed_certificate(tmp_path: Path) -> None:
+    first, second = (Authority(tmp_path, name) for name in ("first", "second"))
+    first.mount(mounted := tmp_path / "certificates", "detector")
+    process = Process(tmp_path)
+    process.write(FAST)
+    process.start("--metrics-certificates", str(mounted))
+
+    def shown(path: str, authority: Authority) -> str:
+        """The page for a client that trusts this authority; empty where that does not trust the detector."""
+        trusting = ssl.create_default_context(cafile=authority.ca)
+        try:
+            with urllib.request.urlopen(f"https://localhost:{process.port}{path}", context=trusting) as answer:
+                return str(answer.read().decode())
+        except urllib.error.URLError as error:
+            if not isinstance(error.reason, ssl.SSLCertVerificationError):
+                raise
+            return ""
+
+    assert "wayside_detector_info" in shown("/metrics", first)
+    assert not shown("/metrics", second)
+    with pytest.raises(OSError, match=r"Remote end closed|reset"):
+        process.page("/metrics")  # without TLS
+    with socket.create_connection(("127.0.0.1", process.port)):  # a client that never shakes hands stops nobody
+        assert shown("/healthz", first)
+    broken = {"tls.crt": b"none", "tls.key": b"none"}
+    first.change(mounted, broken)
+    log = tmp_path / "log"
+    wait_for(lambda: "--metrics-certificates: tls.crt and tls.key are no certificate and key" in log.read_text())
+    assert shown("/healthz", first), "the previous certificate stays"
+    second.mount(mounted, "detector")
+    wait_for(lambda: bool(shown("/healthz", second)))
+    assert not shown("/healthz", first)
+    assert process.stop() == 0
+    assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--metrics-certificates", "."], "--metrics-certificates requires --metrics-port"),
+        (
+            ["--metrics-port", "0", "--metrics-certificates", "."],
+            "tls.crt: No such file or directory: the folder must hold",
+        ),
+    ],
+)
+def test_metrics_certificates_that_cannot_be_used_are_an_error(
+    options: list[str], problem: str, tmp_path: Path
+) -> None:
+    Process(tmp_path).write(FAST)
+    files = ["--detector", "detector.yaml", "--rules", "rules.yaml"]
+    done = programs.run("detector", "run", *files, *options, folder=tmp_path)
+    assert done.returncode == 2
+    assert problem in " ".join(done.stderr.replace("│", " ").split())

@@ -36,6 +36,7 @@ KINDS = (
 
 METRICS, METRICS_PORT = "metrics", 9100
 _SECRETS_FOLDER = "/etc/wayside/secrets"  # where the detector looks for them
+_METRICS_FOLDER = "/etc/wayside/metrics-certificates"  # not among the Secrets that rules may use
 _SECRET_FIELDS = frozenset({"tlsSecret", "credentialsSecret", "uriSecret"})
 _AS_GIVEN = frozenset(OF_ITS_OWN_POD) - {"securityContext"}
 _SCRATCH_SIZE = "256Mi"
@@ -138,11 +139,11 @@ def _deployment(detector: Detector, defaults: PodDefaults) -> Manifest:
 def _pod(detector: Detector, defaults: PodDefaults) -> Manifest:
     """The pod, as the restricted Pod Security Standard asks for it."""
     pod = detector.spec.pod or DetectorPod()
-    volumes, mounts = volumes_of(detector)
+    volumes, mounts = volumes_of(detector, defaults)
     probes = {
-        "startupProbe": probe("/healthz", 2, 60),
-        "livenessProbe": probe("/healthz", 10, 3),
-        "readinessProbe": probe("/readyz", 5, 2),
+        "startupProbe": probe(defaults, "/healthz", 2, 60),
+        "livenessProbe": probe(defaults, "/healthz", 10, 3),
+        "readinessProbe": probe(defaults, "/readyz", 5, 2),
     }
     return {
         "serviceAccountName": object_name(detector.name),
@@ -194,6 +195,7 @@ def container(
             "run",
             f"--name={detector.name}",
             *([] if port is None else [f"--metrics-port={port}"]),
+            *([] if port is None or not defaults.metrics_secret else [f"--metrics-certificates={_METRICS_FOLDER}"]),
         ],
         "env": _environment(pod, defaults),
         **metrics,
@@ -223,9 +225,9 @@ def told(variable: str, path: str) -> Manifest:
     return {"name": variable, "valueFrom": {"fieldRef": {"fieldPath": path}}}
 
 
-def probe(path: str, period: int, failures: int, port_name: str = METRICS) -> Manifest:
+def probe(defaults: PodDefaults, path: str, period: int, failures: int, port_name: str = METRICS) -> Manifest:
     """A probe of the container's port for metrics and health, every `period` seconds."""
-    get = {"path": path, "port": port_name}
+    get = {"path": path, "port": port_name, **({"scheme": "HTTPS"} if defaults.metrics_secret else {})}
     return {"httpGet": get, "periodSeconds": period, "timeoutSeconds": 5, "failureThreshold": failures}
 
 
@@ -241,7 +243,7 @@ def _environment(pod: DetectorPod, defaults: PodDefaults) -> list[Manifest]:
     return [*own, *({"name": name, **value} for name, value in given.items())]
 
 
-def volumes_of(detector: Detector, prefix: str = "") -> tuple[list[Manifest], list[Manifest]]:
+def volumes_of(detector: Detector, defaults: PodDefaults, prefix: str = "") -> tuple[list[Manifest], list[Manifest]]:
     """The volumes, and where they are mounted. A Secret that is not there yet keeps nothing from starting.
 
     `prefix`: what the volumes' names begin with.
@@ -261,6 +263,10 @@ def volumes_of(detector: Detector, prefix: str = "") -> tuple[list[Manifest], li
         name = f"{prefix}secret-{index}"
         volumes.append({"name": name, "secret": {"secretName": secret, "optional": True}})
         mounts.append({"name": name, "mountPath": f"{_SECRETS_FOLDER}/{secret}", "readOnly": True})
+    if defaults.metrics_secret is not None:
+        name = f"{prefix}metrics"
+        volumes.append({"name": name, "secret": {"secretName": defaults.metrics_secret, "optional": True}})
+        mounts.append({"name": name, "mountPath": _METRICS_FOLDER, "readOnly": True})
     return volumes, mounts
 
 

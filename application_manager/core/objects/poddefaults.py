@@ -24,6 +24,8 @@ class PodDefaults:
         pull_policy: of all images; None: Kubernetes' default, by the image's tag.
         pull_secrets: by which nodes pull the images; each namespace with detectors has Secrets of these names.
         environment: of the containers, e.g. where traces go; what a Detector gives itself wins.
+        metrics_secret: the Secret with tls.crt and tls.key by which they serve metrics and health, in each namespace
+            with detectors; None: without TLS.
         user: as whom they run, and the group of their volumes; None: as the cluster chooses, as OpenShift does.
     """
 
@@ -32,6 +34,7 @@ class PodDefaults:
     pull_secrets: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
     user: int | None = USER
+    metrics_secret: str | None = None
 
 
 def parse_user(given: str) -> int | None:

@@ -65,7 +65,7 @@ def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults)
     """
     if has_sidecar(spec):
         return None
-    volumes, mounts = volumes_of(detector, _PREFIX)
+    volumes, mounts = volumes_of(detector, defaults, _PREFIX)
     volumes.append(_token())
     mounts.append({"name": _TOKEN, "mountPath": _TOKEN_FOLDER, "readOnly": True})
     paths = [each["mountPath"].rstrip("/") for each in mounts]
@@ -145,7 +145,7 @@ def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], 
     health = (
         {}
         if port is None
-        else {"livenessProbe": probe("/healthz", 10, 3, _METRICS) | {"initialDelaySeconds": _STARTING}}
+        else {"livenessProbe": probe(defaults, "/healthz", 10, 3, _METRICS) | {"initialDelaySeconds": _STARTING}}
     )
     return made | {"restartPolicy": "Always"} | health
 

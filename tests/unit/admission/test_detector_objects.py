@@ -170,9 +170,20 @@ def test_what_holds_for_all_detectors_is_in_each_pod_and_what_a_detector_says_it
     assert names[:2] == ["POD_NAME", "POD_UID"]
 
 
+def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of_rules() -> None:
+    given = pod(detector(), PodDefaults(IMAGE, metrics_secret="metrics"))
+    (container,) = given["containers"]
+    folder = "/etc/wayside/metrics-certificates"
+    assert f"--metrics-certificates={folder}" in container["command"]
+    assert {container[each]["httpGet"]["scheme"] for each in container if each.endswith("Probe")} == {"HTTPS"}
+    assert {"name": "metrics", "mountPath": folder, "readOnly": True} in container["volumeMounts"]
+    assert {"name": "metrics", "secret": {"secretName": "metrics", "optional": True}} in given["volumes"]
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (["--detector-metrics-secret", "a"], "do nothing without --detector-image"),
         (["--detector-env", "A=b"], "do nothing without --detector-image"),
         (["--detector-image", "a", "--detector-env", "A"], "'A' is no variable: write NAME=VALUE"),
         (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set for each pod by itself"),

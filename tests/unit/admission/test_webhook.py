@@ -15,7 +15,6 @@ import yaml
 from application_manager.admission.authority import make_certificates
 from application_manager.admission.reviewing import AT_ONCE, LARGEST, Desk, Serving, webhook
 from application_manager.cli import EXPECTED, app
-from application_manager.cluster.certificate import ServingCertificate
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import PATH
@@ -23,6 +22,7 @@ from application_manager.measures import Measures
 from tests.ports import free_port
 from tests.unit.manager_objects import DEPLOYMENT
 from wayside import commandline
+from wayside.servingcertificate import CertificateError, ServingCertificate
 
 Ask = Callable[..., Awaitable[tuple[int, str]]]
 
@@ -155,7 +155,7 @@ def test_renewed_files_are_taken_whole_or_not_at_all(folder: Path) -> None:
 )  # fmt: skip
 def test_files_that_cannot_be_used_are_said_at_the_start(folder: Path, spoil: Callable[[Path], Any], part: str) -> None:
     spoil(folder)
-    with pytest.raises(ConfigurationError, match=r"^--admission-certificates .*certificates: ") as error:
+    with pytest.raises(CertificateError, match=r"^--admission-certificates .*certificates: ") as error:
         ServingCertificate(folder, "--admission-certificates")
     assert part in str(error.value)
 

@@ -85,9 +85,8 @@ def test_geojson_is_on_the_earth_and_its_holes_are_outside(tmp_path: Path) -> No
         "zone": ("inside", "distance"),
         "road": ("inside", "distance", "along", "across", "heading"),
     }
-    assert [bool(positions_at(found["zone"]).inside(at(each), at(each - 42))[0]) for each in (52.002, 52.005, 52.011)] == [
-        True, False, False,
-    ]  # fmt: skip
+    zone = positions_at(found["zone"])
+    assert [bool(zone.inside(at(each), at(each - 42))[0]) for each in (52.002, 52.005, 52.011)] == [True, False, False]
     assert positions_at(found["road"]).inside(at(52.00002), at(10.005))[0]
 
 

@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from detector.status.metrics import DETECTOR, RULE, STREAM, Metrics
 from detector.status.model import Status
-from detector.status.server import StatusServer
+from detector.status.server import PagesAddress, StatusServer
 from detector.streams.tally import Cause
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.guides import guide
@@ -62,7 +62,7 @@ def test_clients_are_no_labels() -> None:
 @pytest.fixture
 def server() -> Iterator[StatusServer]:
     pages = {"/metrics": lambda: (True, b"some 1\n"), "/readyz": lambda: (False, b"not yet\n")}
-    server = StatusServer(0, pages)
+    server = StatusServer(PagesAddress(0), pages)
     server.start()
     yield server
     server.close()
@@ -83,7 +83,7 @@ def test_pages_are_served_and_what_is_not_well_is_503(server: StatusServer) -> N
 
 def test_a_port_that_is_taken_is_told_with_the_option(server: StatusServer) -> None:
     with pytest.raises(OSError, match=rf"--metrics-port {server.port}: .*: give another port"):
-        StatusServer(server.port, {})
+        StatusServer(PagesAddress(server.port), {})
 
 
 def test_the_documentation_names_every_metric_and_every_cause() -> None:

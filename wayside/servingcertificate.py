@@ -1,0 +1,81 @@
+"""The certificate of a server: two files, as cert-manager mounts them, which are followed.
+
+A renewed Secret changes in its mount without a restart. New files are checked first, and used for all later connections
+only if they are valid; until then the old ones stay.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import ssl
+from pathlib import Path
+
+from wayside.inputerror import InputError
+
+CERTIFICATE = "tls.crt"
+KEY = "tls.key"
+EVERY = 5.0
+"""Seconds between two calls of `refresh`."""
+
+log = logging.getLogger(__name__)
+
+
+class CertificateError(InputError, ValueError):
+    """There is no valid certificate in the folder; the message names the option, the folder and the reason."""
+
+
+class ServingCertificate:
+    """A TLS context for servers, whose certificate and key are those in the folder."""
+
+    def __init__(self, folder: Path, option: str) -> None:
+        """`option` names the folder in messages. Raises CertificateError where it holds no valid pair."""
+        self._files = folder / CERTIFICATE, folder / KEY
+        self._option = option
+        self._logged = ""
+        self.context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        try:
+            self._seen = self._digest()
+            self.context.load_cert_chain(*self._files)
+        except (OSError, ssl.SSLError) as error:
+            raise CertificateError(f"{option} {folder}: {_reason(error)}") from error
+
+    def refresh(self) -> None:
+        """Use the files' new contents if they have changed and are valid; log what happens, and a problem once."""
+        try:
+            changed = self.renewed()
+        except (OSError, ssl.SSLError) as error:
+            reason = _reason(error)
+            if reason != self._logged:
+                log.warning("%s: %s; the previous certificate stays", self._option, reason)
+            self._logged = reason
+        else:
+            self._logged = ""
+            if changed:
+                log.info("%s: the certificate was renewed", self._option)
+
+    def renewed(self) -> bool:
+        """Use the files if they have changed; whether they have.
+
+        Raises OSError or ssl.SSLError for files that are not valid; then the previous ones stay.
+        """
+        digest = self._digest()
+        if digest == self._seen:
+            return False
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(*self._files)
+        self.context.load_cert_chain(*self._files)
+        self._seen = digest
+        return True
+
+    def _digest(self) -> bytes:
+        return hashlib.sha256(b"\0".join(each.read_bytes() for each in self._files)).digest()
+
+
+def _reason(error: OSError) -> str:
+    """What is wrong with the files, in one line."""
+    if isinstance(error, ssl.SSLError):
+        if error.reason == "KEY_VALUES_MISMATCH":
+            return f"{KEY} is not the key of {CERTIFICATE}: give both of one pair"
+        return f"{CERTIFICATE} and {KEY} are no certificate and key ({error.reason or error}): give PEM files"
+    where = f"{Path(error.filename).name}: " if error.filename else ""
+    return f"{where}{error.strerror or error}: the folder must hold {CERTIFICATE} and {KEY}, as a Secret has them"
