@@ -241,15 +241,22 @@ FREE: dict[tuple[str, str], Object] = {
         "helm": {"chart": "/charts/none", "values": LARGE},
         "baseline": {},
     },
-    ("Detector", "sources[].parameters"): DETECTOR["spec"]
+    ("Detector", "sources[].parameters{}"): DETECTOR["spec"]
     | {
         "sources": [{"name": "s", "plugin": "mqtt", "parameters": LARGE}],
     },
     ("Detector", "clients[].parameters{}{}"): DETECTOR["spec"]
     | {"clients": [{"name": "c", "parameters": {"v": LARGE}}]},
+    ("Detector", "pod.affinity"): DETECTOR["spec"] | {"mode": "Standalone", "pod": {"affinity": LARGE}},
+    ("Detector", "pod.securityContext"): DETECTOR["spec"] | {"mode": "Standalone", "pod": {"securityContext": LARGE}},
+    **{
+        ("Detector", f"pod.volumes[].{source}"): DETECTOR["spec"]
+        | {"mode": "Standalone", "pod": {"volumes": [{"name": "v", source: LARGE}]}}
+        for source in ("persistentVolumeClaim", "ephemeral", "emptyDir", "configMap", "secret", "projected", "csi")
+    },
     ("EventRule", "each.of[]"): {"each": {"as": "site", "of": [{"name": "n", **LARGE}]}},
     ("EventRule", "parameters{}"): {"parameters": {"v": LARGE}},
-    ("EventRule", "signals[].plugin.parameters"): {
+    ("EventRule", "signals[].plugin.parameters{}"): {
         "signals": [{"name": "s", "plugin": {"name": "p", "parameters": LARGE}}]
     },
     ("EventRule", "actions[].deploy.parameters{}"): action(deploy={"template": "good", "parameters": {"v": LARGE}}),
@@ -258,12 +265,12 @@ FREE: dict[tuple[str, str], Object] = {
     ("EventRule", "actions[].trigger.ros2.stop.request{}"): action(
         trigger={"ros2": {"start": STARTED["ros2"] | {"request": {}}, "stop": STARTED["ros2"]}}
     ),
-    ("EventRule", "actions[].trigger.http.start.body"): action(trigger={"http": {"start": STARTED["http"]}}),
-    ("EventRule", "actions[].trigger.http.stop.body"): action(
+    ("EventRule", "actions[].trigger.http.start.body{}"): action(trigger={"http": {"start": STARTED["http"]}}),
+    ("EventRule", "actions[].trigger.http.stop.body{}"): action(
         trigger={"http": {"start": {"url": "http://127.0.0.1:9/"}, "stop": STARTED["http"]}}
     ),
     ("EventRule", "actions[].database.metadata{}"): action(database={"metadata": {"v": LARGE}}),
-    ("EventRule", "actions[].plugin.parameters"): action(plugin={"name": "p", "parameters": LARGE}),
+    ("EventRule", "actions[].plugin.parameters{}"): action(plugin={"name": "p", "parameters": LARGE}),
     ("EventRule", "actions[].plugin.values{}"): action(plugin={"name": "p", "values": {"v": LARGE}}),
 }
 """900 kB in each field that takes any data: by kind and field, the spec; of an EventRule what it has besides."""
@@ -275,6 +282,7 @@ def free_fields() -> Iterator[tuple[str, str]]:
     def walk(schema: Object, path: str) -> Iterator[str]:
         if schema.get("x-kubernetes-preserve-unknown-fields"):
             yield path.removeprefix(".")
+            return  # what is deeper is free as well
         for name, child in schema.get("properties", {}).items():
             yield from walk(child, f"{path}.{name}")
         for key, sign in (("items", "[]"), ("additionalProperties", "{}")):
