@@ -65,7 +65,12 @@ def test_other_text_is_no_quantity(text: str) -> None:
         Quantity.parse(text)
 
 
-@pytest.mark.parametrize("text", ["0", "0.0Gi", "0e9"])
+@pytest.mark.parametrize("text", ["1", "010", "0.5", ".5Gi", "1.0", "0.000000001", "100000000000000000"])
+def test_what_has_a_digit_above_zero_is_a_positive_quantity(text: str) -> None:
+    assert PositiveQuantity.parse(text).value == Quantity.parse(text).value > 0
+
+
+@pytest.mark.parametrize("text", ["0", "0.0Gi", "0e9", ".0", "00"])
 def test_a_positive_quantity_is_not_zero(text: str) -> None:
     with pytest.raises(ValueError, match="above zero"):
         PositiveQuantity.parse(text)
