@@ -1,4 +1,4 @@
-"""The attacks of `load`, all from one namespace and by one account, until the process is ended.
+"""The attacks of `load`, all from one namespace and by one account, until the last task of the flood is made.
 
 Templates whose expressions take too long, whose values change all the time; a flood of tasks, as many at once as one
 program with few connections makes; and large tasks. A process of its own, so that what it computes delays neither the
@@ -88,7 +88,7 @@ class Attacker:
 
 
 async def attack(namespace: str, bombs: int, flood: int, larges: int) -> None:
-    """Attack until cancelled."""
+    """Attack until the flood is over."""
     client = Client(await load_configuration())
     attacker = Attacker(client, namespace)
     every = max(1, flood // max(1, larges))
@@ -99,10 +99,14 @@ async def attack(namespace: str, bombs: int, flood: int, larges: int) -> None:
             if index % every == 0:
                 yield large(namespace, index // every)
 
-    async with asyncio.TaskGroup() as group:
-        for number in range(bombs):
-            group.create_task(attacker.bombing(number))
-        group.create_task(attacker.flood(tasks()))
+    try:
+        async with asyncio.TaskGroup() as group:
+            others = [group.create_task(attacker.bombing(number)) for number in range(bombs)]
+            await attacker.flood(tasks())
+            for each in others:
+                each.cancel()
+    finally:
+        await client.close()
 
 
 def main() -> None:

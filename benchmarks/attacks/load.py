@@ -21,7 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from application_manager.cluster.client import Client, Resource
@@ -37,6 +38,7 @@ MEMORY = 1024  # MiB: the chart's limit
 PAUSE = 0.3  # s between two tasks that are measured
 WARMING = 10  # tasks before those that are measured
 GATHERING = 5.0  # s from the start of the attack to the first task that is measured
+LONGEST = 420.0  # s of an attack
 _LOOK = 0.02  # s between two looks for a status
 
 STAGES = ("creation", "Deployment", "status", "raw calls")
@@ -49,10 +51,11 @@ class Measured:
         self._client = client
         self._seen = seen
 
-    async def times(self, prefix: str, count: int) -> dict[str, list[float]]:
-        """The times of each of STAGES, over as many tasks, one after the other; the raw calls are in between."""
+    async def times(self, prefix: str, more: Callable[[int], bool]) -> dict[str, list[float]]:
+        """The times of each of STAGES, of one task after the other while `more` has it so; raw calls are in between."""
         found: dict[str, list[float]] = {stage: [] for stage in STAGES}
-        for index in range(count):
+        index = -1
+        while more(index := index + 1):
             name = f"{prefix}{index}"
             began = time.perf_counter()
             await self._client.create(TASKS, task(QUIET, name))
@@ -84,22 +87,31 @@ class Measured:
 
 
 class Usage:
-    """What each program uses of a core, and where requests wait, from its making to `report`."""
+    """What each program uses of a core, and where requests wait, from its making to `report`.
+
+    What all else on the machine uses is that of strangers: where it is much, the times are of no use.
+    """
 
     def __init__(self, cluster: Cluster, programs: Mapping[str, int]) -> None:
         self._cluster = cluster
-        self._programs = dict(programs)
+        self._programs = {**programs, "benchmark": os.getpid()}
         self._began = time.monotonic()
         self._requests = cluster.requests()
-        self._cpu = {name: cpu_seconds(pid) for name, pid in programs.items()}
+        self._cpu = self._seconds()
+
+    def _seconds(self) -> dict[str, float]:
+        """CPU seconds of the manager without and with its workers, of the others, and of the whole machine."""
+        used = {name: cpu_seconds(pid) for name, pid in self._programs.items()}
+        used["workers"] = _of_children(self._programs["manager"])
+        ticks = list(map(int, Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]))
+        idle = ticks[3] + ticks[4]
+        return {**used, "strangers": (sum(ticks[:8]) - idle) / os.sysconf("SC_CLK_TCK") - sum(used.values())}
 
     def report(self, when: str) -> None:
         """Print both."""
         elapsed = time.monotonic() - self._began
-        used = {name: (cpu_seconds(pid) - self._cpu[name]) / elapsed for name, pid in self._programs.items()}
-        print(
-            f"{when}: cores used, in {elapsed:.0f} s: " + ", ".join(f"{name} {each:.2f}" for name, each in used.items())
-        )
+        used = {name: (now - self._cpu[name]) / elapsed for name, now in self._seconds().items()}
+        print(f"{when}: cores used by " + ", ".join(f"{name} {each:.2f}" for name, each in used.items()))
         for schema, now in self._cluster.requests().items():
             before = self._requests.get(schema, (0.0, 0.0, 0.0))
             count, wait, execution = (after - was for after, was in zip(now, before, strict=True))
@@ -107,6 +119,17 @@ class Usage:
                 rate = f"{count / elapsed:6.1f} requests/s"
                 means = f"{wait / count * 1e3:6.1f} ms in a queue, {execution / count * 1e3:6.1f} ms at work"
                 print(f"{when}: {schema:24} {rate}, in the mean {means}")
+
+
+def _of_children(pid: int) -> float:
+    """The CPU seconds of a process's children: of those that have ended, and of those that run."""
+    ended = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()[13:15]
+    running = 0.0
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        for child in (thread / "children").read_text().split():
+            with suppress(OSError):  # it has ended meanwhile
+                running += cpu_seconds(int(child))
+    return sum(map(int, ended)) / os.sysconf("SC_CLK_TCK") + running
 
 
 def _p95(values: list[float]) -> float:
@@ -128,22 +151,24 @@ async def measure(options: argparse.Namespace, cluster: Cluster, manager: int) -
     attacker: subprocess.Popen[bytes] | None = None
     try:
         async with seen.watching(client, QUIET):
-            await measured.times("warm", WARMING)
+            await measured.times("warm", lambda done: done < WARMING)
             usage = Usage(cluster, programs)
-            alone = await measured.times("alone", options.tasks)
+            alone = await measured.times("alone", lambda done: done < options.tasks)
             usage.report("alone")
             attacker = attack(options, cluster)
             await asyncio.sleep(GATHERING)
-            usage = Usage(cluster, {**programs, "attacker": attacker.pid})
-            attacked = await measured.times("attacked", options.tasks)
+            usage = Usage(cluster, programs)
+            until = time.monotonic() + LONGEST
+            attacked = await measured.times("attacked", lambda _: attacker.poll() is None and time.monotonic() < until)
             usage.report("under attack")
-            lasted = attacker.poll() is None
+            whole = attacker.poll() == 0
     finally:
         if attacker is not None:
             attacker.kill()
             attacker.wait()
         await client.close()
     memory = largest(manager)
+    print(f"measured: {options.tasks} tasks alone, and {len(attacked['status'])} while the attack lasted")
     for stage in STAGES:
         for what, of in (("p50", statistics.median), ("p95", _p95)):
             before, after = of(alone[stage]), of(attacked[stage])
@@ -155,7 +180,8 @@ async def measure(options: argparse.Namespace, cluster: Cluster, manager: int) -
         "the time": _p95(attacked["Deployment"]) > SLOWER * _p95(alone["Deployment"]),
         "the status": _p95(attacked["status"]) > STATUS,
         "the memory": memory > MEMORY,
-        "an attack as long as the measurement: give a larger --flood": not lasted,
+        f"a whole attack within {LONGEST:.0f} s: give a smaller --flood": not whole,
+        "enough tasks under attack: give a larger --flood": len(attacked["status"]) < options.tasks,
     }
     return [what for what, missed in found.items() if missed]
 
