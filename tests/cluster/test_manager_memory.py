@@ -61,7 +61,7 @@ def test_tasks_of_a_megabyte_take_little_memory(api: Api, manager: Process) -> N
 
 def test_parameters_and_templates_that_are_too_large_are_refused_with_their_size(api: Api, manager: Process) -> None:
     api.create(template())
-    large = template("large", configuration={"data.txt": "x" * 300_000})
+    large = template("large", configuration={f"data{index}.txt": "x" * 60_000 for index in range(5)})
     api.create(large)
     told = api.wait_for(
         "ApplicationTemplate", "large", lambda raw: bool(condition(raw, "Accepted")), what="it has a status"
