@@ -67,8 +67,8 @@ def located(spec: dict[str, Any], positions: dict[str, dict[str, str]]) -> dict[
 
 def _place(name: str, variables: dict[str, Any], where: Where) -> dict[str, float]:
     """The position that an expression names, without what is not known."""
-    if name == "position":
-        message = variables.get("msg") or {}
+    if name in ("position", "positionBefore"):
+        message = variables.get("msg" if name == "position" else "before") or {}
         given = {axis: message.get(field.removeprefix("msg.")) for axis, field in where.position.items()}
     else:
         client, _, _ = name.partition(".")

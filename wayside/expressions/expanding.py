@@ -3,6 +3,7 @@
     at(a.position, "crossing").inside  →  (at_inside((a.position).x, (a.position).y, r'crossing#…') > 0.0)
     seenFrom(a, b).ahead               →  seen_ahead((a).position.x, (a).position.y, (a).yaw, …)
     position.x                         →  (msg.pose.position.x), as the stream's `position` has it
+    positionBefore.x                   →  (before.pose.position.x), that of the sample before
 
 So what is read is plain paths and numbers, for CEL as for columns, and no field costs what another needs.
 """
@@ -21,6 +22,10 @@ from wayside.geometry import Shape
 AT: Final = "at"
 SEEN_FROM: Final = "seenFrom"
 POSITION: Final = "position"
+POSITION_BEFORE: Final = "positionBefore"
+_POSITIONS: Final = (POSITION, POSITION_BEFORE)
+_BEFORE: Final = "before"
+_OF_A_SAMPLE: Final = frozenset({"msg", "item", "sample"})
 AXES: Final = {False: ("x", "y", "yaw"), True: ("latitude", "longitude", "heading")}
 """What a position has in metres, and on the Earth: two coordinates and a direction."""
 FIELDS_AT: Final = {
@@ -52,6 +57,8 @@ class Places:
     """The expressions of the stream's position by axis; None: the expression is not over samples."""
     stream: str = ""
     """The stream's name, for errors."""
+    own: str = "msg"
+    """The variable of the client's message, or of its item."""
 
 
 class Expanded(NamedTuple):
@@ -95,7 +102,7 @@ class _Expansion:
             replacement: str | None = None
             if token.text in (AT, SEEN_FROM) and called:
                 replacement, after = self._call(at, last)
-            elif token.text == POSITION and self._places.position is not None and self._text(at - 1) != ".":
+            elif token.text in _POSITIONS and self._places.position is not None and self._text(at - 1) != ".":
                 replacement, after = self._position(at, last)
             if replacement is not None:
                 yield _Piece(self._source[done : token.start], tuple(range(done, token.start)))
@@ -147,7 +154,7 @@ class _Expansion:
     def _axis(self, argument: tuple[int, int], axis: str, shape: Shape) -> Callable[[], str]:
         """Writes an axis of the position where it is needed."""
         first, last = argument
-        if last - first == 1 and self._text(first) == POSITION and self._places.position is not None:
+        if last - first == 1 and self._text(first) in _POSITIONS and self._places.position is not None:
             of = f"place {shape.name} is in {'degrees' if shape.geographic else 'metres'}"
             return lambda: self._of_stream(first, axis, of)
         return lambda: f"({self._inner(argument)}).{axis}"
@@ -171,7 +178,7 @@ class _Expansion:
         if at + 2 < last and self._text(at + 1) == "." and self._tokens[at + 2].kind is TokenKind.NAME:
             return self._of_stream(at, self._text(at + 2), ""), at + 3
         self._of_stream(at, "", "")
-        pairs = (f'"{axis}": ({source})' for axis, source in (self._places.position or {}).items())
+        pairs = (f'"{axis}": {self._of_stream(at, axis, "")}' for axis in self._places.position or {})
         return f"{{{', '.join(pairs)}}}", at + 1
 
     def _of_stream(self, at: int, axis: str, why: str) -> str:
@@ -188,7 +195,25 @@ class _Expansion:
             self._refuse(
                 at, f"the position of stream {self._places.stream} has no {axis}{because}", f"it has {', '.join(given)}"
             )
-        return f"({given[axis]})" if axis else ""
+        if not axis:
+            return ""
+        return f"({given[axis] if self._text(at) == POSITION else self._before(at, given[axis])})"
+
+    def _before(self, at: int, source: str) -> str:
+        """The expression of the stream's position, over the message or item before."""
+        found: list[str] = []
+        last = ""
+        for token in tokens(source):
+            name = token.text if token.kind is TokenKind.NAME and last != "." else ""
+            if name in _OF_A_SAMPLE and name != self._places.own:
+                self._refuse(
+                    at,
+                    f"{POSITION_BEFORE} of stream {self._places.stream} is not known, since its position reads {name}",
+                    f"write the position over {self._places.own}",
+                )
+            found.append(_BEFORE if name == self._places.own else token.text)
+            last = last if token.kind is TokenKind.SPACE else token.text
+        return "".join(found)
 
     def _arguments(self, opening: int, last: int) -> tuple[list[tuple[int, int]], int]:
         """The arguments of a call as ranges of tokens, and the index of the token behind its bracket."""

@@ -134,6 +134,7 @@ AT_A_SAMPLE = (
     'at(position, "stop").across',
     'at(position, "lane").heading',
     "position.x + position.speed",
+    'at(positionBefore, "stop").across > 0 && at(position, "stop").across <= 0',
 )
 
 AT_A_PAIR = (

@@ -156,6 +156,7 @@ DETECTOR = a_detector(
     a_stream("pose", position={"x": "msg.x", "y": "msg.y"}),
     a_stream("gnss", position={"latitude": "msg.lat", "longitude": "msg.lon"}),
     a_stream("speed"),
+    a_stream("late", position={"x": "msg.x + sample.latency * msg.v", "y": "msg.y"}),
     places=[
         {"name": "crossing", "area": [[0, 0], [4, 0], [4, 4]]},
         {"name": "stop", "line": [[0, 0], [4, 0]]},
@@ -176,6 +177,8 @@ DETECTOR = a_detector(
         ("gnss", 'at(position, "stop").across', "has no x; place stop is in metres (it has latitude, longitude)"),
         ("pose", 'at(position, "town").inside', "has no latitude; place town is in degrees"),
         ("speed", 'at(position, "stop").across', "stream speed has no position (give position in the stream of the"),
+        ("gnss", "positionBefore.altitude", "the position of stream gnss has no altitude (it has latitude, longitude)"),
+        ("late", "positionBefore.x", "positionBefore of stream late is not known, since its position reads sample"),
         ("pose", "1 + at(position, msg.name).inside", "column 18: the name of a place must be a text in quotes"),
         ("pose", "seenFrom(msg, msg).ahead", "seenFrom is about two clients (use it in a rule with scope pairs)"),
         ("pose", 'at(position, "crossing").inside + 1', "does not take (bool, double)"),
@@ -186,6 +189,22 @@ def test_what_is_wrong_with_the_use_of_a_place_is_located(stream: str, value: st
     with pytest.raises(RuleError, match="signals") as error:
         compile_rule(rule, DETECTOR)
     assert message in str(error.value)
+
+
+def test_the_position_before_is_that_of_the_message_or_item_before() -> None:
+    of_items = {"items": "msg.objects", "client": "${item.id}", "key": "station/objects"}
+    detector = a_detector(
+        a_stream("pose", position={"x": "msg.pos.msg", "y": "msg . y"}),
+        a_stream("list", position={"x": "item.x", "y": "item.y"}, **of_items),
+    )
+    for stream, paths in (
+        ("pose", {("before", "pos", "msg"), ("before", "y")}),
+        ("list", {("before", "x"), ("before", "y")}),
+    ):
+        value = "positionBefore.x + positionBefore.y"
+        rule = compile_rule(a_rule(signals=[{"name": "s", "stream": stream, "value": value}], when="s > 0"), detector)
+        assert rule.signals[0].value is not None
+        assert rule.signals[0].value.paths == paths
 
 
 def test_pairs_need_a_position_and_get_that_of_their_stream() -> None:
