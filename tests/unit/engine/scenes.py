@@ -47,11 +47,20 @@ _SIGNALS: list[tuple[str, dict[str, Any]]] = [
     ("number", {"stream": "o", "value": "item.v"}),
     ("number", {"stream": "o", "value": "item.v + before.v"}),
     ("number", {"stream": "s", "value": "msg.v - before.v", "over": "1s", "aggregate": "Max"}),
+    ("number", {"stream": "p", "value": 'at(position, "yard").distance'}),
+    ("number", {"stream": "p", "value": 'at(position, "lane").heading - at(positionBefore, "lane").along'}),
+    ("truth", {"stream": "p", "value": 'at(position, "yard").inside || at(position, "lane").across > 0'}),
     ("truth", {"stream": "p", "value": "has(before.q)", "where": "before.gear != msg.gear"}),
     ("number", {"stream": "o", "value": "item.v * msg.f - item.at[0]", "over": "1s", "aggregate": "Max"}),
     ("number", {"stream": "o", "over": "2s", "aggregate": "Count", "where": "item.v > 1"}),
     ("text", {"stream": "o", "value": "[item].map(i, i.gear)[0]"}),
 ]  # fmt: skip
+
+_POSITION = {"x": "msg.q.w", "y": "msg.q.z", "yaw": "msg.q.w / 3", "speed": "msg.q.z"}
+_PLACES = [
+    {"name": "yard", "area": [[0, -1], [3, -1], [3, 1], [1, 0.1]]},
+    {"name": "lane", "line": [[0, 0], [2.5, 1], [2.5, 9]], "width": 1},
+]
 
 _FORMS = {
     "number": ["{} > 1", "{} < 2", "{} * 2 >= 5", "{} > parameters.f", "({0} > 1 ? {0} : 0 - {0}) > 2",
@@ -169,6 +178,15 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
         for variable in ("labels.", "client ", "streams"):
             condition = condition.replace(variable, f"b.{variable}")
         spec["when"] = random.choice(["distance < 1.5", "closingSpeed > 0.1", f"distance < 2 && ({condition})"])
+        if position["stream"] == "p" and random.random() < 0.4:
+            position = {"stream": "p", "maxAge": "1s"}
+            spec["scope"]["pairs"]["position"] = position
+            spec["when"] = random.choice(
+                [
+                    'at(a.position, "yard").inside || at(b.position, "lane").along > 1',
+                    "seenFrom(a, b).ahead > 0.5 || seenFrom(b, a).speedLeft > 0.2",
+                ]
+            )
         if random.random() < 0.5:
             spec["until"] = "distance > 2"
         return a_rule(f"r{number}", **spec)
@@ -258,9 +276,10 @@ def a_scene(seed: int) -> Scene:
     capped = random.choice([{}] * 9 + [{"buffer": {"count": 5}}])
     detector = a_detector(
         a_stream("s", staleAfter=random.choice(["500ms", "1s", "Never"]), **capped, **stamp),
-        a_stream("p", staleAfter="1s", **stamp),
+        a_stream("p", staleAfter="1s", position=_POSITION, **stamp),
         {"name": "o", "key": "stations/${station:*}/o", "encoding": "json", "staleAfter": "500ms", **stamp,
          "items": "msg.objects", "client": "c${item.id}"},
+        places=_PLACES,
         clientTimeout="2s", buffer=buffer, clock="Data" if data else "Wall", **({"lateness": "200ms"} if data else {}),
         clients=[{"name": "c0", "labels": {"kind": "bus"}},
                  {"name": "c1", "labels": {"kind": "car"}, "parameters": {f"r{random.randrange(5)}": {"f": 2.5}}}],
