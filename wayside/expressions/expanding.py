@@ -142,6 +142,12 @@ class _Expansion:
         if chosen not in shape.fields:
             what = "an area" if shape.rings else "a line without width"
             self._refuse(at, f"{name} is {what}, which has no {chosen}", f"it has {', '.join(shape.fields)}")
+        if chosen == "heading" and self._places.geographic is not None and self._text(arguments[0][1] - 1) == POSITION:
+            self._refuse(
+                at,
+                "the position of a pair has no direction",
+                f'use a signal over the stream, with the value at(position, "{name}").heading',
+            )
         self._shapes[name] = shape
         u, v, heading = (self._axis(arguments[0], axis, shape) for axis in AXES[shape.geographic])
         place = f"r'{shape.key}'"

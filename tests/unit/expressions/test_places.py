@@ -215,6 +215,12 @@ def test_pairs_need_a_position_and_get_that_of_their_stream() -> None:
     assert compile_rule(rule, DETECTOR).subject.position.geographic  # type: ignore[union-attr]
 
 
+def test_a_pair_has_no_direction_to_compare_with_a_line() -> None:
+    pairs = {"pairs": {"position": {"stream": "pose"}, "within": 5}}
+    with pytest.raises(RuleError, match=r"column 5: the position of a pair has no direction \(use a signal over the"):
+        compile_rule(a_rule(scope=pairs, when='1 < at(a.position, "stop").heading'), DETECTOR)
+
+
 def test_problems_of_a_rule_alone_are_none_of_places() -> None:
     for when in ('at(a.position, "anywhere").inside', "seenFrom(a, b).ahead > 3"):
         assert own_problems(a_rule(scope={"pairs": {"position": {"stream": "x"}, "within": 5}}, when=when)) == ()
