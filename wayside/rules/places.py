@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
-from wayside.api.eventrule import Signal
+from wayside.api.eventrule import EventRuleSpec, Signal
 from wayside.api.place import Frame, Place
 from wayside.api.stream import Stream
 from wayside.expressions.expanding import SEEN_FROM, Places
@@ -112,13 +112,19 @@ def located(rule: EventRule, detector: Detector) -> EventRule:
         axes = {axis: source for axis, source in own.axes.items() if axis in names}
         pairs = pairs.model_copy(update={"position": position.model_copy(update=axes)})
     signals = list(rule.spec.signals)
-    if SEEN_FROM in str(rule.spec.model_copy(update={"description": ""}).to_json()):
+    if SEEN_FROM in _conditions(rule.spec):
         named = {signal.name for signal in signals}
         for axis in _MOTION[pairs.position.latitude is not None]:
             if axis in own.axes and axis not in named:
                 signals.append(Signal(name=axis, stream=stream.name, value=own.axes[axis]))
     scope = rule.spec.scope.model_copy(update={"pairs": pairs})
     return rule.model_copy(update={"spec": rule.spec.model_copy(update={"scope": scope, "signals": signals})})
+
+
+def _conditions(spec: EventRuleSpec) -> str:
+    """All expressions about pairs in one text."""
+    where = None if spec.scope.pairs is None else spec.scope.pairs.where
+    return f"{where} {spec.when} {spec.until} {[action.to_json() for action in spec.actions]}"
 
 
 def of_conditions(rule: EventRule, known: KnownPlaces) -> Places:
