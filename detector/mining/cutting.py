@@ -62,7 +62,7 @@ def cutting_of(recording: Recording, detector: Detector, rules: Sequence[EventRu
         return None
     completed = with_recorded_types(detector, recording)
     entries = inlets(completed)
-    compiled, _ = RuleIndex().compile(rules, completed, entries.fields)
+    compiled, _ = RuleIndex().compile(rules, completed, entries.fields, entries.places)
     engine = make_engine(completed, entries, holder=detector.name, start=0)
     engine.set_rules(compiled)
     reasons = {rule.name: why_whole(engine, rule) for rule in compiled}
@@ -82,6 +82,8 @@ def why_whole(engine: Engine, rule: CompiledRule) -> str | None:
         return "clock Data"
     if any(stream.latched for stream in spec.streams):
         return "latched streams"
+    if any(stream.items is not None for stream in spec.streams):
+        return "streams with items"
     if not isinstance(rule.subject, ClientSubject):
         return "the fleet" if isinstance(rule.subject, FleetSubject) else "pairs"
     if any(signal.rule is not None for signal in signals_of(rule)):
@@ -108,7 +110,8 @@ def warmup_of(detector: Detector, rules: Sequence[CompiledRule]) -> int:
     kept = [spec.buffer_duration_ns(stream) for stream in spec.streams]
     stale = [spec.stale_after_ns(stream) or 0 for stream in spec.streams]
     every = max(rule.every_ns or 0 for rule in rules)
-    return max(*kept, *stale, spec.client_timeout.ns) + 2 * (every + HOUSEKEEPING)
+    # The oldest sample of a window may be compared with the one before it, which is not stale then.
+    return max(kept) + max(stale) + spec.client_timeout.ns + 2 * (every + HOUSEKEEPING)
 
 
 def _spans(chunks: Sequence[tuple[int, int]], pieces: int, warmup: int) -> list[Span]:

@@ -44,7 +44,8 @@ def flaw_of(pieces: Sequence[Observed]) -> str | None:
 def joined(job: Job, recording: Recording, pieces: Sequence[Observed]) -> Mined:
     """What a recording came to; the pieces, in order, have no flaw. The job's rules are those that they looked at."""
     detector = with_recorded_types(job.detector, recording)
-    compiled, _ = RuleIndex().compile(job.rules, detector, inlets(detector).fields)
+    entries = inlets(detector)
+    compiled, _ = RuleIndex().compile(job.rules, detector, entries.fields, entries.places)
     there = [piece for piece in pieces if piece.samples]
     end = there[-1].last
     texts = _Texts()

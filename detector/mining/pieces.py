@@ -242,16 +242,15 @@ class _Recorder:
         """What was noted."""
         found: dict[tuple[str, str | None, str], Seen] = {}
         names = [*self._numbers]
-        everybody = np.ones(len(names), bool)
         for group in self._groups.values():
             signals: dict[int, dict[int, Values]] = {}
             for at, (changes, _, _) in group.signals.items():
-                for client, times, values, tags in changes.by_client(everybody):
+                for client, times, values, tags in changes.by_client(None):
                     signals.setdefault(client, {})[at] = Values(
                         times, values, tags, frozenset(np.unique(tags).tolist())
                     )
             for track, changes in zip(group.tracks, group.codes, strict=True):
-                for client, times, values, _ in changes.by_client(everybody):
+                for client, times, values, _ in changes.by_client(None):
                     codes = values.astype(np.uint8)
                     kept = _Relevant(times, codes)
                     own = signals.get(client, {})

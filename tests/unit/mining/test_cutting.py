@@ -69,11 +69,12 @@ SIGNALS = {
     "count": {"stream": "odom", "over": "2s", "aggregate": "Count"},
     "before": {"stream": "slow", "value": "msg.v", "aggregate": "Previous"},
     "spread": {"stream": "odom", "value": "msg.v", "over": "1s", "aggregate": "StdDev"},
+    "jump": {"stream": "odom", "value": "msg.v - before.v", "over": "3s", "aggregate": "Max"},
     "often": {"stream": "odom", "value": "msg.on", "over": "2s", "aggregate": "Any", "where": "msg.v > 5"},
 }
 CONDITIONS = [
     "v > 15", "v < 10 || on", "gear == 'R'", "low > 8", "mean < 14 && v > 3", "count < 12", "v - before > 4",
-    "spread > 2", "often && gear != 'N'", "on", "'slow' in streams && v > 10",
+    "spread > 2", "jump > 6", "often && gear != 'N'", "on", "'slow' in streams && v > 10",
 ]  # fmt: skip
 
 
