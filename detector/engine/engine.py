@@ -72,6 +72,7 @@ class Engine:
         self._starts = Starts()
         self._known = Knowledge(detector, decoders, read_key, start, self.counters, self._starts, exact=self._exact)
         self.buffer, self.clients = self._known.buffer, self._known.clients
+        self._starts.is_known = self.clients.__contains__
         self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
         self.consequences = Consequences(self.buffer)
         """The messages for actions other than deploy."""

@@ -8,7 +8,7 @@ from typing import Any
 from tests.reference.aggregates import NOTHING
 from tests.reference.episodes import Break, Episode, Seen, Truth, episodes, wakes
 from tests.reference.scopes import Look, Subject, both, looks, text
-from tests.reference.signals import Sources, Start, nanoseconds, truth
+from tests.reference.signals import Sources, Start, nanoseconds, of_rule, truth
 from tests.reference.world import SECOND, Sample, World
 
 
@@ -89,9 +89,13 @@ class Reference:
         self.starts: list[Start] = []
         self.told: list[Told] = []
         signals = [signal for spec in rules.values() for signal in spec.get("signals", [])]
+        over_rules = [
+            (of_rule(signal), nanoseconds(signal.get("over", "0s"))) for signal in signals if "rule" in signal
+        ]
         self._keep = {
-            name: max([keep_starts, *(nanoseconds(s.get("over", "0s")) for s in signals if s.get("rule") == name)])
+            which: max([keep_starts, *(over for named, over in over_rules if named == which)])
             for name in rules
+            for which in ((name, False), (name, True))
         }
 
     def arrive(self, sample: Sample) -> None:
@@ -215,6 +219,10 @@ class Reference:
             if not event.reason:
                 message = {"subject": event.subject, "subjects": list(clients), "values": event.values}
                 self.starts.append(Start(rule.name, self.now, clients or None, message))
+            else:
+                left = tuple(client for client in clients if client in self.world.known)
+                message = {"subject": event.subject, "reason": event.reason, "values": event.values}
+                self.starts.append(Start(rule.name, self.now, left if clients else None, message, ends=True))
 
     def _view(self, rule: Rule, client: str) -> dict[str, Any]:
         sources = Sources(self.world, self.starts, self._open(), self._keep)
@@ -260,7 +268,7 @@ def _without(start: Start, lost: set[str]) -> Start:
     if start.clients is None:
         return start
     left = tuple(client for client in start.clients if client not in lost)
-    return Start(start.rule, start.time, left, start.message)
+    return Start(start.rule, start.time, left, start.message, start.ends)
 
 
 def _not(value: Truth) -> Truth:

@@ -52,6 +52,8 @@ class Start:
     time: int
     clients: tuple[str, ...] | None
     message: dict[str, Any]
+    ends: bool = False
+    """Whether it is an end instead."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class Item:
     before: Any = None
 
 
+def of_rule(signal: dict[str, Any]) -> tuple[str, bool]:
+    """Whose starts or ends a signal is over."""
+    return signal["rule"], signal.get("samples") == "Ends"
+
+
 @dataclass
 class Sources:
     """All that signals are computed from."""
@@ -75,7 +82,7 @@ class Sources:
     """In order; those of a client that was lost since are not its own any more."""
     open_of: dict[str, list[tuple[str, ...] | None]]
     """By rule that is evaluated: the clients of each episode that is open."""
-    keep_starts: dict[str, int]
+    keep_starts: dict[tuple[str, bool], int]
 
     def signal(self, signal: dict[str, Any], client: str, now: int, ticks: list[int]) -> Any:
         """The value at a tick; `ticks` are those at which the rule was evaluated for the client, this one included."""
@@ -121,9 +128,11 @@ class Sources:
         mine = [
             each
             for each in self.starts
-            if each.rule == signal["rule"] and each.time <= now and (each.clients is None or client in each.clients)
+            if (each.rule, each.ends) == of_rule(signal)
+            and each.time <= now
+            and (each.clients is None or client in each.clients)
         ]
-        kept = [each for each in mine if each.time > now - self.keep_starts[signal["rule"]]] or mine[-1:]
+        kept = [each for each in mine if each.time > now - self.keep_starts[of_rule(signal)]] or mine[-1:]
         return [Item(each.time, each.message, {"received": each.time / SECOND}) for each in kept]
 
     def _picked(self, signal: dict[str, Any], items: list[Item]) -> Iterator[Item]:

@@ -51,6 +51,13 @@ class Aggregate(StrEnum):
     ACTIVE = "Active"
 
 
+class Samples(StrEnum):
+    """Which samples the episodes of another rule give."""
+
+    STARTS = "Starts"
+    ENDS = "Ends"
+
+
 OF_A_SAMPLE = frozenset({Aggregate.LAST, Aggregate.FIRST, Aggregate.PREVIOUS})
 """The aggregates that are the value of one sample."""
 
@@ -62,6 +69,9 @@ WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE, Aggregate.ACTIVE
 
 
 _QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95, and other aggregates have none"
+
+
+_ENDS = "samples: Ends is for a signal with rule and an aggregate other than Active"
 
 
 class Signal(Model):
@@ -89,6 +99,7 @@ class Signal(Model):
             "give exactly one of stream, rule, model and plugin",
         ),
         ("(self.aggregate == 'Quantile') == has(self.quantile)", _QUANTILE),
+        ("self.samples == 'Starts' || (has(self.rule) && self.aggregate != 'Active')", _ENDS, ".samples"),
         (
             "!(has(self.model) || has(self.plugin)) || !(has(self.where) || has(self.over) || has(self.value))",
             "the signal of a model or plugin has no value, where or over: remove them",
@@ -100,8 +111,13 @@ class Signal(Model):
     rule: ObjectName | None = Field(
         default=None,
         description="Instead of a stream: another rule that the Detector selects. Its samples are the starts of "
-        "episodes that have the client as a subject. msg contains episode, subject, subjects, onsetTime and startTime "
-        "(seconds since the epoch), and the values at the start.",
+        "episodes that have the client as a subject, or their ends: see samples. msg contains episode, subject, "
+        "subjects, onsetTime and startTime (seconds since the epoch), and the values at the start.",
+    )
+    samples: Samples = Field(
+        default=Samples.STARTS,
+        description="Only with rule: Starts or Ends of its episodes. msg of an end contains endTime and reason as "
+        "well, and the values at the end.",
     )
     model: ModelSource | None = Field(
         default=None, description="Instead of a stream: an ONNX model over other signals, an image or a point cloud."
@@ -148,6 +164,8 @@ class Signal(Model):
             raise ValueError("give exactly one of stream, rule, model and plugin")
         if (self.aggregate is Aggregate.QUANTILE) != (self.quantile is not None):
             raise ValueError(_QUANTILE)
+        if self.samples is Samples.ENDS and (self.rule is None or self.aggregate is Aggregate.ACTIVE):
+            raise ValueError(_ENDS)
         if self.model is not None or self.plugin is not None:
             if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
                 raise ValueError("the signal of a model or plugin has no value, where, over or aggregate: remove them")

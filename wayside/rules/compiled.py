@@ -28,7 +28,7 @@ class CompiledSignal:
     parameters: Parameters = NO_PARAMETERS
     """The `parameters` of value and where, by client."""
     rule: str | None = None
-    """The rule whose episode starts are the samples; None where they come from a stream."""
+    """The rule whose episode starts or ends are the samples; None where they come from a stream."""
     element: CompiledElement | None = None
     """The element that it is computed for, where value or where read it."""
     quantile: float | None = None
@@ -40,9 +40,9 @@ class CompiledSignal:
         return self.name if self.element is None else f"{self.name}~{self.element.name}"
 
 
-def episode_stream(rule: str) -> str:
-    """The name of a rule's episode starts in place of a stream name; no stream can have such a name."""
-    return f"rule/{rule}"
+def episode_stream(rule: str, *, ends: bool = False) -> str:
+    """The name of a rule's episode starts, or ends, in place of a stream name; no stream can have such a name."""
+    return f"rule/{rule}/ends" if ends else f"rule/{rule}"
 
 
 @dataclass(frozen=True, slots=True)

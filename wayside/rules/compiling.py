@@ -12,7 +12,7 @@ from wayside.api import Detector, EventRule
 from wayside.api.actions.action import Action
 from wayside.api.base import JsonValue
 from wayside.api.documents import FieldPath
-from wayside.api.eventrule import Signal
+from wayside.api.eventrule import Samples, Signal
 from wayside.api.stream import Stream
 from wayside.expressions import (
     CompiledTemplate,
@@ -53,6 +53,7 @@ from wayside.rules.scopes import (
 )
 from wayside.rules.streams import item_fields
 from wayside.rules.variables import (
+    END_MEMBERS,
     EPISODE_MEMBERS,
     SAMPLE_MEMBERS,
     condition_environment,
@@ -187,17 +188,19 @@ class _RuleCompiler:
         )
 
     def _episode_signal(self, at: FieldPath, signal: Signal, rule: str) -> CompiledSignal:
-        """A signal whose samples are the episode starts of another rule."""
+        """A signal whose samples are the episode starts or ends of another rule."""
+        ends = signal.samples is Samples.ENDS
         value, where = (
             self.sample((*at, field), source, None, kind, element_of(self.spec), of_rule=True)
             for field, source, kind in (("value", signal.value, Kind.DYN), ("where", signal.where, Kind.BOOL))
         )
         for field, expression in (("value", value), ("where", where)):
-            for text in () if expression is None else unknown_fields(expression.paths, "msg", EPISODE_MEMBERS):
-                self.problem((*at, field), f"{text} (msg is an episode's start)")
+            members = END_MEMBERS if ends else EPISODE_MEMBERS
+            for text in () if expression is None else unknown_fields(expression.paths, "msg", members):
+                self.problem((*at, field), f"{text} (msg is an episode's {'end' if ends else 'start'})")
         over = None if signal.over is None else signal.over.ns
         return CompiledSignal(
-            signal.name, episode_stream(rule), signal.aggregate, value, where, over, self.parameters, rule,
+            signal.name, episode_stream(rule, ends=ends), signal.aggregate, value, where, over, self.parameters, rule,
             quantile=signal.quantile,
         )  # fmt: skip
 

@@ -15,6 +15,9 @@ EPISODE_MEMBERS: Fields = dict.fromkeys(
 )
 """The fields of msg in a signal over a rule: the start of an episode. Times are seconds since the epoch."""
 
+END_MEMBERS: Fields = {**EPISODE_MEMBERS, "endTime": None, "reason": None}
+"""The same of the end of an episode."""
+
 SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 
 

@@ -1,4 +1,4 @@
-"""The episodes of rules as other rules see them: each start is a sample, and what is open is known.
+"""The episodes of rules as other rules see them: each start and end is a sample, and what is open is known.
 
 A start is kept for each of the episode's clients; that of an episode of the whole fleet, which names none, for
 everybody. Starts live in a buffer of their own, with a cap of its own: they are no data of a client, so they neither
@@ -8,7 +8,7 @@ keep it from timing out nor push its samples out.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
 from detector.engine.buffering.buffer import NEVER, Buffer, Lane
@@ -27,7 +27,7 @@ ALWAYS: Final = 2**63 - 1
 
 
 class Starts:
-    """The starts and the open episodes of the rules that signals of other rules name."""
+    """The starts, ends and open episodes of the rules that signals of other rules name."""
 
     def __init__(self) -> None:
         self.buffer = Buffer(MAXIMUM_BYTES)
@@ -40,6 +40,8 @@ class Starts:
         """From when to when episodes were open that ended since `settle`, by what starts are called and client."""
         self._number = 0
         self._expired = NEVER
+        self.is_known: Callable[[str], bool] = lambda client: True
+        """Whether the client is known: one that was lost keeps no end."""
 
     def configure(self, rules: Iterable[CompiledRule], least: int) -> set[str]:
         """These rules are evaluated from now on; starts are kept as long as any signal looks back, or `least` (ns).
@@ -53,9 +55,13 @@ class Starts:
                 if signal.rule is not None:
                     durations[signal.stream] = max(durations.get(signal.stream, least), signal.over_ns or 0)
                     names[signal.stream] = signal.rule
-        new = {name for stream, name in names.items() if stream not in self._durations}
+        new = {
+            name for stream, name in names.items() if stream not in self._durations and stream == episode_stream(name)
+        }
         self._durations = durations
-        self._evaluated = {episode_stream(rule.name) for rule in rules if rule.enabled}
+        self._evaluated = {
+            episode_stream(rule.name, ends=ends) for rule in rules if rule.enabled for ends in (False, True)
+        }
         self.buffer.keep(durations)
         for lane in self.buffer:
             lane.duration = durations[lane.stream]
@@ -65,8 +71,8 @@ class Starts:
 
     def forget(self, rule: str) -> None:
         """The rule means something else now, or is gone: its past starts are not its own."""
-        stream = episode_stream(rule)
-        self.buffer.keep([each for each in self._durations if each != stream])
+        stream, ends = episode_stream(rule), episode_stream(rule, ends=True)
+        self.buffer.keep([each for each in self._durations if each not in (stream, ends)])
         self._open.pop(stream, None)
 
     def note(self, event: Event) -> None:
@@ -82,20 +88,30 @@ class Starts:
                     self._ended.setdefault(stream, {}).setdefault(client, []).append((since, event.end_time))
                 if not open_episodes.get(client):
                     open_episodes.pop(client, None)
+            clients = [client for client in event.subjects if self.is_known(client)] if event.subjects else [FLEET]
+            self._put(episode_stream(event.rule, ends=True), event.end_time, event, clients)
 
     def started(self, event: Event, since: int = NEVER) -> None:
         """An episode started, now or, where it was restored, before; `since`: when rules can first see that."""
         stream = episode_stream(event.rule)
         if stream not in self._durations:
             return
-        payload = _payload(event)
-        for client in event.subjects or (FLEET,):
+        clients = event.subjects or (FLEET,)
+        for client in clients:
             self._open.setdefault(stream, {}).setdefault(client, {})[event.episode] = since
+        self._put(stream, event.start_time, event, clients)
+
+    def _put(self, stream: str, time: int, event: Event, clients: Iterable[str]) -> None:
+        """Keep a start or an end for these clients, where any rule looks at it."""
+        if stream not in self._durations:
+            return
+        payload = _payload(event)
+        for client in clients:
             lane = self.buffer.lane(client, stream)
             if lane is None:
                 lane = self.buffer.add(Lane(client, stream, self._durations[stream]))
             self._number += 1
-            sample = Stamped(event.start_time, self._number, payload, event.key)
+            sample = Stamped(time, self._number, payload, event.key)
             self.buffer.grew(lane.insert(sample))
 
     def settle(self, now: int) -> None:
@@ -161,6 +177,7 @@ def _payload(event: Event) -> bytes:
         **({} if event.element is None else {"element": event.element}),
         "onsetTime": event.onset_time / 10**9,
         "startTime": event.start_time / 10**9,
+        **({} if event.end_time is None else {"endTime": event.end_time / 10**9, "reason": event.reason}),
         "values": plain(event.values),
     }
     return to_text(message).encode()

@@ -161,6 +161,8 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
         aggregate = draw(st.sampled_from(("Active", "Count", "Age", aggregate)))
         if aggregate == "Active":
             return {**signal, "aggregate": aggregate}
+        if draw(st.booleans()):
+            signal["samples"] = "Ends"
     else:
         signal["stream"] = draw(st.sampled_from(("speed", "speed", "speed", "pose", "rare", "list", "list")))
     signal["aggregate"] = aggregate
@@ -183,7 +185,9 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
         picked = ("msg.v > 0", "msg.w == 1", "before.v < msg.v")
         if signal.get("stream") == "list":
             picked = ("item.v > 0", "msg.n == 1", "before.v < item.v")
-        signal["where"] = "msg.values.s > 1" if of_rule else draw(st.sampled_from(picked))
+        if of_rule:
+            picked = ("msg.values.s > 1", *(("msg.reason == 'Until'",) if "samples" in signal else ()))
+        signal["where"] = draw(st.sampled_from(picked))
     return signal
 
 

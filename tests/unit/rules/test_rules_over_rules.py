@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from detector.assembly import RuleIndex
-from tests.driving import POSITION, SPEED, Drive, a_detector, a_rule, arrival, at, compiled
-from wayside.rules import dependency_problems, in_order
+from tests.driving import POSITION, SPEED, Drive, a_detector, a_rule, arrival, at, compiled, place
+from wayside.rules import RuleError, dependency_problems, in_order
 
 
 def over(rule: str, name: str = "it", **fields: Any) -> dict[str, Any]:
@@ -212,3 +212,63 @@ def test_a_start_has_no_other_fields() -> None:
     top = a_rule("top", signals=[over("braking", value="msg.vales.speed")], when="it > 0.0")
     (refusal,) = RuleIndex().compile([top, braking()], a_detector(), {})[1]
     assert "spec.signals[0].value: msg has no field vales; did you mean values?" in str(refusal)
+
+
+def test_ends_are_samples_at_their_times_with_the_reason_and_the_values_at_the_end() -> None:
+    left = a_rule(
+        "left",
+        signals=[
+            over(
+                "braking", "lasted", samples="Ends", value="msg.endTime - msg.startTime", where="msg.reason == 'Until'"
+            ),
+            over("braking", "speed", samples="Ends", value="msg.values.speed"),
+            over("braking", "since", samples="Ends", aggregate="Age"),
+            count("braking", "5s", "ends", samples="Ends"),
+            count("braking", "5s", "starts"),
+        ],
+        when="lasted == 2 && speed == 7 && since < 1 && ends == 1 && starts == 1",
+        evaluation={"every": "500ms"},
+    )
+    drive = Drive(a_detector(), left, braking())
+    assert {"left", "braking"} <= drive.engine.in_columns
+    assert drive.take(*speeds("5007"), until=4.2) == [
+        "braking car started 2",
+        "braking car Until 4",
+        "left car started 4",
+    ]
+
+
+def test_an_end_by_loss_counts_for_the_other_client_of_a_pair_alone() -> None:
+    scope = {"pairs": {"position": POSITION, "within": 50}}
+    near = a_rule("near", scope=scope, when="distance < 10")
+    lost = [over("near", "reason", samples="Ends", value="msg.reason")]
+    alone = a_rule("alone", signals=lost, when="reason == 'ClientLost'", evaluation={"every": "500ms"})
+    drive = Drive(a_detector(clientTimeout="3s"), near, alone)
+    told = drive.take(*(place(n / 2, "a", 0) for n in range(1, 20)), until=0)
+    told = drive.take(
+        place(9.6, "a", 0), place(9.7, "b", 1), *(place(n / 2, "a", 0) for n in range(20, 30)), until=14.9
+    )
+    assert told == ["near a+b started 10", "near a+b ClientLost 13", "alone a started 13"]
+    assert drive.take(place(15, "a", 0), place(15, "b", 30), until=16) == []
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        {"stream": "speed", "value": "msg.v", "samples": "Ends"},
+        {"rule": "braking", "aggregate": "Active", "samples": "Ends"},
+    ],
+)
+def test_ends_are_of_rules_and_never_active(signal: dict[str, Any]) -> None:
+    with pytest.raises(
+        ValidationError, match="samples: Ends is for a signal with rule and an aggregate other than Active"
+    ):
+        a_rule(signals=[{"name": "s", **signal}], when="s")
+
+
+def test_a_field_that_only_an_end_has_is_refused_of_a_start() -> None:
+    rule = a_rule(signals=[over("braking", value="msg.reason")], when="it == 'Until'")
+    with pytest.raises(
+        RuleError, match=r"signals\[0\].value: msg has no field reason; .*\(msg is an episode's start\)"
+    ):
+        compiled(a_detector(), rule)
