@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from detector.assembly import RuleIndex, inlets, make_engine
 from detector.engine.episodes.events import Event
-from detector.engine.evaluation import Evaluated
 from detector.engine.samples.sample import Arrival
+from detector.engine.scoping.scopes import Evaluated
 from detector.replay.replaying import replay_arrivals
 from wayside.api import Detector, EventRule
 

@@ -30,7 +30,7 @@ class Episode:
     """The rule's variables at the start; what is unknown is left out."""
     classification: Mapping[str, JsonValue] | None
     rendered: Mapping[str, JsonValue]
-    """The action's templates, rendered at the start; what could not be rendered is missing."""
+    """The action's templates, rendered at the start, or see `rendered_again`; what could not be rendered is missing."""
     unrendered: Mapping[str, str]
     """Of the action's templates, those that could not be rendered, and why."""
     started: Mapping[str, Any]
@@ -43,6 +43,8 @@ class Episode:
     """Why it ended: Until, OutOfScope, Unknown, ClientLost or RuleChanged."""
     ended: Mapping[str, Any] | None = None
     """The CloudEvent of the end."""
+    rendered_again: bool = False
+    """It has ended, and templates that read statistics of the episode were rendered again."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -180,6 +180,8 @@ class Worker:
             case Over(event=event):
                 reason = None if event.reason is None else event.reason.value
                 ended = replace(episode, end_time=event.end_time, reason=reason, ended=event.cloud_event())
+                if (again := event.rendered.get(run.action)) is not None:
+                    ended = replace(ended, rendered={**ended.rendered, **again.values}, rendered_again=True)
                 self._episodes[run] = ended
                 action.ended(ended)
             case Completed(cut=cut):

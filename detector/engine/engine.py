@@ -8,6 +8,7 @@ included.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from detector.engine.buffering.messages import KeyReader
 from detector.engine.consequences.consequences import Consequences
@@ -175,14 +176,16 @@ class Engine:
     def restore(self, demands: Sequence[Demand], now: int, episodes: Sequence[OpenEpisode] = ()) -> list[Event]:
         """Take up the episodes that were open before a restart; those whose rule changed meanwhile end.
 
-        First those of the demands, then of `episodes` those that had none.
+        First those of the demands, then of `episodes` those that had none. Statistics are those of `episodes`.
         """
         demanded: dict[tuple[str, str, str], list[Demand]] = {}
         for demand in demands:
             demanded.setdefault((demand.rule, demand.subject, demand.episode), []).append(demand)
+        statistics = {episode.episode: episode.statistics for episode in episodes}
         events: list[Event] = []
         for _, of_one in sorted(demanded.items()):
             episode = episode_of(of_one[0])
+            episode = replace(episode, statistics=statistics.get(episode.episode))
             whole = episode.subject.text == of_one[0].subject
             events += self._take_up(episode, of_one, now) if whole else [self._ended_while_away(episode, now)]
         known = {demand.episode for demand in demands}
@@ -209,6 +212,11 @@ class Engine:
     def open_episodes(self) -> list[OpenEpisode]:
         """All episodes that have not ended."""
         return [episode for run in self._runs.values() for episode in run.episodes()]
+
+    @property
+    def measures(self) -> bool:
+        """Whether an open episode has statistics, which each evaluation may change."""
+        return any(run.measured for run in self._runs.values())
 
     def set_paused(self, names: Collection[str]) -> None:
         """Do not evaluate these rules until further notice, and all others again; names of no rule mean nothing.

@@ -2,41 +2,30 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from detector.engine.buffering.clients import Clients
+from detector.engine.columns.past import Past
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.budget import Budget
 from detector.engine.episodes.current import Episode, Identity
-from detector.engine.episodes.demands import Demand
+from detector.engine.episodes.demands import Demand, DemandChange
 from detector.engine.episodes.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject, fits
+from detector.engine.scoping.derived import with_derived
 from detector.engine.scoping.plugins import PluginSignals
-from detector.engine.scoping.scopes import Candidate, Views, candidates, condition
-from detector.engine.scoping.snapshots import snapshot
+from detector.engine.scoping.scopes import Candidate, Evaluated, Views, candidates, condition
+from detector.engine.scoping.snapshots import signals_read, snapshot
 from detector.engine.timing.schedule import Only
 from wayside.api.base import JsonValue
 from wayside.expressions import Expression, Unknown
-from wayside.rules import CompiledRule, FleetSubject
-
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-
-
-class Evaluated(NamedTuple):
-    """What the evaluation of a rule saw of one subject, after it has decided. Times are nanoseconds."""
-
-    now: int
-    candidate: Candidate
-    when: Truth
-    until: Truth
-    is_open: bool
-    onset: int | None
+from wayside.rules import CompiledRule
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,25 +43,19 @@ class OnDemandResult:
     """When it started; nanoseconds since the epoch."""
 
 
-class DemandChange(NamedTuple):
-    """A demand began or changed (end None), or ended; nanoseconds since the epoch."""
-
-    time: int
-    demand: Demand
-    end: int | None
-
-
 class RuleRun:
     """A rule and the states of its subjects."""
 
     def __init__(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> None:
         self.rule = rule
-        self._read = {field: _read(rule, each) for field, each in (("when", rule.when), ("until", rule.until))}
+        self._read = {field: signals_read(rule, each) for field, each in (("when", rule.when), ("until", rule.until))}
         """By condition, the signals and streams that it reads, for errors."""
         self.counters = counters
         self._identity = identity
-        self._timing = _timing(rule)
+        self._timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
+        self.past = Past()
+        """What signals over others look back on."""
         self.witness: Callable[[Evaluated], None] | None = None
         """Called with each evaluation while it is set. It decides nothing."""
         self.version = 0
@@ -98,7 +81,10 @@ class RuleRun:
         events = [] if only is not None else [*self._lost(now, clients)]
         self.looked_at = []
         seen = candidates(self.rule, views, clients, self._in_progress(), only)
-        for candidate in plugins.added(self.rule, seen, self.counters, every_subject=only is None):
+        seen = plugins.added(self.rule, seen, self.counters, every_subject=only is None)
+        if self.rule.derived:
+            seen = with_derived(self.rule, self.past, now, seen, self.counters)
+        for candidate in seen:
             self.counters.evaluations += 1
             self.looked_at.append(candidate.subject)
             events += self._subject(now, candidate)
@@ -165,8 +151,9 @@ class RuleRun:
         return sum(state.onset is not None for state in self._states.values())
 
     def gap(self, time: int) -> None:
-        """Time went on (or back) without ticks: open episodes hold, what was pending is forgotten."""
+        """Time went on (or back) without ticks: open episodes hold, what was pending is forgotten; windows reset."""
         self.disturbed = True
+        self.past.clear()
         for state in self._states.values():
             state.gap()
             state.rests_until = min(state.rests_until, time + self._timing.cooldown)
@@ -198,7 +185,10 @@ class RuleRun:
             None,
             {d.action: d for d in demands if d.action in deploys},
             {d.action for d in demands if d.action in deploys and deploys[d.action] != d.fixed},
+            Statistics.of(self.rule, episode.start_time),
         )
+        if (statistics := self._open[episode.subject].statistics) is not None and episode.statistics is not None:
+            statistics.restore(episode.statistics)
         return self._open[episode.subject].started(self.rule, self._identity)
 
     def episodes(self) -> Iterator[OpenEpisode]:
@@ -214,7 +204,7 @@ class RuleRun:
         gone = changed - {deploy.action for deploy in rule.deploys}
         self.disturbed = True
         self.rule = rule
-        self._timing = _timing(rule)
+        self._timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
         for episode in self._open.values():
             episode.change(changed, gone)
@@ -224,7 +214,7 @@ class RuleRun:
         """End every open episode, in order of the subjects, and forget what was pending."""
         self.disturbed = True
         for subject in sorted(self._open, key=lambda each: each.text):
-            yield self._ended(now, self._open.pop(subject), reason, {})
+            yield self._cut_off(now, self._open.pop(subject), reason)
         self._states.clear()
         self._muted.clear()
 
@@ -250,9 +240,31 @@ class RuleRun:
                 if subject in self._muted:
                     self._muted.discard(subject)
                 else:
-                    yield self._ended(now, self._open.pop(subject), Reason.CLIENT_LOST, {})
+                    yield self._cut_off(now, self._open.pop(subject), Reason.CLIENT_LOST)
             else:
                 state.gap()
+
+    def _cut_off(self, now: int, episode: Episode, reason: Reason) -> Event:
+        """End an episode without an evaluation: only the statistics of the episode are known."""
+        known = {} if episode.statistics is None else episode.statistics.values(now)
+        return self._ended(now, episode, reason, known, known)
+
+    @property
+    def measured(self) -> Mapping[Subject, Statistics]:
+        """The statistics of the open episodes; none where the rule has no signals over episodes."""
+        return {subject: each.statistics for subject, each in self._open.items() if each.statistics is not None}
+
+    def statistics(self, subject: Subject) -> Statistics | None:
+        """Those of the subject's open episode, if it has any."""
+        episode = self._open.get(subject)
+        return None if episode is None else episode.statistics
+
+    def _measured(self, now: int, episode: Episode, candidate: Candidate) -> Candidate:
+        """The candidate, with the statistics of its episode up to this evaluation."""
+        if episode.statistics is None:
+            return candidate
+        found = episode.statistics.up_to(now, candidate.measured, self.counters)
+        return candidate._replace(variables={**candidate.variables, **found})
 
     def _subject(self, now: int, candidate: Candidate) -> Iterator[Event]:
         state = self._states.get(candidate.subject)
@@ -309,7 +321,9 @@ class RuleRun:
             if subject in self._muted:
                 self._muted.discard(subject)
                 return None
-            return self._ended(now, self._open.pop(subject), what.reason, snapshot(self.rule, candidate))
+            ended = self._open.pop(subject)
+            candidate = self._measured(now, ended, candidate)
+            return self._ended(now, ended, what.reason, snapshot(self.rule, candidate), candidate.variables)
         limit = self.rule.maximum_per_hour
         if limit is None or self._budget.takes(subject.clients, now, limit):
             return self._started(now, what.onset, candidate)
@@ -322,6 +336,7 @@ class RuleRun:
         episode = self._open.get(candidate.subject)
         if episode is None:
             return
+        candidate = self._measured(now, episode, candidate)
         before = dict(episode.demands) if self.journal is not None else {}
         if not episode.is_complete(self.rule):
             episode.variables = candidate.variables
@@ -354,19 +369,23 @@ class RuleRun:
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
         subject = candidate.subject
         identifier = episode_id(self._identity.holder, self.rule.name, subject.text, now)
-        variables = candidate.variables if self.rule.has_actions else None
-        episode = Episode(identifier, subject, onset, now, snapshot(self.rule, candidate), variables)
+        episode = Episode(identifier, subject, onset, now, {}, None, statistics=Statistics.of(self.rule, now))
+        candidate = self._measured(now, episode, candidate)
+        episode.values = snapshot(self.rule, candidate)
+        episode.variables = candidate.variables if self.rule.has_actions else None
         self._open[subject] = episode
         self.counters.started += 1
         self._render(episode)
         self._note_demands(now, episode, {})
         return episode.started(self.rule, self._identity)
 
-    def _ended(self, now: int, episode: Episode, reason: Reason, values: Mapping[str, Any]) -> Event:
+    def _ended(
+        self, now: int, episode: Episode, reason: Reason, values: Mapping[str, Any], variables: Mapping[str, Any]
+    ) -> Event:
         self.counters.ended += 1
         self.version += 1
         self._note_demands(now, episode, {}, now)
-        return episode.ended(self.rule, self._identity, now, reason, values)
+        return episode.ended(self.rule, self._identity, now, reason, values, variables)
 
     def _render(self, episode: Episode) -> None:
         self.version += episode.render(self.rule, self._identity, self.counters)
@@ -375,18 +394,3 @@ class RuleRun:
 def same_semantics(run: RuleRun, rule: CompiledRule) -> bool:
     """Whether open episodes go on under the new rule."""
     return run.rule.digest == rule.digest and run.rule.enabled == rule.enabled
-
-
-def _read(rule: CompiledRule, expression: Expression | None) -> str:
-    """The signals that an expression reads, with their streams, for people."""
-    steps: set[object] = set()
-    if expression is not None:
-        steps.update(step for path in expression.paths for step in path)
-        if isinstance(rule.subject, FleetSubject):  # it reads the clients' signals by names of its own for them
-            steps.update(_NAME.findall(expression.source))
-    found = [f"{each.name} of stream {each.stream}" for each in rule.signals if each.name in steps and not each.rule]
-    return f" ({', '.join(found)})" if found else ""
-
-
-def _timing(rule: CompiledRule) -> Timing:
-    return Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)

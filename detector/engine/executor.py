@@ -301,6 +301,8 @@ class Executor:
             self._losing.update(self._runs)
             self._starts.lose(lost)
             self._plugins.lose(lost)
+            for run in self._runs.values():
+                run.past.lose(lost)
 
     def _wake(self, run: RuleRun, time: int, subjects: Iterable[Subject]) -> None:
         for subject, at in run.wakes(time, subjects):

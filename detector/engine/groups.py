@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -54,7 +55,8 @@ class RuleGroup:
         """Ticks that are not evaluated yet."""
         elements = [(run, element) for run in runs for element in run.rule.elements]
         self.columns = columns(
-            [Track(run.rule, each, run.counters, run.read, row) for row, (run, each) in enumerate(elements)], context
+            [Track(run.rule, each, run.counters, run.read, row, run.past) for row, (run, each) in enumerate(elements)],
+            context,
         )
         self.observer: Observer | None = None
         self.may_wait = True
@@ -93,6 +95,8 @@ class RuleGroup:
         states: list[tuple[int, int, bool, int]] = []
         for change in self._changed(block, codes, looked):
             yield from self._step(block, change, numbers[change.at], states)
+        if isinstance(block, Block) and block.measured:
+            self._measure(block)
         if states:
             rows, at, watched, wakes = zip(*states, strict=True)
             self._watched[rows, at] = watched
@@ -193,12 +197,14 @@ class RuleGroup:
                 ran = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
                 wake, happened_at = ran.wake, ran.at
                 if ran.what is not None:
+                    self._measure_until(block, row, at, subject, happened_at)
                     candidate = self._candidate(block, track, subject, at * count + happened_at)
                     event = run.happened(ticks[happened_at], ran.what, candidate)
                     if event is not None:
                         happened.append(Happened(ticks[happened_at], self._orders[row], event))
                     happened_at += 1
                 elif one_by_one:
+                    self._measure_until(block, row, at, subject, first)
                     run.stays(ticks[first], self._candidate(block, track, subject, at * count + first))
                 first = happened_at
         idle = state.idle_at(ticks[-1])
@@ -208,6 +214,27 @@ class RuleGroup:
         return happened
 
     def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
-        if isinstance(block, Block) and self._plain[track.row]:
-            return Candidate(subject, block.values(track, point), in_scope=True, near=True)
-        return Candidate(subject, block.variables(track, point), in_scope=True, near=True)
+        if not isinstance(block, Block):
+            return Candidate(subject, block.variables(track, point), in_scope=True, near=True)
+        seen = block.values(track, point) if self._plain[track.row] else block.variables(track, point)
+        return Candidate(subject, seen, in_scope=True, near=True, measured=block.measured_at(track.row, point))
+
+    def _measure(self, block: Block) -> None:
+        """Take the rest of the block into the statistics of the open episodes."""
+        at = {client: place for place, client in enumerate(block.clients)}
+        for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True)):
+            for subject in run.measured:
+                if subject.element == track.element.name and subject.clients[0] in at:
+                    self._measure_until(block, row, at[subject.clients[0]], subject, len(block.ticks))
+
+    def _measure_until(self, block: Block | FleetBlock, row: int, at: int, subject: Subject, end: int) -> None:
+        """Take the block's ticks before `end` into the statistics of the subject's episode, if it has any."""
+        run = self._of[row]
+        statistics = run.statistics(subject)
+        if statistics is None or not isinstance(block, Block):
+            return
+        looked = block.points(row)
+        for tick in range(bisect_right(block.ticks, statistics.until), end):
+            point = at * len(block.ticks) + tick
+            if looked is None or looked[point]:
+                statistics.take(block.ticks[tick], block.measured_at(row, point), run.counters)

@@ -11,7 +11,7 @@ from detector.engine.columns.fleets import FleetBlock
 from detector.engine.columns.pairs import PairBlock
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Codes
-from detector.engine.evaluation import DemandChange
+from detector.engine.episodes.demands import DemandChange
 
 
 class Observer(Protocol):

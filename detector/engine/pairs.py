@@ -67,7 +67,7 @@ class PairGroup:
         self._order = order
         self._context = context
         self._element = run.rule.elements[0]
-        self._track = Track(run.rule, self._element, run.counters, run.read, 0)
+        self._track = Track(run.rule, self._element, run.counters, run.read, 0, run.past)
         self._columns = PairColumns(self._track, context)
         self.observer: Observer | None = None
         self._watched = _NOBODY
@@ -113,10 +113,22 @@ class PairGroup:
         over = ~seen & ~watched.in_progress & (watched.wakes <= tick)
         for key in watched.keys[over].tolist():
             self._run.drop_state(self._subject(key))
+        if these.measured:
+            self._measure(tick, these, index)
         kept: list[Entry] = []
         for row in np.flatnonzero(changed).tolist():
             yield from self._step(tick, these, row, kept)
         self._watched = _joined(watched.of(~stale & ~over), kept)
+
+    def _measure(self, tick: int, these: PairBlock, index: Integers) -> None:
+        """Take the tick into the statistics of the open episodes; `index`: where clients are in the block."""
+        tables, count = self._context.tables, len(these.block.clients)
+        pairs = these.first * count + these.second
+        for subject, statistics in self._run.measured.items():
+            first, second = (int(index[tables.number(client)]) for client in subject.clients)
+            row = int(np.searchsorted(pairs, first * count + second))
+            if min(first, second) >= 0 and row < len(pairs) and pairs[row] == first * count + second:
+                statistics.take(tick, self._columns.measured(these, row), self._run.counters)
 
     def _block(self, tick: int, clients: Sequence[str]) -> Block:
         """The clients that are known at the tick."""
@@ -171,7 +183,9 @@ class PairGroup:
         stays = state.is_open and run.needs_every_tick(subject)
         ran = state.run((tick,), 0, 1, run.timing, code)
         if ran.what is not None or stays:
-            candidate = Candidate(subject, self._columns.variables(these, row), in_scope=True, near=True)
+            measured = self._columns.measured(these, row)
+            variables = self._columns.variables(these, row)
+            candidate = Candidate(subject, variables, in_scope=True, near=True, measured=measured)
             if ran.what is None:
                 run.stays(tick, candidate)
             elif (event := run.happened(tick, ran.what, candidate)) is not None:

@@ -50,6 +50,9 @@ _LOG_EVERY = 1.0
 _STALL = 1_000_000_000
 """Nanoseconds: a tick that is overdue by more is skipped, and a larger step back of the clock is accepted."""
 
+_SAVE_EVERY = 1_000_000_000
+"""Nanoseconds between two writes of open episodes with statistics: a kill costs no more of them."""
+
 
 class Recorder(Protocol):
     """Keeps what the engine consumes, in that order."""
@@ -130,6 +133,8 @@ class Evaluator:
         self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
         self._overload = Overload()
         self._sweeper = Sweeper()
+        self._saved = 0
+        """When open episodes were last written; nanoseconds on the engine's time axis."""
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
         self.losses = Losses(engine, intake)
@@ -244,6 +249,8 @@ class Evaluator:
         end = self._engine.now
         for events in self._engine.finish():
             self._hand_over(events)
+        if self._engine.measures:
+            self._outlet.open_episodes(self._engine.open_episodes)
         self._record_outages()
         self._record(end, {"kind": "end", "finished": True})
 
@@ -348,6 +355,8 @@ class Evaluator:
             self._onlooker.looked(self._engine, events)
         if events:
             self._outlet.events(events)
+        if events or (abs(self._engine.now - self._saved) >= _SAVE_EVERY and self._engine.measures):
+            self._saved = self._engine.now
             self._outlet.open_episodes(self._engine.open_episodes)
         if consequences := self._engine.consequences.take(self._engine.now):
             self._outlet.consequences(consequences)

@@ -28,7 +28,7 @@ from detector.results.series import (
     Wanted,
     Way,
 )
-from wayside.expressions.columns.values import Tag
+from wayside.expressions.columns.values import Column, Tag
 from wayside.rules import PairSubject
 
 _SHIFT = 32
@@ -67,6 +67,8 @@ class PairLog:
         if these.closing is not None and these.closing_known is not None:
             speeds = np.where(these.closing_known, these.closing, np.nan)
             self._values.setdefault("closingSpeed", []).append(speeds)
+        for name, own in these.derived.items():
+            self._values.setdefault(name, []).append(self._numbers(name, own))
         for name, at in self._track.signals.items():
             column = these.seen.signals[at] if len(these.first) else None
             for role, clients in zip(_ROLES, (these.first, these.second), strict=True):
@@ -75,13 +77,19 @@ class PairLog:
                     values.append(np.zeros(0))
                     continue
                 rows = these.at[clients]
-                tags = None if column.tags is None else column.tags[rows]
-                if tags is not None and ((tags == Tag.OTHER) | (tags == Tag.TEXT)).any():
-                    self._odd.add(f"{role}.{name}")
-                if tags is not None and (tags == Tag.BOOLEAN).any():
-                    self._kinds[f"{role}.{name}"] = Kind.BOOLEAN
-                known = None if tags is None else (tags == Tag.NUMBER) | (tags == Tag.BOOLEAN)
-                values.append(column.values[rows] if known is None else np.where(known, column.values[rows], np.nan))
+                own = Column(column.values[rows], None if column.tags is None else column.tags[rows])
+                values.append(self._numbers(f"{role}.{name}", own))
+
+    def _numbers(self, name: str, column: Column) -> Doubles:
+        """The values of a signal, NaN where it is unknown; notes what else than numbers it holds."""
+        tags = column.tags
+        if tags is None:
+            return column.values
+        if ((tags == Tag.OTHER) | (tags == Tag.TEXT)).any():
+            self._odd.add(name)
+        if (tags == Tag.BOOLEAN).any():
+            self._kinds[name] = Kind.BOOLEAN
+        return np.where((tags == Tag.NUMBER) | (tags == Tag.BOOLEAN), column.values, np.nan)
 
     def subjects(self, rule: str, names: Sequence[str], wanted: Wanted) -> Iterator[SubjectTrace]:
         """Each pair that was looked at and is wanted; `names` are the clients', by their numbers."""
@@ -139,6 +147,9 @@ class PairLog:
             for signal in rule.signals:
                 if (role, signal.name) in read and signal.name not in values:
                     return f"{role}.{signal.name} of {client}: {of_stream(these.seen, signal.stream, point)}"
+        for name in sorted({str(path[0]) for path in read} & these.derived.keys()):
+            if np.isnan(self._numbers(name, these.derived[name])[row]):
+                return f"{name}: no value"
         return "a value that it reads is not there"
 
 

@@ -21,6 +21,9 @@ def why_unknown(block: Block, point: int, track: Track, expression: Expression |
     for signal in track.rule.signals:
         if signal.name in expression.names and signal.name not in values:
             return f"{signal.name}: {of_stream(block, signal.stream, point)}"
+    for each in track.rule.derived:
+        if each.name in expression.names and each.name not in values:
+            return f"{each.name}: no value"
     _, note = expression.explained(block.variables(track, point))
     return _OTHERWISE if note is None else note[1]
 
@@ -44,8 +47,8 @@ def of_variables(rule: CompiledRule, expression: Expression | None, variables: M
         for role in ("a", "b"):
             if "position" not in variables[role]:
                 return f"{role}.position: no sample of stream {rule.subject.position.stream}, or an old one"
-    for signal in rule.signals:
-        if signal.name in expression.names and signal.name not in variables:
-            return f"{signal.name}: no value"
+    for name in (*(signal.name for signal in rule.signals), *(signal.name for signal in rule.derived)):
+        if name in expression.names and name not in variables:
+            return f"{name}: no value"
     _, note = expression.explained(variables)
     return _OTHERWISE if note is None else note[1]

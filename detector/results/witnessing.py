@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from detector.engine.evaluation import Evaluated
+from detector.engine.scoping.scopes import Evaluated
 from detector.engine.scoping.snapshots import snapshot
 from detector.results.reasons import of_variables
 from detector.results.series import AWAY, FALSE, TRUE, UNKNOWN, Kind, Series, Steps, SubjectTrace

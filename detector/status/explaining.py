@@ -13,7 +13,7 @@ from typing import Any
 from detector.engine.buffering.buffer import NEVER
 from detector.engine.engine import Engine
 from detector.engine.episodes.plain import plain
-from detector.engine.evaluation import Evaluated
+from detector.engine.scoping.scopes import Evaluated
 from detector.engine.scoping.snapshots import snapshot
 from detector.status.model import Explanation, SubjectStatus
 from wayside.expressions import UNKNOWN

@@ -50,6 +50,9 @@ def _calculated(name: str, numbers: list[tuple[int, Any]]) -> Any:
         return _double(sum(map(Fraction, plain), Fraction()) / (1 if name == "Sum" else len(plain)))
     if name == "StdDev":
         return math.nan if infinite else statistics.pstdev(plain)
+    if name in ("MinTime", "MaxTime"):
+        extreme = (min if name == "MinTime" else max)(plain)
+        return next(time for time, number in numbers if number == extreme) / 10**9
     if name == "Slope":
         if numbers[0][0] == numbers[-1][0]:
             return NOTHING

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tests.reference.aggregates import NOTHING
-from tests.reference.episodes import Break, Episode, Seen, Truth, episodes, wakes
+from tests.reference.derived import Evaluations
+from tests.reference.episodes import Break, Episode, Seen, Truth, episodes, in_progress, wakes
 from tests.reference.scopes import Look, Subject, both, looks, text
 from tests.reference.signals import Sources, Start, nanoseconds, of_rule, truth
 from tests.reference.world import SECOND, Sample, World
@@ -33,6 +34,17 @@ class Rule:
     history: dict[Subject, list[Seen | Break]] = field(default_factory=dict)
     looked: dict[str, list[int]] = field(default_factory=dict)
     """The ticks at which a client was looked at since it is known."""
+    evaluations: dict[Subject, Evaluations] = field(default_factory=dict)
+    """Of the subjects that were evaluated since their clients are known."""
+
+    @property
+    def derived(self) -> list[dict[str, Any]]:
+        """The signals over what conditions see."""
+        return [each for each in self.spec.get("signals", []) if "of" in each or each.get("over") == "Episode"]
+
+    def in_progress(self, subject: Subject, client_timeout: int) -> bool:
+        """Whether the subject has an episode, or is about to."""
+        return in_progress(self.history.get(subject, []), *self._times(client_timeout))
 
     @property
     def every(self) -> int:
@@ -88,6 +100,7 @@ class Reference:
         self.waiting: list[Sample] = []
         self.starts: list[Start] = []
         self.told: list[Told] = []
+        self.keep_starts = keep_starts
         signals = [signal for spec in rules.values() for signal in spec.get("signals", [])]
         over_rules = [
             (of_rule(signal), nanoseconds(signal.get("over", "0s"))) for signal in signals if "rule" in signal
@@ -164,6 +177,8 @@ class Reference:
         self.now = time
         self.world.gap(time)
         for rule in self.rules:
+            for evaluations in rule.evaluations.values():
+                evaluations.before.clear()
             for history in rule.history.values():
                 history.append(Break(time, lost=False))
 
@@ -182,6 +197,9 @@ class Reference:
             for rule in self.rules:
                 for client in lost:
                     rule.looked.pop(client, None)
+                for subject, evaluations in rule.evaluations.items():
+                    if lost & {*subject[0]}:
+                        evaluations.before.clear()
         for rule in self.rules:
             if not rule.spec.get("enabled", True):
                 continue
@@ -203,12 +221,20 @@ class Reference:
                 rule.looked.setdefault(client, []).append(self.now)
             for look in looks(rule.spec, self.world, self.now, lambda client: self._view(rule, client)):
                 if whom is None or look.subject in whom.subjects or whom.clients & {*(look.subject[0] or whom.clients)}:
-                    found[look.subject] = (self._seen(rule, look), look.values)
+                    names = (*look.names, *(signal["name"] for signal in rule.derived))
+                    seen = replace(look, names=names)
+                    if look.near is True or rule.in_progress(look.subject, timeout):
+                        evaluations = rule.evaluations.setdefault(look.subject, Evaluations())
+                        seen = evaluations.look(rule.derived, seen, self.now, self.keep_starts)
+                    found[look.subject] = (self._seen(rule, seen), seen.values)
         told: list[tuple[Told, tuple[str, ...]]] = []
-        for subject, (seen, values) in found.items():
+        for subject, (seen, known) in found.items():
             before = rule.episodes(subject, timeout)
             rule.history.setdefault(subject, []).append(seen)
             after = rule.episodes(subject, timeout)
+            values = known
+            if after and subject in rule.evaluations:
+                values = known | rule.evaluations[subject].statistics(rule.derived, after[-1].start, self.now)
             if len(after) > len(before):
                 told.append((Told(rule.name, text(subject), self.now, after[-1].onset, "", values), subject[0]))
             elif after and before and after[-1].end != before[-1].end:
@@ -229,6 +255,8 @@ class Reference:
         streams = [stream for stream in self.world.stale_after if self.world.fresh(client, stream, self.now)]
         view: dict[str, Any] = {"client": client, "labels": {}, "streams": streams}
         for signal in rule.spec.get("signals", []):
+            if signal in rule.derived:
+                continue
             value = sources.signal(signal, client, self.now, rule.looked[client])
             if value is not NOTHING:
                 view[signal["name"]] = value

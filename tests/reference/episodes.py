@@ -88,6 +88,18 @@ def wakes(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout
     return {onset + hold, *([_unknown_since(history, "condition") + hold + 1] if unknown else [])}
 
 
+def in_progress(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout: int) -> bool:
+    """Whether an episode is open or about to start."""
+    found = episodes(history, hold, cooldown, unknown_timeout)
+    if not found:
+        return bool(history) and _pending(history, hold, 0) is not None
+    end = found[-1].end
+    if end is None:
+        return True
+    since = [each for each in history if each.time > end]
+    return bool(since) and _pending(since, hold, end + cooldown) is not None
+
+
 def _onset(history: list[Seen | Break], hold: int, rests_until: int) -> int | None:
     """When the condition began to hold, if it has done so for long enough at the end of the history."""
     last = history[-1]

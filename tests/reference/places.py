@@ -58,7 +58,7 @@ def located(spec: dict[str, Any], positions: dict[str, dict[str, str]]) -> dict[
     own = positions[pairs["position"]["stream"]]
     position = {"x": own["x"], "y": own["y"], **pairs["position"]}
     signals = list(spec.get("signals", []))
-    if "seenFrom" in spec["when"] + spec.get("until", ""):
+    if "seenFrom" in f"{spec['when']} {spec.get('until')} {[each.get('of') for each in spec['signals']]}":
         signals += [
             {"name": name, "stream": position["stream"], "value": own[name]} for name in ("yaw", "speed")
         ]  # fmt: skip

@@ -25,7 +25,7 @@ def truth(source: str | None, variables: dict[str, Any], names: Iterable[str]) -
     """What a condition says; None is unknown, and one that is absent holds."""
     if source is None:
         return True
-    value = _evaluated(source, variables, tuple(names))
+    value = evaluated(source, variables, tuple(names))
     return value if isinstance(value, bool) else None
 
 
@@ -38,7 +38,8 @@ def tell_places(places: Iterable[dict[str, Any]], position: dict[str, str]) -> N
     _WHERE.position.update(position)
 
 
-def _evaluated(source: str, variables: dict[str, Any], names: tuple[str, ...]) -> Any:
+def evaluated(source: str, variables: dict[str, Any], names: tuple[str, ...]) -> Any:
+    """What an expression says; NOTHING is unknown."""
     source, variables, more = with_fields(source, variables, _WHERE)
     value = _compiled(source, (*names, *more)).evaluate_or_unknown(variables)
     return NOTHING if value is UNKNOWN else value
@@ -142,7 +143,7 @@ class Sources:
 
 
 def _value(signal: dict[str, Any], item: Item) -> Any:
-    return _evaluated(signal["value"], _variables(item), VARIABLES) if "value" in signal else True
+    return evaluated(signal["value"], _variables(item), VARIABLES) if "value" in signal else True
 
 
 def _variables(item: Item) -> dict[str, Any]:

@@ -106,6 +106,23 @@ class PositiveDuration(Duration):
         return parsed
 
 
+class Over(PositiveDuration):
+    """The length of a window, or `Episode`: from the start of the open episode on."""
+
+    pattern = rf"({PositiveDuration.pattern}|Episode)"
+    expectation = "a duration above zero, such as 500ms, 10s, 1.5s or 1h30m, or Episode"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """As for any duration above zero, or Episode."""
+        return cls(text) if text == "Episode" else super().parse(text)
+
+    @property
+    def is_episode(self) -> bool:
+        """Whether the window is the open episode, which has no length."""
+        return self == "Episode"
+
+
 class Quantity(_PatternString):
     """An amount in Kubernetes notation, such as ``64Mi``, ``1e9`` or ``250m``; whole numbers need no quotes."""
 

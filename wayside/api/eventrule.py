@@ -16,6 +16,7 @@ from wayside.api.base import (
     Kind,
     Model,
     ObjectName,
+    Over,
     PositiveDuration,
     conditions_field,
     validations,
@@ -49,6 +50,8 @@ class Aggregate(StrEnum):
     DISTINCT = "Distinct"
     AGE = "Age"
     ACTIVE = "Active"
+    MIN_TIME = "MinTime"
+    MAX_TIME = "MaxTime"
 
 
 class Samples(StrEnum):
@@ -67,7 +70,18 @@ WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE, Aggregate.ACTIVE})
 WINDOWED = frozenset(Aggregate) - OF_A_SAMPLE - {Aggregate.AGE, Aggregate.ACTIVE}
 """The aggregates that need `over`."""
 
+OF_AN_EPISODE = frozenset(
+    {
+        Aggregate.LAST, Aggregate.FIRST, Aggregate.MIN, Aggregate.MAX, Aggregate.MIN_TIME, Aggregate.MAX_TIME,
+        Aggregate.MEAN, Aggregate.SUM, Aggregate.COUNT, Aggregate.ALL, Aggregate.ANY, Aggregate.AGE,
+    }
+)  # fmt: skip
+"""The aggregates of an open episode: they need no more than a few numbers, however long it lasts."""
 
+_SOURCE = "give exactly one of stream, rule, model, plugin and of (aggregate Age with over: Episode needs none)"
+_OF = "a signal with of has no value or where, and its aggregate is not Age or Active"
+_LAG = "lag is for a signal with of, and not with over: Episode"
+_EPISODE = f"over: Episode is for a signal with of and the aggregates {', '.join(sorted(OF_AN_EPISODE))}; Age has no of"
 _QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95, and other aggregates have none"
 
 
@@ -75,7 +89,7 @@ _ENDS = "samples: Ends is for a signal with rule and an aggregate other than Act
 
 
 class Signal(Model):
-    """A value computed from a stream's samples, from another rule's episodes, by a model, or by a plugin."""
+    """A value computed from samples, from another rule's episodes, from other signals, by a model, or by a plugin."""
 
     model_config = validations(
         (
@@ -85,7 +99,8 @@ class Signal(Model):
             "Required",
         ),
         (
-            "has(self.model) || has(self.plugin) || (self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
+            "has(self.model) || has(self.plugin) || has(self.of) || "
+            "(self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
             "give value, e.g. value: msg.speed, except with the aggregates Count, Age and Active, which use no value",
             ".value",
         ),
@@ -95,8 +110,17 @@ class Signal(Model):
             ".aggregate",
         ),
         (
-            "[has(self.stream), has(self.rule), has(self.model), has(self.plugin)].filter(given, given).size() == 1",
-            "give exactly one of stream, rule, model and plugin",
+            "[has(self.stream), has(self.rule), has(self.model), has(self.plugin), has(self.of)]"
+            ".filter(given, given).size() == "
+            "(self.aggregate == 'Age' && has(self.over) && self.over == 'Episode' ? 0 : 1)",
+            _SOURCE,
+        ),
+        ("!has(self.of) || !(has(self.value) || has(self.where) || self.aggregate in ['Age', 'Active'])", _OF),
+        ("!has(self.lag) || (has(self.of) && !(has(self.over) && self.over == 'Episode'))", _LAG),
+        (
+            "!has(self.over) || self.over != 'Episode' || "
+            f"(self.aggregate == 'Age') != has(self.of) && self.aggregate in {sorted(map(str, OF_AN_EPISODE))}",
+            _EPISODE,
         ),
         ("(self.aggregate == 'Quantile') == has(self.quantile)", _QUANTILE),
         ("self.samples == 'Starts' || (has(self.rule) && self.aggregate != 'Active')", _ENDS, ".samples"),
@@ -127,6 +151,13 @@ class Signal(Model):
         description="Instead of a stream: Python code that computes the value for the rule's subject at each "
         "evaluation. In a pairs scope, the value belongs to the pair: expressions use the bare name, without a or b.",
     )
+    of: Expression | None = Field(
+        default=None,
+        description="Instead of a stream: CEL over what `when` sees, such as another signal or the distance of a pair. "
+        "The samples are the values of the expression at the evaluations of the subject. Without over and lag, the "
+        "signal is the value itself. In a pairs scope, the value belongs to the pair: expressions use the bare name. "
+        "The values are kept for over and lag: at most 25 bytes for each evaluation of each subject.",
+    )
     value: Expression | None = Field(
         default=None,
         description="CEL over msg (the decoded sample), item (its item, if the stream has items), before (the client's "
@@ -136,18 +167,26 @@ class Signal(Model):
     where: Expression | None = Field(
         default=None, description="CEL over msg, key, sample and parameters. Only samples for which it is true count."
     )
-    over: PositiveDuration | None = Field(
+    over: Over | None = Field(
         default=None,
         description="The length of the window: at tick t it is (t - over, t]. Required, except with the aggregates "
-        "Last, First, Previous, Age and Active.",
+        "Last, First, Previous, Age and Active. Episode, for a signal with of: the evaluations of the open episode, "
+        "from its start to its end. Such a signal is known while an episode is open: the events of start and end have "
+        "it, and actions can use it, but conditions and other signals cannot.",
+    )
+    lag: PositiveDuration | None = Field(
+        default=None,
+        description="For a signal with of: the window ends in the past. At tick t it is (t - lag - over, t - lag].",
     )
     aggregate: Aggregate = Field(
         default=Aggregate.LAST,
         description="How the samples become one value. Last, Previous, First: the newest, the second newest, the "
         "oldest value. Min, Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: last - first. "
         "Rate: Delta per second. Slope: of the line of least squares, per second. All, Any: of booleans. Distinct: "
-        "the list of distinct values. Count: the number of samples. Age: "
-        "seconds since the last sample was received. Active (only for a rule): whether an episode is open.",
+        "the list of distinct values. Count: the number of samples. Age: seconds "
+        "since the last sample was received; over an episode, since its start. Active (only for a rule): whether an "
+        "episode is open. MinTime, MaxTime: when the smallest or largest number first occurred, seconds since the "
+        "epoch.",
     )
 
     quantile: float | None = Field(
@@ -158,10 +197,21 @@ class Signal(Model):
         "exceed. Between two values, it is interpolated linearly.",
     )
 
+    @property
+    def is_derived(self) -> bool:
+        """Whether it belongs to the rule's subject and is computed from what conditions see, or from the episode."""
+        return self.of is not None or (self.over is not None and self.over.is_episode)
+
     @model_validator(mode="after")
     def _complete(self) -> Signal:
-        if sum(source is not None for source in (self.stream, self.rule, self.model, self.plugin)) != 1:
-            raise ValueError("give exactly one of stream, rule, model and plugin")
+        episode = self.over is not None and self.over.is_episode
+        sources = sum(each is not None for each in (self.stream, self.rule, self.model, self.plugin, self.of))
+        if sources != (0 if episode and self.aggregate is Aggregate.AGE else 1):
+            raise ValueError(_SOURCE)
+        if episode and (self.aggregate not in OF_AN_EPISODE or (self.of is None) != (self.aggregate is Aggregate.AGE)):
+            raise ValueError(_EPISODE)
+        if self.lag is not None and (self.of is None or episode):
+            raise ValueError(_LAG)
         if (self.aggregate is Aggregate.QUANTILE) != (self.quantile is not None):
             raise ValueError(_QUANTILE)
         if self.samples is Samples.ENDS and (self.rule is None or self.aggregate is Aggregate.ACTIVE):
@@ -170,11 +220,13 @@ class Signal(Model):
             if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
                 raise ValueError("the signal of a model or plugin has no value, where, over or aggregate: remove them")
             return self
+        if self.of is not None and (self.value or self.where or self.aggregate in (Aggregate.AGE, Aggregate.ACTIVE)):
+            raise ValueError(_OF)
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
         if self.aggregate is Aggregate.ACTIVE and (self.rule is None or self.over or self.where):
             raise ValueError("aggregate Active is for a signal with rule, without over and where")
-        if self.aggregate not in WITHOUT_VALUE and self.value is None:
+        if self.of is None and self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:
             raise ValueError(f"aggregate {self.aggregate} uses no value: remove value (use where to select samples)")

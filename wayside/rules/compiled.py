@@ -40,6 +40,26 @@ class CompiledSignal:
         return self.name if self.element is None else f"{self.name}~{self.element.name}"
 
 
+@dataclass(frozen=True, slots=True)
+class CompiledDerived:
+    """A signal over the values that an expression had at the evaluations of a subject; times in nanoseconds."""
+
+    name: str
+    of: Expression | None
+    """None: it is the age of the open episode."""
+    aggregate: Aggregate
+    over_ns: int
+    lag_ns: int
+    quantile: float | None = None
+    episode: bool = False
+    """Whether it is a statistic of the open episode; it has no window then."""
+
+    @property
+    def keeps(self) -> bool:
+        """Whether it looks at earlier evaluations."""
+        return not self.episode and (self.lag_ns > 0 or self.aggregate is not Aggregate.LAST)
+
+
 def episode_stream(rule: str, *, ends: bool = False) -> str:
     """The name of a rule's episode starts, or ends, in place of a stream name; no stream can have such a name."""
     return f"rule/{rule}/ends" if ends else f"rule/{rule}"
@@ -233,6 +253,8 @@ class CompiledRule:
     """The signals that models compute."""
     places: tuple[Shape, ...] = ()
     """The places that its expressions name."""
+    derived: tuple[CompiledDerived, ...] = ()
+    """The signals over what conditions see, each after those that it reads."""
     on_sample: str | None = None
     """The stream with whose samples it is evaluated."""
     on_demand: bool = False

@@ -37,6 +37,7 @@ from wayside.rules.compiled import (
     PairSubject,
     episode_stream,
 )
+from wayside.rules.derived import compile_derived, statistics_read
 from wayside.rules.fields import Fields, unknown_fields
 from wayside.rules.models import compile_models
 from wayside.rules.naming import signal_name_problem
@@ -121,8 +122,12 @@ class _RuleCompiler:
         if self.spec.evaluation.on_sample is not None:
             self.stream(("spec", "evaluation", "onSample"), self.spec.evaluation.on_sample)
         environment = condition_environment(self.spec)
+        derived = compile_derived(self, environment)
         when = self.condition(("spec", "when"), self.spec.when, environment)
         until = self.condition(("spec", "until"), self.spec.until, environment)
+        for field, condition in (("when", when), ("until", until)):
+            for text in () if condition is None else statistics_read(condition, derived):
+                self.problem(("spec", field), text)
         deploys = [self._deploy(index, action.name, environment) for index, action in self._actions(deploy=True)]
         actions = compile_actions(self, self._actions(deploy=False), environment)
         elements = with_signals(elements, element_of(self.spec), [each for each in signals if each is not None])
@@ -132,7 +137,7 @@ class _RuleCompiler:
             templates = [deploy.parameters for deploy in deploys if deploy]
             templates += [template for action in actions for template in action.templates.values()]
             embedded = [each.expression for template in templates for each in template.embedded]
-            subject = self._closing(subject, (when, until, *embedded))
+            subject = self._closing(subject, (when, until, *(each.of for each in derived), *embedded))
         if self.problems or subject is None or when is None:
             return None
         spec = self.spec
@@ -157,6 +162,7 @@ class _RuleCompiler:
             elements=elements,
             parameters=self.parameters,
             models=models,
+            derived=derived,
             on_sample=spec.evaluation.on_sample,
             on_demand=bool(spec.evaluation.on_demand),
             priority=spec.evaluation.priority,
@@ -170,7 +176,7 @@ class _RuleCompiler:
         if signal.rule is not None:
             return self._episode_signal(at, signal, signal.rule)
         if signal.stream is None:
-            return None  # a model's, or a plugin's
+            return None  # a model's or a plugin's, or computed from other signals
         stream = self.stream((*at, "stream"), signal.stream)
         value = self.sample((*at, "value"), signal.value, stream, Kind.DYN, element_of(self.spec))
         where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL, element_of(self.spec))
@@ -251,9 +257,11 @@ class _RuleCompiler:
             self.problem(path, f"Detector {self.detector.name} has no stream {name}; {hint}")
         return stream
 
-    def condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
-        """A boolean expression; None where there is none, or it is wrong."""
-        expression = self._expression(path, source, environment, Kind.BOOL)
+    def condition(
+        self, path: FieldPath, source: str | None, environment: Environment, kind: Kind = Kind.BOOL
+    ) -> Expression | None:
+        """An expression over what a subject is seen as; None where there is none, or it is wrong."""
+        expression = self._expression(path, source, environment, kind)
         if expression is not None:
             self._members(path, expression.paths)
         return expression

@@ -89,6 +89,11 @@ def _signal_problems(names: Iterable[str], by_name: Mapping[str, Signal]) -> Ite
             yield ("signals", position), f"{name} is computed by a model and cannot be the input of another model"
         elif signal.plugin is not None:
             yield ("signals", position), f"{name} is computed by a plugin and cannot be the input of a model"
+        elif signal.is_derived:
+            yield (
+                ("signals", position),
+                f"{name} is computed from what conditions see and cannot be the input of a model",
+            )
 
 
 def _window_problems(window: ModelWindow, by_name: Mapping[str, Signal], detector: Detector) -> Iterator[Located]:

@@ -124,7 +124,8 @@ def located(rule: EventRule, detector: Detector) -> EventRule:
 def _conditions(spec: EventRuleSpec) -> str:
     """All expressions about pairs in one text."""
     where = None if spec.scope.pairs is None else spec.scope.pairs.where
-    return f"{where} {spec.when} {spec.until} {[action.to_json() for action in spec.actions]}"
+    of = [signal.of for signal in spec.signals]
+    return f"{where} {spec.when} {spec.until} {of} {[action.to_json() for action in spec.actions]}"
 
 
 def of_conditions(rule: EventRule, known: KnownPlaces) -> Places:

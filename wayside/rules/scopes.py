@@ -29,6 +29,7 @@ from wayside.rules.variables import (
     MEMBER_OF_CLIENT,
     client_environment,
     element_of,
+    of_the_subject,
     pairs_environment,
     signal_names,
 )
@@ -163,7 +164,8 @@ def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:
     """The maps among the variables whose fields are known, and these: CEL itself does not know what is in them."""
     yield "parameters", dict.fromkeys(spec.parameters)
     if spec.scope.pairs is not None:
-        signals = (signal.name for signal in spec.signals if signal.plugin is None)
+        whole = of_the_subject(spec)
+        signals = (signal.name for signal in spec.signals if signal.name not in whole)
         member: dict[str, Any] = dict.fromkeys((*MEMBER_OF_CLIENT, *signals))
         position = spec.scope.pairs.position
         axes = ("latitude", "longitude") if position.latitude is not None else ("x", "y", "z")

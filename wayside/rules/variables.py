@@ -98,19 +98,25 @@ def element_of(spec: EventRuleSpec) -> str | None:
 
 def signal_names(spec: EventRuleSpec) -> tuple[str, ...]:
     """The signals that each client has and that expressions can name."""
-    return tuple(signal.name for signal in spec.signals if signal.plugin is None and not is_taken(signal.name))
+    whole = of_the_subject(spec)
+    return tuple(each.name for each in spec.signals if each.name not in whole and not is_taken(each.name))
+
+
+def of_the_subject(spec: EventRuleSpec) -> frozenset[str]:
+    """The signals that the rule's subject has as a whole: in a pairs scope, neither a nor b has them."""
+    return frozenset(signal.name for signal in spec.signals if signal.plugin is not None or signal.is_derived)
 
 
 def condition_environment(spec: EventRuleSpec) -> Environment:
     """For `when`, `until` and the actions of a rule."""
-    plugins = tuple(signal.name for signal in spec.signals if signal.plugin is not None and not is_taken(signal.name))
-    return _with(_scope_environment(spec), plugins) if plugins else _scope_environment(spec)
+    whole = tuple(sorted(name for name in of_the_subject(spec) if not is_taken(name)))
+    return _with(_scope_environment(spec), whole) if whole else _scope_environment(spec)
 
 
 @lru_cache(maxsize=256)
-def _with(environment: Environment, plugins: tuple[str, ...]) -> Environment:
+def _with(environment: Environment, whole: tuple[str, ...]) -> Environment:
     """And the signals that the subject has as a whole."""
-    return Environment({**environment.variables, **dict.fromkeys(plugins, Kind.DYN)})
+    return Environment({**environment.variables, **dict.fromkeys(whole, Kind.DYN)})
 
 
 def _scope_environment(spec: EventRuleSpec) -> Environment:

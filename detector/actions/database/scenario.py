@@ -138,6 +138,7 @@ def finish(
     known: dict[str, Any] = {
         "endTime": None if episode.end_time is None else Int64(episode.end_time),
         "reason": episode.reason,
+        **({} if episode.ended is None else plain({"endValues": episode.ended["data"]["values"]})),
         "clients": sorted(scenario.clients),
         "since": Int64(min((first for first, _, _ in scenario.clients.values()), default=0)),
         "until": Int64(max((last for _, last, _ in scenario.clients.values()), default=0)),

@@ -59,7 +59,8 @@ class Notify(Action[api.Notify]):
     def ended(self, episode: Episode) -> None:
         """Notify of the end."""
         with self._work.changing():
-            self._work.ended(episode, self._keeping.rendered(episode.id) or texts(episode.rendered))
+            kept = None if episode.rendered_again else self._keeping.rendered(episode.id)
+            self._work.ended(episode, kept or texts(episode.rendered))
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """Nothing more will come of it."""

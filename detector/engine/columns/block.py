@@ -12,6 +12,7 @@ import numpy as np
 
 from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.possible import Possible
+from detector.engine.columns.past import Past
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Verdict
@@ -47,14 +48,24 @@ class Track:
     """A rule for one element of its `each`."""
 
     def __init__(
-        self, rule: CompiledRule, element: CompiledElement, counters: RuleCounters, place: Mapping[str, str], row: int
+        self,
+        rule: CompiledRule,
+        element: CompiledElement,
+        counters: RuleCounters,
+        place: Mapping[str, str],
+        row: int,
+        past: Past,
     ) -> None:
-        """`place`: by condition, the text that errors add about its inputs. `row`: the track's place in its group."""
+        """`place`: by condition, the text that errors add about its inputs. `row`: the track's place in its group.
+
+        `past` has the earlier values of the rule's signals over others.
+        """
         self.rule = rule
         self.element = element
         self.counters = counters
         self.place = place
         self.row = row
+        self.past = past
         self.signals: dict[str, int] = {}
         """Places of the rule's signals in the group, by name, in the order of the rule."""
         self._subjects: dict[str, Subject] = {}
@@ -91,6 +102,8 @@ class Block:
         """Which points there are; None: all. Shape (clients, ticks)."""
         self.looked: Truths | None = None
         """Which rule looks at which client; None: all at all. Shape (tracks, clients)."""
+        self.measured: dict[tuple[int, str], Column] = {}
+        """By track and signal over the open episode, the values that it is over."""
         self.verdicts: Mapping[str, Verdict] = {}
         """By field, where conditions are true and where false; shape (tracks, points)."""
         self._context = context
@@ -133,12 +146,20 @@ class Block:
         """The rule's signals at a point, those that are known."""
         found: dict[str, Any] = {}
         for name, at in track.signals.items():
+            if at >= len(self.signals):  # over others that are just being looked at
+                continue
             column = self.signals[at]
             if column.tags is None:
                 found[name] = column.values.item(point)
             elif (value := value_at(column, point, self._context.tables.texts)) is not UNKNOWN:
                 found[name] = value
         return found
+
+    def measured_at(self, row: int, point: int) -> dict[str, Any]:
+        """What a track's signals over the open episode are over at a point, those that are known."""
+        texts = self._context.tables.texts
+        found = {name: value_at(column, point, texts) for (of, name), column in self.measured.items() if of == row}
+        return {name: value for name, value in found.items() if value is not UNKNOWN}
 
     def last(self, points: Integers) -> int:
         """Of some points the one that comes last: by tick, then by client."""

@@ -36,7 +36,7 @@ _MEMBERS = "members"
 def fits_fleet(rule: CompiledRule) -> bool:
     """Whether a rule about the fleet whose signals fit can be evaluated in columns."""
     budgeted = rule.maximum_per_hour is not None and len(rule.elements) > 1
-    return isinstance(rule.subject, FleetSubject) and not budgeted
+    return isinstance(rule.subject, FleetSubject) and not budgeted and not rule.derived
 
 
 class FleetCondition(NamedTuple):

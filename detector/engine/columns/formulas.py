@@ -14,8 +14,9 @@ from detector.engine.columns.verdicts import Verdict
 from wayside.expressions import Expression, Path, Reason
 from wayside.expressions.columns.graph import Graph
 from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.nodes import Op
 from wayside.expressions.columns.program import Program
-from wayside.expressions.columns.values import Column, Texts
+from wayside.expressions.columns.values import Column, Tag, Texts, column_of
 
 
 class Rows(NamedTuple):
@@ -86,17 +87,74 @@ class Formulas:
     def _note_unknown(
         self, field: str, rows: Rows, verdict: Verdict, foreign: Truths | None, tags: NDArray[np.uint8] | None
     ) -> None:
-        """Rows that look alike have one reason, which CEL gives for the last of them."""
         unknown = ~(verdict.true | verdict.false)
         at = np.flatnonzero(unknown if foreign is None else unknown & ~foreign)
-        if not len(at):
-            return
-        which, counts = np.arange(len(at)), np.ones(len(at), np.int64)
-        if rows.alike:
-            kinds = np.zeros((1, len(at)), np.uint8) if tags is None or not len(tags) else tags[:, at]
-            _, last, counts = np.unique(kinds[:, ::-1], axis=1, return_index=True, return_counts=True)
-            which = len(at) - 1 - last
-        for row, times in sorted(zip(at[which].tolist(), counts.tolist(), strict=True)):
-            _, why = self._conditions[field].explained(rows.variables(row))
+        _note_unknown(field, self._conditions[field], rows, at, tags)
+
+
+class Formula:
+    """An expression of any kind over rows."""
+
+    def __init__(
+        self, name: str, expression: Expression, leaf: Callable[[Path], Hashable | Constant | None], texts: Texts
+    ) -> None:
+        """Errors are about `name`."""
+        self._name, self._expression, self._texts = name, expression, texts
+        graph = Graph()
+        self._node = graph.add(expression, leaf)
+        self._is_leaf = self._node is not None and graph.nodes[self._node].op is Op.LEAF
+        self._program = Program(graph, [] if self._node is None else [self._node], texts)
+
+    def column(self, rows: Rows) -> Column:
+        """The value of each row. Counts those that are unknown."""
+        if self._node is None or not rows.size:
+            empty = Column(np.zeros(rows.size), np.zeros(rows.size, np.uint8), None)
+            return self._asked(rows, np.arange(rows.size), empty) if rows.size else empty
+        columns = [rows.column(leaf) for leaf in self._program.leaves]
+        if self._is_leaf:
+            column, tags, foreign = columns[0], columns[0].tags, None
+        else:
+            values, tags = stacked(columns, rows.size)
+            results = self._program.run(values, tags)
+            column, foreign = results.column(self._node), results.foreign(self._node)
+            tags = column.tags
+        if tags is not None:
+            unknown = (tags == Tag.ABSENT) | (tags == Tag.UNREACHABLE)
+            at = np.flatnonzero(unknown if foreign is None else unknown & ~foreign)
+            kinds = [each.tags if each.tags is not None else np.ones(rows.size, np.uint8) for each in columns]
+            _note_unknown(self._name, self._expression, rows, at, np.stack(kinds) if kinds else None)
+        return column if foreign is None else self._asked(rows, np.flatnonzero(foreign), column)
+
+    def _asked(self, rows: Rows, at: NDArray[np.intp], column: Column) -> Column:
+        """The column with what CEL gives for some rows."""
+        found: list[object] = []
+        for row in at.tolist():
+            value, why = self._expression.explained(rows.variables(row))
+            found.append(value)
             if why is not None:
-                rows.note(field, row, *why, times)
+                rows.note(self._name, row, *why, 1)
+        own = column_of(found, self._texts)
+        values, others = column.values.copy(), column.others
+        tags = np.full(rows.size, Tag.NUMBER, np.uint8) if column.tags is None else column.tags.copy()
+        values[at], tags[at] = own.values, Tag.NUMBER if own.tags is None else own.tags
+        if own.others is not None:
+            others = np.full(rows.size, None, object) if others is None else others.copy()
+            others[at] = own.others
+        return Column(values, tags, others)
+
+
+def _note_unknown(
+    field: str, expression: Expression, rows: Rows, at: NDArray[np.intp], tags: NDArray[np.uint8] | None
+) -> None:
+    """Rows that look alike have one reason, which CEL gives for the last of them; `tags` are those of the leaves."""
+    if not len(at):
+        return
+    which, counts = np.arange(len(at)), np.ones(len(at), np.int64)
+    if rows.alike:
+        kinds = np.zeros((1, len(at)), np.uint8) if tags is None or not len(tags) else tags[:, at]
+        _, last, counts = np.unique(kinds[:, ::-1], axis=1, return_index=True, return_counts=True)
+        which = len(at) - 1 - last
+    for row, times in sorted(zip(at[which].tolist(), counts.tolist(), strict=True)):
+        _, why = expression.explained(rows.variables(row))
+        if why is not None:
+            rows.note(field, row, *why, times)

@@ -9,6 +9,7 @@ import numpy as np
 from detector.engine.buffering.clients import Clients
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.conditions import Conditions
+from detector.engine.columns.derived import ClientDerived
 from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Truths
 from detector.engine.columns.tables import Tables
@@ -60,6 +61,8 @@ class ClientGroup:
         self.tracks = tracks
         self._context = context
         self._signals = SignalColumns(context, tracks)
+        derived = [track for track in tracks if track.rule.derived]
+        self._derived = ClientDerived(context, derived, self._signals.count) if derived else None
         self._conditions = Conditions(context, tracks, _conditions)
         if any("streams" in names_of(track.rule) for track in tracks):
             self._signals.watch_all_streams()
@@ -76,6 +79,8 @@ class ClientGroup:
         block.present = present(block, self._context.clients)
         block.looked = None if looked is None or looked.all() else looked
         self._signals.look(block, floor)
+        if self._derived is not None:
+            self._derived.look(block)
         for row, track in enumerate(self.tracks):
             points = block.points(row)
             track.counters.evaluations += len(clients) * len(ticks) if points is None else int(points.sum())
@@ -125,10 +130,11 @@ def present(block: Block, clients: Clients) -> Truths | None:
 
 
 def names_of(rule: CompiledRule) -> frozenset[str]:
-    """The variables that a rule's conditions and the templates of its actions read."""
+    """The variables that a rule's conditions, signals over others and the templates of its actions read."""
     templates = [
         *(deploy.parameters for deploy in rule.deploys),
         *(template for action in rule.actions for template in action.templates.values()),
     ]
-    found = {name for each in _conditions(rule).values() for name in each.names}
+    conditions = [*_conditions(rule).values(), *(each.of for each in rule.derived if each.of is not None)]
+    found = {name for each in conditions for name in each.names}
     return frozenset(found.union(*(template.names for template in templates)))

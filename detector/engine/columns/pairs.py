@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.derived import DerivedColumns
 from detector.engine.columns.formulas import Formulas, Rows
 from detector.engine.columns.leaves import ClientLeaves
 from detector.engine.columns.nearby import Crowd, Nearby, nearby
+from detector.engine.columns.past import Evaluations
 from detector.engine.columns.places import Places, Whereabouts
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
@@ -21,9 +23,9 @@ from detector.engine.columns.verdicts import Codes, Verdict, observed
 from detector.engine.episodes.subjects import Subject
 from detector.engine.scoping.positions import described
 from detector.engine.scoping.scopes import CLOSING_NS
-from wayside.expressions import Path, Reason
+from wayside.expressions import UNKNOWN, Expression, Path, Reason
 from wayside.expressions.columns.lowering import Constant
-from wayside.expressions.columns.values import Column, Doubles, Tag
+from wayside.expressions.columns.values import Column, Doubles, Tag, value_at
 from wayside.rules import CompiledRule, PairSubject
 
 _ROLES = ("a", "b")
@@ -62,6 +64,10 @@ class PairBlock:
     closing_known: Truths | None = None
     codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint8))
     """Of each pair its observation (see SubjectState.run)."""
+    derived: dict[str, Column] = field(default_factory=dict)
+    """Of each pair, the signals over what conditions see."""
+    measured: dict[str, Column] = field(default_factory=dict)
+    """By signal over the open episode, the values that it is over."""
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     """By field, where conditions are true and where false."""
 
@@ -82,6 +88,7 @@ class PairColumns:
         self._reads_streams = bool(rule.signals) or _reads_streams(rule)
         self._where_abouts = Whereabouts(rule.subject.position, context, track.counters, self._signals.ages)
         self._leaves = ClientLeaves(context, [track])
+        self._derived_names = frozenset(signal.name for signal in rule.derived if not signal.episode)
         texts = context.tables.texts
         self._roles = {
             role: Formulas({"where": where}, lambda path: self._leaves.leaf(track, path), texts)
@@ -89,6 +96,9 @@ class PairColumns:
         }
         conditions = {"where": rule.subject.where, "when": rule.when, "until": rule.until}
         self._conditions = Formulas(conditions, self._leaf, texts)
+        self._derived = DerivedColumns(track, self._leaf, context) if rule.derived else None
+        self._numbers: tuple[Sequence[str], int, Integers] = ((), -1, np.zeros(0, np.int64))
+        """Clients, the version of their numbers for signals over others, and these."""
 
     def evaluate(self, block: Block, floor: int | None, more: tuple[Integers, Integers]) -> PairBlock:
         """Look at the pairs within reach and at `more`, at the block's only tick; its clients are in order.
@@ -122,8 +132,31 @@ class PairColumns:
         if self._subject.closing_speed:
             self._measure_closing(these, newest, floor)
         self._track.counters.evaluations += len(first)
+        if self._derived is not None:
+            self._derive(these, self._derived)
         these.codes = self._observed(these, is_near, roles)
         return these
+
+    def _derive(self, these: PairBlock, derived: DerivedColumns) -> None:
+        past, clients, tick = self._track.past, these.block.clients, these.block.ticks[0]
+        if self._numbers[0] is not clients or self._numbers[1] != past.version:
+            own = np.array([past.number(client) for client in clients], np.int64)
+            self._numbers = clients, past.version, own
+        numbers = self._numbers[2]
+        keys = past.pairs(numbers[these.first], numbers[these.second])
+        now = Evaluations(keys, np.full(len(keys), tick), tick)
+        expressions = {signal.name: signal.of for signal in self._track.rule.derived}
+        for each in derived.look(self._rows(these, expressions), now):
+            columns = these.measured if each.signal.episode else these.derived
+            columns[each.signal.name] = each.column
+
+    def measured(self, these: PairBlock, row: int) -> dict[str, Any]:
+        """What signals over the open episode are over, at one pair; those that are known."""
+        return self._known(these.measured, row)
+
+    def _known(self, columns: Mapping[str, Column], row: int) -> dict[str, Any]:
+        found = {name: value_at(column, row, self._context.tables.texts) for name, column in columns.items()}
+        return {name: value for name, value in found.items() if value is not UNKNOWN}
 
     def variables(self, these: PairBlock, row: int) -> dict[str, Any]:
         """What expressions see of a pair, as in `scopes`."""
@@ -137,6 +170,7 @@ class PairColumns:
             found["distance"] = float(these.distance[row])
         if these.closing is not None and these.closing_known is not None and these.closing_known[row]:
             found["closingSpeed"] = float(these.closing[row])
+        found.update(self._known(these.derived, row))
         return found
 
     def _member(self, these: PairBlock, index: int) -> dict[str, Any]:
@@ -204,27 +238,31 @@ class PairColumns:
         everybody = Verdict(np.ones(rows.size, bool), np.zeros(rows.size, bool))
         return self._roles[role].evaluate(rows).get("where", everybody)
 
-    def _observed(self, these: PairBlock, near: Truths, roles: Mapping[str, Verdict]) -> Codes:
-        conditions = {"where": self._subject.where, "when": self._track.rule.when, "until": self._track.rule.until}
+    def _rows(self, these: PairBlock, expressions: Mapping[str, Expression | None]) -> Rows:
+        """The pairs; `expressions` are those that are evaluated over them, by what errors call them."""
 
         def note(field: str, row: int, reason: Reason, message: str, times: int) -> None:
             a, b = self._names(these, row)
             if reason is Reason.ABSENT and self._context.possible.limited:
                 never = {("a", name) for name in self._never(a)} | {("b", name) for name in self._never(b)}
-                condition = conditions[field]
-                if condition is not None and any(path[:2] in never for path in condition.paths):
+                expression = expressions[field]
+                if expression is not None and any(path[:2] in never for path in expression.paths):
                     return
             text = Subject((a, b), self._track.element.name).text
             place = f"{field} of {text}{self._track.place.get(field, '')}"
             self._track.counters.note(reason, message, place, times)
 
-        rows = Rows(
+        return Rows(
             len(these.first),
             lambda leaf: self._pair_column(these, leaf),
             lambda row: self.variables(these, row),
             note,
             not self._context.possible.limited,
         )
+
+    def _observed(self, these: PairBlock, near: Truths, roles: Mapping[str, Verdict]) -> Codes:
+        conditions = {"where": self._subject.where, "when": self._track.rule.when, "until": self._track.rule.until}
+        rows = self._rows(these, conditions)
         found = these.verdicts = self._conditions.evaluate(rows)
         when = found["when"]
         until = found.get("until", Verdict(when.false, when.true))
@@ -255,6 +293,8 @@ class PairColumns:
             return constant(self._track.element.variables, path)
         if name in ("distance", "closingSpeed"):
             return None if below else (name,)
+        if name in self._derived_names:
+            return None if below else ("derived", name)
         if name == "parameters":
             return constant({"parameters": self._track.rule.parameters.own}, path)
         if name not in _ROLES or not below:
@@ -271,6 +311,8 @@ class PairColumns:
             assert these.closing is not None  # noqa: S101  an expression needs it
             assert these.closing_known is not None  # noqa: S101
             return _where(these.closing, these.closing_known)
+        if leaf[0] == "derived":
+            return these.derived[leaf[1]]
         at = these.first if leaf[0] == "a" else these.second
         if leaf[1] == "position":
             places = these.places.of(at)
@@ -296,6 +338,7 @@ def _reads_streams(rule: CompiledRule) -> bool:
     assert isinstance(subject, PairSubject)  # noqa: S101  the rule fits
     roles = {path for each in (subject.a, subject.b) if each is not None for path in each.paths}
     read = {path for each in (subject.where, rule.when, rule.until) if each is not None for path in each.paths}
+    read |= {path for each in rule.derived if each.of is not None for path in each.of.paths}
     read |= {path for deploy in rule.deploys for path in deploy.parameters.paths}
     read |= {path for action in rule.actions for template in action.templates.values() for path in template.paths}
     return any(path[0] == "streams" for path in roles) or any(

@@ -66,6 +66,11 @@ class SignalColumns:
         self._nested = _nested(self._keys)
         """The signals that differ in the length of their windows alone, from the shortest on."""
 
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._users)
+
     def watch_all_streams(self) -> None:
         """Know of every stream whether it is fresh: some rule reads it."""
         self._all_streams = True

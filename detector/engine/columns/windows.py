@@ -24,7 +24,11 @@ Tags = NDArray[np.uint8]
 
 EXTREMES: Final = frozenset({Aggregate.MIN, Aggregate.MAX})
 
-_ONE_BY_ONE: Final = frozenset({Aggregate.RATE, Aggregate.STD_DEV, Aggregate.QUANTILE, Aggregate.SLOPE})
+_ONE_BY_ONE: Final = frozenset(
+    {
+        Aggregate.RATE, Aggregate.STD_DEV, Aggregate.QUANTILE, Aggregate.SLOPE, Aggregate.MIN_TIME, Aggregate.MAX_TIME,
+    }
+)  # fmt: skip
 """Aggregates of numbers that are computed for each range by itself."""
 
 _HUGE = 1e290
@@ -270,7 +274,7 @@ def _sums(values: Numbers, low: Integers, high: Integers) -> Numbers | None:
 NUMERIC: Final = frozenset(
     {
         Aggregate.MIN, Aggregate.MAX, Aggregate.MEAN, Aggregate.SUM, Aggregate.RATE, Aggregate.DELTA, Aggregate.STD_DEV,
-        Aggregate.QUANTILE, Aggregate.SLOPE,
+        Aggregate.QUANTILE, Aggregate.SLOPE, Aggregate.MIN_TIME, Aggregate.MAX_TIME,
     }
 )  # fmt: skip
 """The aggregates that take numbers only."""

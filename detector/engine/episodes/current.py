@@ -13,6 +13,7 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.rendering import Rendered, render
+from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject
 from wayside.expressions import InterpolationError
 from wayside.rules import CompiledDeploy, CompiledRule
@@ -43,6 +44,8 @@ class Episode:
     """By action; an action whose parameters cannot be rendered yet has none."""
     outdated: set[str] = field(default_factory=set)
     """Actions that changed since: their demands hold until they can be rendered again."""
+    statistics: Statistics | None = None
+    """None where the rule has no signals over the episode."""
 
     def started(self, rule: CompiledRule, identity: Identity) -> Event:
         """The event of its start, with what is rendered for the rule's actions as they are now."""
@@ -50,16 +53,33 @@ class Episode:
         return self._event(rule, identity, None, None, self.values, rendered)
 
     def ended(
-        self, rule: CompiledRule, identity: Identity, now: int, reason: Reason, values: Mapping[str, Any]
+        self,
+        rule: CompiledRule,
+        identity: Identity,
+        now: int,
+        reason: Reason,
+        values: Mapping[str, Any],
+        variables: Mapping[str, Any],
     ) -> Event:
-        """The event of its end; `values` are those of the last evaluation."""
-        return self._event(rule, identity, now, reason, values, {})
+        """The event of its end; `values` and `variables` are those of the last evaluation.
+
+        Templates that read statistics of the episode are rendered again.
+        """
+        names = {signal.name for signal in rule.derived if signal.episode}
+        reading = [
+            action
+            for action in rule.actions
+            if names and any(names & template.names for template in action.templates.values())
+        ]
+        seen = {**(self.variables or {}), **variables}
+        return self._event(rule, identity, now, reason, values, {each.name: render(each, seen) for each in reading})
 
     def kept(self, rule: CompiledRule) -> OpenEpisode:
         """As it is kept beyond a restart."""
         return OpenEpisode(
-            rule.name, self.subject, self.id, self.onset, self.start, self.values, rule.classification, rule.digest
-        )
+            rule.name, self.subject, self.id, self.onset, self.start, self.values, rule.classification, rule.digest,
+            None if self.statistics is None else self.statistics.to_document(),
+        )  # fmt: skip
 
     def is_complete(self, rule: CompiledRule) -> bool:
         """Whether all demands are up to date with the rule."""

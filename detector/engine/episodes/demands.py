@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 from detector.engine.episodes.identifiers import identifier
 from detector.engine.episodes.plain import plain
@@ -69,6 +70,14 @@ class Demand:
         """The name of the task: the same demand always has the same one. At most 63 characters."""
         parts = (self.holder, self.rule, self.action, self.subject, str(self.start_time))
         return f"{self.rule[:46]}-{_digest(*parts)}"
+
+
+class DemandChange(NamedTuple):
+    """A demand began or changed (end None), or ended; nanoseconds since the epoch."""
+
+    time: int
+    demand: Demand
+    end: int | None
 
 
 def holder_label(holder: str) -> str:

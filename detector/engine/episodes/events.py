@@ -41,7 +41,8 @@ class Event(msgspec.Struct, frozen=True):
     """No action of the rule runs."""
 
     rendered: Mapping[str, Rendered] = msgspec.field(default_factory=dict)
-    """Of a start: what is rendered for the actions, by their names. It is for them alone."""
+    """What is rendered for the actions, by their names: at the start, and at the end what reads statistics of the
+    episode. It is for them alone."""
 
     traceparent: str | None = None
     """Where the episode stands in a trace; None where traces are off. The engine knows nothing of it."""

@@ -31,6 +31,8 @@ class OpenEpisode:
     classification: Mapping[str, JsonValue] | None
     rule_digest: str
     """Of the rule's semantics under which it started."""
+    statistics: Mapping[str, Any] | None = None
+    """What its signals over the episode are so far, see `Statistics.to_document`; None: it has none, or lost them."""
 
     def to_document(self) -> dict[str, Any]:
         """The episode as JSON carries it."""
@@ -43,6 +45,7 @@ class OpenEpisode:
             "values": plain(self.values),
             **({} if self.classification is None else {"classification": dict(self.classification)}),
             "ruleDigest": self.rule_digest,
+            **({} if self.statistics is None else {"statistics": self.statistics}),
         }
 
 
@@ -59,6 +62,9 @@ def from_document(document: Mapping[str, Any]) -> OpenEpisode:
     values, classification = document.get("values"), document.get("classification")
     if not isinstance(values, dict) or not isinstance(classification, dict | None):
         raise ValueError("an episode's values must be a map, and so its classification where it has one")
+    statistics = document.get("statistics")
+    if not isinstance(statistics, dict | None):
+        raise ValueError("an episode's statistics must be a map, where it has any")
     return OpenEpisode(
         rule=document["rule"],
         subject=Subject(*parse_subject(document["subject"])),
@@ -68,6 +74,7 @@ def from_document(document: Mapping[str, Any]) -> OpenEpisode:
         values=values,
         classification=classification,
         rule_digest=document["ruleDigest"],
+        statistics=statistics,
     )
 
 

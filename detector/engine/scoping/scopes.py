@@ -16,7 +16,7 @@ from detector.engine.scoping.positions import Place, Positions, described, dista
 from detector.engine.signals.models import add_models
 from detector.engine.signals.signals import Signals
 from detector.engine.timing.schedule import Only
-from wayside.expressions import UNKNOWN, Expression, Path, Reason
+from wayside.expressions import UNKNOWN, Expression, Path, Reason, Unknown, Value
 from wayside.rules import ClientSubject, CompiledElement, CompiledRule, CompiledSignal, FleetSubject, PairSubject
 
 _NONE: frozenset[Path] = frozenset()
@@ -37,6 +37,19 @@ class Candidate(NamedTuple):
     """Whether an episode may start; unknown for a pair of which one's position is."""
     never: frozenset[Path] = frozenset()
     """The beginnings of the paths to signals that its clients can never have."""
+    measured: Mapping[str, Any] = {}
+    """By signal over the open episode, the value that it takes at this evaluation; what is unknown is left out."""
+
+
+class Evaluated(NamedTuple):
+    """What the evaluation of a rule saw of one subject, after it has decided. Times are nanoseconds."""
+
+    now: int
+    candidate: Candidate
+    when: Truth
+    until: Truth
+    is_open: bool
+    onset: int | None
 
 
 class Views:
@@ -170,6 +183,14 @@ def condition(
     expression: Expression, variables: Mapping[str, Any], place: str, never: frozenset[Path], counters: RuleCounters
 ) -> Truth:
     """The truth of a condition. Counts an unknown result, unless the condition reads a signal that can never exist."""
+    value = evaluated(expression, variables, place, never, counters)
+    return value if isinstance(value, bool) else UNKNOWN
+
+
+def evaluated(
+    expression: Expression, variables: Mapping[str, Any], place: str, never: frozenset[Path], counters: RuleCounters
+) -> Value | Unknown:
+    """The value of an expression; counts an unknown result as `condition` does."""
 
     def note(reason: Reason, message: str) -> None:
         if (
@@ -179,8 +200,7 @@ def condition(
         ):
             counters.note(reason, message, place)
 
-    value = expression.evaluate_or_unknown(variables, note)
-    return value if isinstance(value, bool) else UNKNOWN
+    return expression.evaluate_or_unknown(variables, note)
 
 
 def candidates(

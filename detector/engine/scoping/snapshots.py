@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from detector.engine.scoping.scopes import Candidate
+from wayside.expressions import Expression
 from wayside.rules import CompiledRule, FleetSubject, PairSubject
 
 _PLAIN = frozenset({float, bool, str})
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 _MEMBERS = 100
 """Maximum number of members of the fleet in an event; `count` is the number of all."""
@@ -18,10 +22,21 @@ def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
     """Signals, positions, distance and closing speed, where known; of a fleet its first members and their number."""
     variables = candidate.variables
     values = _of_the_scope(rule, variables)
-    for plugin in rule.plugins:
-        if plugin.name in variables:
-            values[plugin.name] = variables[plugin.name]
+    for name in (*(plugin.name for plugin in rule.plugins), *(signal.name for signal in rule.derived)):
+        if name in variables:
+            values[name] = _without_bytes(variables[name])
     return values
+
+
+def signals_read(rule: CompiledRule, expression: Expression | None) -> str:
+    """The signals that an expression reads, with their streams, for people."""
+    steps: set[object] = set()
+    if expression is not None:
+        steps.update(step for path in expression.paths for step in path)
+        if isinstance(rule.subject, FleetSubject):  # it reads the clients' signals by names of its own for them
+            steps.update(_NAME.findall(expression.source))
+    found = [f"{each.name} of stream {each.stream}" for each in rule.signals if each.name in steps and not each.rule]
+    return f" ({', '.join(found)})" if found else ""
 
 
 def _of_the_scope(rule: CompiledRule, variables: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ numbers only. Sums and differences are exact before they are rounded once, so th
 counter of nanoseconds near 1e18 costs digits; beyond the range of a double they are infinite, as in IEEE 754.
 
 Rate and Delta are (last - first)/(time between) and last - first (see docs/rules.md). StdDev is the population's
-(divided by n, so that of one value is 0), in two passes. Slope is that of the line of least squares, per second.
+(divided by n, so that of one value is 0). Slope is that of the line of least squares, per second.
 Quantile interpolates linearly between the two values that are next to it.
 """
 
@@ -62,6 +62,16 @@ def _maximum(window: Sequence[Timed]) -> Number:
     return max(number for _, number in window) or 0.0
 
 
+def _minimum_time(window: Sequence[Timed]) -> Number:
+    """Seconds since the epoch."""
+    return min(window, key=lambda each: each[1])[0] / _SECOND
+
+
+def _maximum_time(window: Sequence[Timed]) -> Number:
+    """Of equal numbers, the time of the first."""
+    return max(window, key=lambda each: each[1])[0] / _SECOND
+
+
 def _sum(window: Sequence[Timed]) -> Number:
     """Infinite where one of the numbers is, NaN where they are infinite both ways."""
     return _over([number for _, number in window], 1)
@@ -85,33 +95,37 @@ def _over(numbers: Sequence[Number], divisor: int) -> float:
 
 
 def _deviation(window: Sequence[Timed]) -> Number:
-    numbers = [float(number) for _, number in window]
-    scale = max(map(abs, numbers))
-    if math.isinf(scale):
+    """Exact before the root is taken."""
+    if any(math.isinf(number) for _, number in window):
         return math.nan
-    if scale == 0:
-        return 0.0
-    scaled = [number / scale for number in numbers]  # so that no square overflows
-    mean = math.fsum(scaled) / len(scaled)
-    return scale * math.sqrt(math.fsum((number - mean) ** 2 for number in scaled) / len(scaled))
+    values, common = _whole(window)
+    count = len(values)
+    square = count * sum(value * value for value in values) - sum(values) ** 2
+    bits = max(0, 64 - square.bit_length() // 2)  # so that the root in whole numbers has more digits than a double
+    return _double(Fraction(math.isqrt(square << 2 * bits), common * count << bits))
 
 
 def _slope(window: Sequence[Timed]) -> Number | Unknown:
-    """Exact before it is rounded: in whole nanoseconds and whole fractions of a common denominator."""
+    """Exact before it is rounded."""
     first, count = window[0][0], len(window)
     if first == window[-1][0]:
         return UNKNOWN
     if any(math.isinf(number) for _, number in window):
         return math.nan
-    ratios = [number.as_integer_ratio() for _, number in window]
-    common = max(below for _, below in ratios)  # all are powers of two
+    values, common = _whole(window)
     times = [time - first for time, _ in window]
-    values = [above * (common // below) for above, below in ratios]
     products = sum(time * value for time, value in zip(times, values, strict=True))
     squares = sum(time * time for time in times)
     total = sum(times)
     above = _SECOND * (count * products - total * sum(values))
     return _double(Fraction(above, common * (count * squares - total * total)))
+
+
+def _whole(window: Sequence[Timed]) -> tuple[list[int], int]:
+    """The numbers as whole ones over a common denominator; none is infinite."""
+    ratios = [number.as_integer_ratio() for _, number in window]
+    common = max(below for _, below in ratios)  # all are powers of two
+    return [above * (common // below) for above, below in ratios], common
 
 
 def _quantile(window: Sequence[Timed], quantile: float) -> Number:
@@ -176,4 +190,6 @@ _CALCULATED: Final[Mapping[Aggregate, Callable[[Sequence[Timed]], Number | Unkno
     Aggregate.DELTA: _delta,
     Aggregate.STD_DEV: _deviation,
     Aggregate.SLOPE: _slope,
+    Aggregate.MIN_TIME: _minimum_time,
+    Aggregate.MAX_TIME: _maximum_time,
 }

@@ -146,7 +146,8 @@ AT_A_PAIR = (
 )
 
 _WINDOWED = (
-    "Min", "Max", "Mean", "Sum", "Count", "Rate", "Delta", "StdDev", "Quantile", "Slope", "All", "Any", "Distinct"
+    "Min", "Max", "Mean", "Sum", "Count", "Rate", "Delta", "StdDev", "Quantile", "Slope", "All", "Any", "Distinct",
+    "MinTime", "MaxTime",
 )  # fmt: skip
 _OF_A_SAMPLE = ("Last", "First", "Previous")
 
@@ -207,16 +208,40 @@ _FORMS = (
 )
 
 
+_OF_AN_EPISODE = ("Min", "Max", "MinTime", "MaxTime", "Mean", "Sum", "Count", "First", "Last", "All", "Any", "Age")
+
+
+@st.composite
+def _derived(draw: st.DrawFn, name: str, expressions: list[str]) -> dict[str, Any]:
+    """A signal over what conditions see."""
+    signal: dict[str, Any] = {"name": name, "of": draw(st.sampled_from(expressions))}
+    if draw(st.integers(0, 3)) == 0:
+        signal |= {"over": "Episode", "aggregate": draw(st.sampled_from(_OF_AN_EPISODE))}
+        if signal["aggregate"] == "Age":
+            del signal["of"]
+        return signal
+    signal["aggregate"] = draw(st.sampled_from((*_WINDOWED, *_OF_A_SAMPLE, "Last", "Any", "Max")))
+    if signal["aggregate"] == "Quantile":
+        signal["quantile"] = draw(st.sampled_from((0.0, 0.25, 0.5, 1.0)))
+    if signal["aggregate"] in _WINDOWED or draw(st.booleans()):
+        signal["over"] = draw(st.sampled_from(("500ms", "1s", "2s", "3s")))
+    if draw(st.booleans()):
+        signal["lag"] = draw(st.sampled_from(("500ms", "1s", "2s")))
+    return signal
+
+
 def _conditions(variables: list[str]) -> st.SearchStrategy[str]:
     """The distance is known to be a number, so what is said of strings and booleans would not compile."""
     simple = st.sampled_from(variables).flatmap(
-        lambda name: st.sampled_from(_FORMS[:8] if name in ("distance", "closingSpeed") else _FORMS).map(
-            lambda form: form.format(name)
-        )
+        lambda name: st.sampled_from(_FORMS[:8] if name in _NUMBERS else _FORMS).map(lambda form: form.format(name))
     )
     joined = st.builds(lambda one, by, other: f"({one}) {by} ({other})", simple, st.sampled_from(["&&", "||"]), simple)
     return st.one_of(simple, joined)
 
+
+_NUMBERS = ("distance", "closingSpeed")
+
+_OF = ("{}", "{}", "{} > 1", "{} * 2", "{} == 'x'")
 
 _POSITION = {"stream": "pose", "x": "msg.x", "y": "msg.y"}
 
@@ -266,11 +291,27 @@ def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
         spec["scope"] = scope
     if scope is not None and "pairs" in scope:
         names = [f"{role}.{name}" for name in names for role in "ab"] + ["distance", "closingSpeed"]
-    conditions = _conditions(names)
+    fleet = scope is not None and "fleet" in scope
+    expressions = (
+        [*_OF_A_FLEET, "size(members)"]
+        if fleet
+        else [form.format(each) for each in names for form in (_OF[:-1] if each in _NUMBERS else _OF)]
+    )
+    if "distance" in names:
+        expressions += ["timeToCollision(distance, closingSpeed)", "distance", "distance < 3"]
+        if scope is not None and scope["pairs"]["position"]["stream"] == "pose":
+            expressions += AT_A_PAIR
+    known = []
+    for name in ("d", "e")[: draw(st.sampled_from((0, 0, 1, 2)))]:
+        signal = draw(_derived(name, [*expressions, *(form.format(each) for each in known for form in _OF)]))
+        spec["signals"].append(signal)
+        if signal.get("over") != "Episode":
+            known.append(name)
+    conditions = _conditions([*names, *known, *known])
     if scope is not None and scope.get("pairs", {}).get("position", {}).get("stream") == "pose":
         conditions = st.one_of(conditions, conditions, st.sampled_from(AT_A_PAIR))
-    if scope is not None and "fleet" in scope:
-        conditions = st.sampled_from(_OF_A_FLEET)
+    if fleet:
+        conditions = st.one_of(st.sampled_from(_OF_A_FLEET), *([_conditions(known)] if known else []))
     if draw(st.integers(0, 4)) == 0:
         spec["each"] = {"as": "site", "of": [{"name": "n", "limit": 1.5}, {"name": "m", "limit": 0}]}
         alone = conditions

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 from detector.assembly import RuleIndex, inlets, make_engine
 from detector.engine.counters import RuleCounters
 from detector.engine.engine import NoAnswerError
-from detector.engine.evaluation import Evaluated
 from detector.engine.samples.sample import Arrival
+from detector.engine.scoping.scopes import Evaluated
 from tests.driving import SECOND, START, a_detector, a_rule, a_stream
 from wayside.api import Detector, EventRule
 
@@ -71,6 +71,17 @@ _FORMS = {
     "text": ["{} == 'D'", "{} != 'R'", "{} + 'x' == 'Dx'"],
     "list": ["size({}) > 1", "{}[0] > 1"],
 }  # fmt: skip
+
+_DERIVED: list[dict[str, Any]] = [
+    {"of": "{}"}, {"of": "{}", "lag": "300ms"}, {"of": "{}", "over": "1s", "aggregate": "Max"},
+    {"of": "{} > 2", "over": "700ms", "aggregate": "Any"}, {"of": "[{}, 2.0]", "lag": "100ms", "aggregate": "Previous"},
+    {"of": "{} > 1 ? 'a' : 'b'", "lag": "100ms", "aggregate": "First"},
+    {"of": "{}", "over": "1s", "lag": "500ms", "aggregate": "Distinct"},
+    {"of": "{}", "over": "1s", "aggregate": "Quantile", "quantile": 0.5},
+    {"of": "{}", "over": "Episode", "aggregate": "Max"}, {"of": "{} > 1", "over": "Episode", "aggregate": "All"},
+    {"of": "{}", "over": "Episode", "aggregate": "Mean"}, {"over": "Episode", "aggregate": "Age"},
+]  # fmt: skip
+"""Signals over what conditions see."""
 
 _OVER: list[tuple[dict[str, Any], str]] = [
     ({"aggregate": "Active"}, "over"), ({"aggregate": "Active"}, "!over"),
@@ -150,6 +161,28 @@ def _fleet_condition(random: Random, names: list[tuple[str, str]], each: bool) -
 
 
 def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
+    spec = _a_random_spec(random, number, kind)
+    if random.random() < 0.35:
+        _derive(random, spec, kind)
+    return a_rule(f"r{number}", **spec)
+
+
+def _derive(random: Random, spec: dict[str, Any], kind: str) -> None:
+    """Give the rule a signal over what its conditions see."""
+    signal = {"name": "d", **random.choice(_DERIVED)}
+    name = {"pairs": random.choice(["distance", "b.g0"]), "fleet": "double(size(members))"}.get(kind, "g0")
+    if "of" in signal:
+        signal["of"] = signal["of"].format(name)
+    spec["signals"].append(signal)
+    if signal.get("over") != "Episode":
+        spec["when"] = (
+            f"({spec['when']}) {random.choice(['&&', '||', '||'])} {random.choice(_FORMS['number'][:3]).format('d')}"
+        )
+    for action in spec.get("actions", []):
+        action["deploy"]["parameters"] = {**action["deploy"]["parameters"], "d": "${d}"}
+
+
+def _a_random_spec(random: Random, number: int, kind: str) -> dict[str, Any]:
     signals, names = [], []
     for at in range(random.choice([1, 1, 2])):
         what, signal = random.choice(_SIGNALS)
@@ -189,7 +222,7 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
             )
         if random.random() < 0.5:
             spec["until"] = "distance > 2"
-        return a_rule(f"r{number}", **spec)
+        return spec
     if kind == "fleet":
         spec["when"] = _fleet_condition(random, names, each)
         spec["scope"] = {"fleet": {"members": _members(random, names)}}
@@ -201,7 +234,7 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
         for field, values in (("for", ("200ms", "1s")), ("cooldown", ("500ms",)), ("unknownTimeout", ("300ms", "1s"))):
             if random.random() < 0.3:
                 spec[field] = random.choice(values)
-        return a_rule(f"r{number}", **spec)
+        return spec
     if random.random() < 0.1:
         spec["evaluation"] = random.choice([{"onSample": "s"}, {"onSample": "p"}, {"onDemand": True}])
     if random.random() < 0.3:
@@ -223,7 +256,7 @@ def a_random_rule(random: Random, number: int, kind: str) -> EventRule:
         parameters = {"x": "${g0}", "c": "${client}"}
         deploy = {"template": "t", "parameters": parameters, **random.choice([{}, {"follow": True}])}
         spec["actions"] = [{"name": "d", "deploy": deploy}]
-    return a_rule(f"r{number}", **spec)
+    return spec
 
 
 def _message(random: Random, stream: str) -> dict[str, Any]:

@@ -34,6 +34,27 @@ def problems(fields: dict[str, Fields] | None = None, **spec: Any) -> dict[str, 
         ),
         ({"signals": [SPEED | {"stream": "zzz"}]}, "spec.signals[0].stream", ["no stream zzz", "it has pose, speed"]),
         (
+            {"signals": [SPEED, {"name": "w", "of": "v > 1", "over": "9s", "lag": "2s", "aggregate": "Any"}]},
+            "spec.signals[1].lag",
+            ["over and lag reach back 11 s", "the 10s that Detector d keeps", "or raise buffer.duration"],
+        ),
+        (
+            {"signals": [{"name": "w", "of": "u"}, {"name": "u", "of": "w", "lag": "1s"}]},
+            "spec.signals[0].of",
+            ["w depends on itself", "remove one of the signals that it reads"],
+        ),
+        (
+            {"signals": [SPEED, {"name": "w", "of": "v", "over": "Episode", "aggregate": "Min"}], "until": "w < 1"},
+            "spec.until",
+            ["w is known only while an episode is open", "use it in actions"],
+        ),
+        ({"signals": [SPEED, {"name": "w", "of": "vv > 1"}]}, "spec.signals[1].of", ["`vv` is not declared"]),
+        (
+            {"scope": PAIRS, "signals": [SPEED, {"name": "w", "of": "distance"}], "when": "a.w > 1"},
+            "spec.when",
+            ["w", "a"],
+        ),
+        (
             {"signals": [SPEED, SPEED | {"name": "w", "over": "11s"}]},
             "spec.signals[1].over",
             ["11s is longer than the 10 s", "stream speed", "shorten it, or raise the stream's buffer.duration"],

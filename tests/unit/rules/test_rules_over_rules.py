@@ -196,7 +196,7 @@ def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"name": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream, rule, model and plugin"),
+        ({"name": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream, rule, model, plugin and of"),
         ({"name": "s", "rule": "r", "stream": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream"),
         ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active is for a signal with rule"),
         ({"name": "s", "rule": "r", "aggregate": "Active", "over": "1s"}, "without over and where"),

@@ -66,13 +66,16 @@ def conditions(rule: EventRule) -> Iterator[str]:
 def detecting(rule: EventRule) -> Iterator[tuple[int, Signal]]:
     """The signals that decide about episodes, with their places; not those that only actions read.
 
-    A signal decides if its name is in a condition or in the scope, or if it goes into a model that decides.
+    A signal decides if its name is in a condition or in the scope, or if it goes into a model or signal that decides.
     """
     spec = rule.spec
     names = {name for condition in conditions(rule) for name in _NAME.findall(condition)}
     for model in [signal.model for signal in spec.signals if signal.name in names]:
         if model is not None:
             names |= {name for each in model.inputs for name in each.signals}
+    of = {signal.name: set(_NAME.findall(signal.of)) for signal in spec.signals if signal.of is not None}
+    while more := {name for each in names & of.keys() for name in of[each]} - names:
+        names |= more
     return ((index, signal) for index, signal in enumerate(spec.signals) if signal.name in names)
 
 

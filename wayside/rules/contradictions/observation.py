@@ -58,7 +58,8 @@ def _observation(rule: EventRule, others: Mapping[str, EventRule], above: frozen
 
 
 def _reaches(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[str]) -> Iterator[_Reach]:
-    if any("closingSpeed" in condition for condition in conditions(rule)):
+    of = [signal.of for _, signal in detecting(rule) if signal.of is not None]
+    if any("closingSpeed" in condition for condition in (*conditions(rule), *of)):
         yield _Reach(_CLOSING_SPEED_NS, "closingSpeed")
     for index, signal in detecting(rule):
         own = _reach(f"spec.signals[{index}]", signal)
@@ -85,6 +86,9 @@ def _reach(at: str, signal: Signal) -> _Reach:
         # Of a number of samples it is not known how much time they are.
         any_time = any(window.over is None for window in windows)
         return _Reach(0, "", any_time) if longest is None else _Reach(longest.ns, f"{at}.model: {longest}", any_time)
+    if signal.lag is not None:
+        over = 0 if signal.over is None else signal.over.ns
+        return _Reach(signal.lag.ns + over, f"{at}.lag: {signal.lag}" + (f" and over: {signal.over}" if over else ""))
     if signal.aggregate is Aggregate.LAST and signal.rule is None:
         return _Reach(0, "")  # `over` limits its age; one sample is enough
     if signal.over is not None:

@@ -1,0 +1,121 @@
+"""Signals over what conditions see, in columns: expressions over the points of a block, and windows over their past."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.formulas import Formula, Rows
+from detector.engine.columns.leaves import ClientLeaves
+from detector.engine.columns.past import Evaluations
+from detector.engine.columns.table import Integers
+from wayside.expressions import Path, Reason
+from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.values import Column, Tag
+from wayside.rules import CompiledDerived
+
+
+class Derived(NamedTuple):
+    """A signal at some evaluations."""
+
+    signal: CompiledDerived
+    column: Column
+    """Of a statistic of the open episode, the values that it is over."""
+
+
+class DerivedColumns:
+    """The signals of one track over what its conditions see."""
+
+    def __init__(self, track: Track, leaf: Callable[[Path], Hashable | Constant | None], context: Context) -> None:
+        self._track = track
+        self._texts = context.tables.texts
+        self._formulas = [
+            (signal, Formula(signal.name, signal.of, leaf, self._texts))
+            for signal in track.rule.derived
+            if signal.of is not None
+        ]
+
+    def look(self, rows: Rows, now: Evaluations) -> Iterator[Derived]:
+        """Each signal at the rows, which are these evaluations. Its rows read those before it."""
+        track = self._track
+        for signal, formula in self._formulas:
+            column = formula.column(rows)
+            if not signal.episode:
+                column = track.past.window(signal, track.element.name, now, column, self._texts, track.counters)
+            yield Derived(signal, column)
+
+
+class ClientDerived:
+    """These signals of rules about clients."""
+
+    def __init__(self, context: Context, tracks: list[Track], first: int) -> None:
+        """They have the places from `first` on among the signals of a block, and the tracks know these then."""
+        self._context = context
+        for track in tracks:
+            for signal in track.rule.derived:
+                if not signal.episode:
+                    track.signals[signal.name] = first
+                    first += 1
+        self._leaves = ClientLeaves(context, tracks)
+        self._of = [(track, DerivedColumns(track, self._leaf(track), context)) for track in tracks]
+
+    def _leaf(self, track: Track) -> Callable[[Path], Hashable | Constant | None]:
+        return lambda path: self._leaves.leaf(track, path)
+
+    def look(self, block: Block) -> None:
+        """Add the signals to those of the block."""
+        for track, derived in self._of:
+            own = block.points(track.row)
+            points = np.arange(block.shape[0] * block.shape[1]) if own is None else np.flatnonzero(own)
+            clients, ticks = np.divmod(points, len(block.ticks))
+            keys = np.array([track.past.number(client) for client in block.clients], np.int64)[clients]
+            now = Evaluations(keys, block.times[ticks], block.ticks[-1])
+            for each in derived.look(self._rows(track, block, points), now):
+                column = _scattered(each.column, points, block.shape[0] * block.shape[1])
+                if each.signal.episode:
+                    block.measured[track.row, each.signal.name] = column
+                else:
+                    block.signals.append(column)
+
+    def _rows(self, track: Track, block: Block, points: Integers) -> Rows:
+        possible = self._context.possible
+        paths = {signal.name: signal.of.paths for signal in track.rule.derived if signal.of is not None}
+
+        def note(field: str, row: int, reason: Reason, message: str, times: int) -> None:
+            client = block.clients[int(points[row]) // len(block.ticks)]
+            if reason is Reason.ABSENT and possible.limited:
+                never = {signal.name for signal in track.rule.signals if not possible(signal.stream, client)}
+                if any(path[0] in never for path in paths[field]):
+                    return
+            track.counters.note(reason, message, f"signal {field} of {track.subject(client).text}", times)
+
+        def column(leaf: Hashable) -> Column:
+            whole = self._leaves.at_points(block, leaf)
+            return whole if len(points) == len(whole.values) else _picked(whole, points)
+
+        return Rows(
+            len(points), column, lambda row: block.variables(track, int(points[row])), note, not possible.limited
+        )
+
+
+def _picked(column: Column, rows: Integers) -> Column:
+    return Column(
+        column.values[rows],
+        None if column.tags is None else column.tags[rows],
+        None if column.others is None else column.others[rows],
+    )
+
+
+def _scattered(column: Column, points: Integers, size: int) -> Column:
+    """The column over all points, absent elsewhere."""
+    if len(points) == size:
+        return column
+    values, tags, others = np.zeros(size), np.zeros(size, np.uint8), None
+    values[points], tags[points] = column.values, Tag.NUMBER if column.tags is None else column.tags
+    if column.others is not None:
+        others = np.full(size, None, object)
+        others[points] = column.others
+    return Column(values, tags, others)

@@ -1,0 +1,77 @@
+"""Compiles the signals over what conditions see: signals of signals, and statistics of the open episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Protocol
+
+from wayside.api import Detector, EventRule
+from wayside.api.documents import FieldPath
+from wayside.api.eventrule import Signal
+from wayside.expressions import Environment, Expression, Kind
+from wayside.rules.compiled import CompiledDerived
+
+
+class Compiling(Protocol):
+    """The rule that is being compiled, and the receiver of its problems."""
+
+    rule: EventRule
+    detector: Detector
+
+    def condition(self, path: FieldPath, source: str | None, environment: Environment, kind: Kind) -> Expression | None:
+        """An expression over what conditions see; None where there is none, or it is wrong."""
+
+    def problem(self, path: FieldPath, message: str) -> None:
+        """Report a problem with a field."""
+
+
+def compile_derived(compiler: Compiling, environment: Environment) -> tuple[CompiledDerived, ...]:
+    """The signals over what conditions see, each after those that it reads."""
+    found: dict[str, CompiledDerived] = {}
+    places: dict[str, FieldPath] = {}
+    for index, signal in enumerate(compiler.rule.spec.signals):
+        if not signal.is_derived:
+            continue
+        at: FieldPath = ("spec", "signals", index)
+        of = compiler.condition((*at, "of"), signal.of, environment, Kind.DYN)
+        if of is None and signal.of is not None:
+            continue
+        places[signal.name] = (*at, "of")
+        found[signal.name] = _compiled(compiler, at, signal, of)
+    for name, derived in found.items():
+        for text in () if derived.of is None else statistics_read(derived.of, found.values()):
+            compiler.problem(places[name], text)
+    ordered = [*_in_order(found)]
+    for name in [name for name in found if name not in ordered]:
+        compiler.problem(places[name], f"{name} depends on itself: remove one of the signals that it reads")
+    return tuple(found[name] for name in ordered)
+
+
+def statistics_read(expression: Expression, derived: Iterable[CompiledDerived]) -> Iterator[str]:
+    """The problems of an expression, other than of an action, that reads a statistic of the open episode."""
+    for name in sorted(expression.names & {each.name for each in derived if each.episode}):
+        yield f"{name} is known only while an episode is open: use it in actions; conditions and signals cannot read it"
+
+
+def _compiled(compiler: Compiling, at: FieldPath, signal: Signal, of: Expression | None) -> CompiledDerived:
+    episode = signal.over is not None and signal.over.is_episode
+    kept = compiler.detector.spec.buffer.duration
+    lag = 0 if signal.lag is None else signal.lag.ns
+    over = kept.ns if signal.over is None or episode else signal.over.ns
+    if over + lag > kept.ns and (signal.over is not None or lag > kept.ns):
+        field = "lag" if signal.lag is not None else "over"
+        compiler.problem(
+            (*at, field),
+            f"over and lag reach back {(lag + (over if signal.over is not None else 0)) / 1e9:g} s, longer than the "
+            f"{kept} that Detector {compiler.detector.name} keeps: shorten them, or raise buffer.duration",
+        )
+    return CompiledDerived(signal.name, of, signal.aggregate, over, lag, signal.quantile, episode)
+
+
+def _in_order(derived: Mapping[str, CompiledDerived]) -> Iterator[str]:
+    """The names, each after those that it reads; without those that depend on themselves."""
+    reads = {name: each.of.names & derived.keys() if each.of else frozenset() for name, each in derived.items()}
+    done: set[str] = set()
+    while ready := [name for name in reads if name not in done and reads[name] <= done]:
+        yield from ready
+        done.update(ready)
