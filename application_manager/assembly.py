@@ -33,7 +33,7 @@ from application_manager.work.publishing import Publisher
 from application_manager.work.recorder import Recorder
 from application_manager.work.rendering import Renderings
 from application_manager.work.rulework import RuleKey, RuleWork
-from application_manager.work.sidecars import SidecarNews
+from application_manager.work.sidecars import SidecarEvents
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork
@@ -44,13 +44,15 @@ from application_manager.workers.claiming import Claiming
 from application_manager.workers.pool import Pool
 from wayside.tracing import Tracing
 
-_JUDGING_PAUSE = 0.3  # s from news of a template, rule or detector to its status: what comes together is one
+_JUDGING_PAUSE = (
+    0.3  # s from a change of a template, rule or detector to its status: changes that come together are one
+)
 _INSTANCE_WORKERS = 16
 _INSTANCE_SHARE = 6  # of these for one namespace: more requests at once make each take longer, also those of others
 _CONFIGURATION_WORKERS = 4
 _JUDGING_WORKERS = 4  # one a namespace: they mostly wait for worker processes
 _STATUS_WORKERS = 4
-_STATUS_SHARE = 2  # few: what runs goes before what is said of it
+_STATUS_SHARE = 2  # few: what runs goes before its status
 
 
 class Assembly:
@@ -58,11 +60,11 @@ class Assembly:
 
     Attributes:
         cache: the objects of the cluster.
-        book: what is known of Detectors that are run.
+        detector_index: what is known of Detectors that are run.
         recorder: posts Events.
         applier: applies manifests.
         publisher: publishes configurations.
-        router: takes news.
+        router: takes events.
         charts: renders charts.
         pool: runs users' expressions.
         detectors: the queue of Detectors that are run.
@@ -100,13 +102,13 @@ class Assembly:
         self._rules: WorkQueue[RuleKey] = WorkQueue(
             "rule", self._reconcile_rule, _JUDGING_WORKERS, self._instances, measures, share=1
         )
-        self.book = DetectorIndex(options.detectors)
+        self.detector_index = DetectorIndex(options.detectors)
         detectors = DetectorWork(
             self.cache,
             client,
-            self.book,
+            self.detector_index,
             lambda name: self._rules.add((DETECTOR, name)),
-            SidecarNews(self.cache, self.book, self.recorder),
+            SidecarEvents(self.cache, self.detector_index, self.recorder),
         )
         self._detector_work = detectors
         self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measures)
@@ -169,7 +171,7 @@ class Assembly:
             enqueue=self._instances.add,
             done=self._statuses.add,
             absent=self._absent,
-            not_made=self._status_work.tell_why_not_made,
+            not_made=self._status_work.report_not_made,
             observe=self.router.observe,
             configured=self._configurations.add,
             objects=self._renderings.objects,
@@ -198,7 +200,7 @@ class Assembly:
             statuses=statuses,
             resources=resources,
             pool=self.pool,
-            detectors=self.book,
+            detectors=self.detector_index,
         )
 
     async def close(self) -> None:
@@ -209,7 +211,7 @@ class Assembly:
 
     def _absent(self, name: Name, decision: Decision | None) -> None:
         self._renderings.forget(name)
-        self._status_work.tell(name, decision, None)
+        self._status_work.report(name, decision, None)
 
     def _claimed(self, name: Name) -> None:
         self.router.claimed(name)

@@ -38,7 +38,7 @@ app = typer.Typer(
 )
 
 EXPECTED = (InputError,)
-"""Errors of the input: said in one line, without a trace."""
+"""Errors of the input: one line each, without a trace."""
 
 AllowedKinds = Annotated[
     list[str] | None,
@@ -75,7 +75,7 @@ def _main(
     )
     for noisy in ("asyncio", "aiohttp", "kopf"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    if not debug:  # each watch tells of each attempt to come back; that the API server is away is said once, by us
+    if not debug:  # each watch logs each attempt to come back; we report once that the API server is away
         for handler in logging.getLogger().handlers:
             handler.addFilter(lambda record: not record.getMessage().startswith("Request attempt"))
 
@@ -125,7 +125,7 @@ def run(
         list[str] | None,
         typer.Option(
             help="Publish the instances' configurations on Zenoh, as a client of this endpoint, e.g. tcp/zenoh:7447 "
-            "(repeatable), or as a Zenoh configuration file says (its name ends with .json5)."
+            "(repeatable), or by a Zenoh configuration file (its name ends with .json5)."
         ),
     ] = None,
     expression_cpu_time: Annotated[
@@ -179,7 +179,7 @@ def run(
         str | None,
         typer.Option(
             metavar="UID|cluster",
-            help="As whom detectors run: a number, or `cluster` where that chooses (OpenShift). Default: 65532.",
+            help="The user of detectors: a number, or `cluster` where that chooses (OpenShift). Default: 65532.",
         ),
     ] = None,
     detector_metrics_secret: Annotated[
@@ -194,7 +194,7 @@ def run(
         typer.Option(
             min=1,
             max=65535,
-            help="Answer the API server here when it asks whether a template, rule or detector is in order, as "
+            help="Answer the API server's reviews of templates, rules and detectors here, as "
             "`application-manager webhooks` makes it do. Default: nowhere.",
         ),
     ] = None,
@@ -280,7 +280,7 @@ def render(
 
     Templates with a chart need the program helm; a chart that is not here is fetched.
 
-    What waits, is held at a bound or is refused is said on stderr; where something is refused, the exit code is 1.
+    What waits, is held at a bound or is refused is printed on stderr; where something is refused, the exit code is 1.
     """
     with importing():
         from application_manager.charts.helm import Helm
@@ -308,9 +308,9 @@ def check(
     ] = None,
     listing: Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")] = False,
 ) -> None:
-    """Say of templates, rules and detectors what the webhook would say, without a cluster.
+    """Check templates, rules and detectors as the webhook would, without a cluster.
 
-    Exits with 1 where it would refuse something; what it would warn of is said alone.
+    Exits with 1 where it would refuse something; its warnings are only printed.
     """
     with importing():
         from application_manager.commands.checking import check_files
@@ -352,12 +352,12 @@ def explain(
     namespace: Annotated[str | None, typer.Option("--namespace", "-n", help="Default: the kubeconfig's.")] = None,
     output: Annotated[Output, typer.Option("--output", "-o", help="For people or for programs.")] = Output.TEXT,
 ) -> None:
-    """Say why a task is served or not, and why an instance runs as it does: from the event to the pods."""
+    """Explain why a task is served or not, and why an instance runs as it does: from the event to the pods."""
     with importing():
         import asyncio
 
+        from application_manager.commands.explanationtext import text
         from application_manager.commands.inquiry import inquire
-        from application_manager.commands.telling import text
 
     explanation = asyncio.run(inquire(subject, namespace))
     if output is Output.JSON:

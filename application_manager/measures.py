@@ -55,11 +55,11 @@ class Measures:
         return generate_latest(self.registry)
 
     def applied(self, seconds: float) -> None:
-        """A task was applied so many seconds after its event started, by the detector's clock."""
+        """A task was applied this number of seconds after its event started, by the detector's clock."""
         self._applied.observe(max(0.0, seconds))
 
     def ready(self, seconds: float) -> None:
-        """A task was ready so many seconds after its event started, by the detector's clock."""
+        """A task was ready this number of seconds after its event started, by the detector's clock."""
         self._ready.observe(max(0.0, seconds))
 
     def refused(self, reason: str) -> None:
@@ -76,7 +76,7 @@ class Measures:
         """An event of a watch could not be handled; the next resync retries it."""
         self._failures.labels("watch").inc()
 
-    def asked(self, method: str, seconds: float, code: str) -> None:
+    def requested(self, method: str, seconds: float, code: str) -> None:
         """The API server answered with an HTTP status, or NO_ANSWER."""
         self._requests.labels(method).observe(seconds)
         if not code.startswith(("2", "3")):

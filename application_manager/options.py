@@ -20,7 +20,7 @@ from application_manager.workers.pool import CPU_TIME
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What the command line says.
+    """The options of the command line.
 
     Attributes:
         policy: what templates may create.

@@ -10,7 +10,7 @@ from functools import partial
 from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
 from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.entitlement import judge, lacking
+from application_manager.cluster.entitlement import judge, missing_rights
 from application_manager.cluster.errors import ApiError
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.cluster.starting import until_answered
@@ -54,16 +54,16 @@ async def selectable(client: Client, resources: Mapping[KindKey, Resource], name
 
 
 async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
-    """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and said.
+    """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and logged.
 
     Raises ConfigurationError where one of our own lacks, or one that is allowed is not namespaced.
     """
     found: dict[KindKey, Resource] = {}
     for version in sorted({each[0] for each in (*OWN_KINDS, POD, *policy.kinds)}):
         found |= await until_answered(partial(client.discover, version))
-    lacking = [kind_text(kind) for kind in OWN_KINDS if kind not in found]
-    if lacking:
-        raise ConfigurationError(f"the cluster has no kind {', '.join(lacking)}: run kubectl apply -f crds/")
+    missing = [kind_text(kind) for kind in OWN_KINDS if kind not in found]
+    if missing:
+        raise ConfigurationError(f"the cluster has no kind {', '.join(missing)}: run kubectl apply -f crds/")
     for kind in sorted(policy.kinds):
         if kind not in found:
             log.warning("the cluster has no kind %s: templates that use it fail", kind_text(kind))
@@ -81,9 +81,9 @@ async def entitled(
     *,
     detectors: bool = False,
 ) -> None:
-    """Look whether the account has the rights that it needs, and say what lacks.
+    """Look whether the account has the rights that it needs, and report those that are missing.
 
-    Of all namespaces it needs to read: in which ones it may write, is asked when something is to be written there.
+    Of all namespaces it needs to read: in which ones it may write, is queried when something is to be written there.
     `detectors`: whether the manager runs detectors too. Raises ConfigurationError where nothing works without.
     """
     plurals = {kind: resources[kind].plural for kind in policy.kinds if kind in resources}
@@ -92,4 +92,4 @@ async def entitled(
         (needed_there if namespaces else reading(needed_there), namespaces),
         (lease_rights(lease.name), (lease.namespace,)),
     ):
-        judge(await until_answered(partial(lacking, client, needed, where)))
+        judge(await until_answered(partial(missing_rights, client, needed, where)))

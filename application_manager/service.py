@@ -99,7 +99,7 @@ class Manager:
         self._options = options
         work = self._work = Assembly(client, options, resources, measures, traced)
         own = [resources[kind] for kind in OWN_KINDS]
-        # Pods always: those of workloads tell why they do not run.
+        # Pods always: those of workloads show why they do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
         self._listing = Listing(
             cache=work.cache,
@@ -114,7 +114,9 @@ class Manager:
         work.cache.overlap.own = self._own_lease
         self._pulse = Pulse(options.watch_timeout, lambda: work.cache.healthy.elapsed)
         measures.registry.register(self._pulse)
-        self._detector_watch = DetectorWatch(work.cache, client, work.book, options.namespaces, work.detectors.add)
+        self._detector_watch = DetectorWatch(
+            work.cache, client, work.detector_index, options.namespaces, work.detectors.add
+        )
         self._grants = Grants(client, work.router.everything)
         if not options.namespaces:
             client.may_write = self._grants.may_write
@@ -204,7 +206,7 @@ class Manager:
         log.info("stopped")
 
     async def _act(self, stop: asyncio.Event) -> None:
-        """Act while we are active, until told to stop."""
+        """Act while we are active, until `stop` is set."""
         await acting(
             self._leadership,
             self._client,
@@ -273,7 +275,7 @@ def _on_signals(stop: asyncio.Event) -> None:
 
 
 async def _until(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
-    """Do the work unless told to stop; whether it was done."""
+    """Do the work unless `stop` is set; whether it was done."""
     working = asyncio.create_task(work)
     stopping = asyncio.create_task(stop.wait())
     await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)

@@ -18,7 +18,7 @@ SILENT = 30.0
 """Seconds without a sign of life of the event loop after which it hangs, at the most."""
 
 PERSISTENT = 10.0
-"""Seconds for which a stall must be seen, so that one who stood still has time to go on."""
+"""Seconds for which a stall must be seen, so that one who stood still has time to continue."""
 
 STALLED = 70
 """The exit code of a manager that was ended: EX_SOFTWARE."""
@@ -26,11 +26,11 @@ STALLED = 70
 _STEP = 1.0  # s
 
 Stall = Callable[[], str | None]
-"""What has stalled, in words; None where nothing has. Asked by another thread, it must only read."""
+"""What has stalled, in words; None where nothing has. Another thread calls it, so it must only read."""
 
 
 def end(reason: str) -> None:
-    """End the process at once, saying why and where every thread is. No lock is asked for: its holder may hang."""
+    """End the process at once, and log the reason and where every thread is. It takes no lock: its holder may hang."""
     when = time.strftime("%Y-%m-%d %H:%M:%S")
     line = f"{when},000 CRITICAL watchdog: {reason}; this manager ends, to be started again\n"
     os.write(2, line.encode())
@@ -42,7 +42,7 @@ def end(reason: str) -> None:
 async def watchdog(
     stalled: Stall, silent: float = SILENT, *, step: float = _STEP, end: Callable[[str], None] = end
 ) -> AsyncIterator[None]:
-    """Look after the event loop that this is entered in, and after what `stalled` tells, while the block runs.
+    """Look after the event loop that this is entered in, and after what `stalled` reports, while the block runs.
 
     Args:
         stalled: what else may stall than the event loop.

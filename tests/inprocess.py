@@ -27,7 +27,7 @@ class InProcess:
 def objects(wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
     """The instance's objects, or why it has none."""
     if not isinstance(template, ApplicationTemplate):
-        return drafting.lacking(wanted, template)
+        return drafting.without_template(wanted, template)
     metadata = template.metadata
     found = RenderJob(
         f"{metadata.uid} {template.to_json()}", metadata.generation, pickle.dumps(template), Policy(), wanted

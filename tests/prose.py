@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 CLEAN = (
     "CONTRIBUTING.md",
+    "application_manager",
     "charts/wayside/files/crds",
     "crds",
     "docs/actions.md",

@@ -1,7 +1,7 @@
-"""What the API server asks before it stores a template, rule or detector, answered from what the manager knows.
+"""Reviews of what the API server is about to store: a template, rule or detector, answered from what the manager knows.
 
 The answers are the findings that also make the conditions. What a rule has only with others (its Detectors, the rules
-and templates that it names) is looked up again at the API server before it is said: a Detector that was applied a
+and templates that it names) is looked up again at the API server before it is reported: a Detector that was applied a
 moment before its rules may not have reached us yet.
 """
 
@@ -39,7 +39,7 @@ from wayside.rules import depends
 AT_ONCE = 8
 """Questions about one namespace that are answered at the same time; those beyond get no answer."""
 
-LOOKING_UP = 3.0  # s for what is asked of the API server, which waits for us meanwhile
+LOOKING_UP = 3.0  # s for requests to the API server, which waits for us meanwhile
 LOOKING_AT_RULES = 1.0  # s for the rules of a Detector that changes
 _RULES_AT_ONCE = 20  # of these in one job, so that the limit of CPU time is each some rules'
 
@@ -69,36 +69,36 @@ class Admission:
     pool: Runs
     namespaces: Collection[str] = ()
     defaults: PodDefaults | None = None
-    _asked: Counter[str] = field(default_factory=Counter)
+    _under_way: Counter[str] = field(default_factory=Counter)
 
-    async def review(self, asked: Any) -> Object:
+    async def review(self, review: Any) -> Object:
         """The answer to an AdmissionReview. Raises ReviewError where it is none."""
-        request = read(asked)
+        request = read(review)
         looked_after = not self.namespaces or request.namespace in self.namespaces
         findings = Findings()
         if request.weight is not Weight.NONE and looked_after:
             findings = await self._in_turn(request)
         response = answer(request, findings)
-        told = response["response"]
-        verdict = "refused" if not told["allowed"] else "warned" if "warnings" in told else "allowed"
+        given = response["response"]
+        verdict = "refused" if not given["allowed"] else "warned" if "warnings" in given else "allowed"
         self.measures.reviewed(request.kind, verdict)
         if verdict == "refused":
-            status = told["status"]
+            status = given["status"]
             name = status["details"]["name"]
             log.info("%s %s/%s is refused: %s", request.kind, request.namespace, name, status["message"])
         return response
 
     async def _in_turn(self, request: Request) -> Findings:
         """The findings, unless the namespace has too many questions: the others' are answered all the same."""
-        if self._asked[request.namespace] >= AT_ONCE:
+        if self._under_way[request.namespace] >= AT_ONCE:
             raise ReviewError(f"{AT_ONCE} questions of namespace {request.namespace} are being answered")
-        self._asked[request.namespace] += 1
+        self._under_way[request.namespace] += 1
         try:
             return await self._findings(request)
         finally:
-            self._asked.subtract((request.namespace,))
-            if not self._asked[request.namespace]:
-                del self._asked[request.namespace]
+            self._under_way.subtract((request.namespace,))
+            if not self._under_way[request.namespace]:
+                del self._under_way[request.namespace]
 
     async def _findings(self, request: Request) -> Findings:
         try:
@@ -160,13 +160,13 @@ class Admission:
             some = rules[first : first + _RULES_AT_ONCE]
             remarks += (await self._run(detector.namespace, DetectorJob(detector, before, some))).remarks
             if time.monotonic() > until and first + _RULES_AT_ONCE < len(rules):
-                unseen = "not all of its rules were looked at: their statuses will say whether they are in order"
+                unseen = "not all of its rules were looked at: their statuses will show whether they are in order"
                 remarks.append(Finding(BROKEN_RULE.name, unseen))
                 break
         return replace(findings, remarks=tuple(remarks))
 
     async def _pod_problem(self, detector: Detector, before: Detector | None) -> str:
-        """Why the API server would refuse the detector's Deployment; empty where it would not, or cannot be asked."""
+        """Why the API server would refuse the detector's Deployment; empty where it would not, or does not answer."""
         spec, old = detector.spec, before.spec if before is not None else None
         unchanged = old is not None and (old.mode, old.pod) == (spec.mode, spec.pod)
         if self.defaults is None or spec.mode is not DetectorMode.STANDALONE or spec.pod is None or unchanged:

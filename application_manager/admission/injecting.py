@@ -27,7 +27,7 @@ from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.measures import Measures
 from wayside.api import Detector
 
-LOOKING_UP = 3.0  # s for what is asked of the API server, which waits for us meanwhile
+LOOKING_UP = 3.0  # s for requests to the API server, which waits for us meanwhile
 
 log = logging.getLogger(__name__)
 
@@ -49,9 +49,9 @@ class Injecting:
     measures: Measures
     defaults: PodDefaults | None
 
-    async def review(self, asked: Any) -> Object:
+    async def review(self, review: Any) -> Object:
         """The answer to an AdmissionReview about a pod. Raises ReviewError where it is none."""
-        request = read_pod(asked)
+        request = read_pod(review)
         name = detector_of(request.pod.get("metadata"))
         if name is None:
             return answer_pod(request, Injection())
@@ -75,4 +75,4 @@ class Injecting:
                 for raw in (await self.client.list(self.detectors, namespace, fields=f"metadata.name={name}"))[0]:
                     self.observe(raw)
         except (ApiError, Unreachable, TimeoutError) as error:
-            log.warning("Detector %s/%s, which a pod asks for, cannot be looked up: %s", namespace, name, error)
+            log.warning("Detector %s/%s, which a pod requests, cannot be looked up: %s", namespace, name, error)

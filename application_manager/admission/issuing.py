@@ -1,6 +1,6 @@
 """The webhook's certificate where nobody else makes one: made here, kept in a Secret, and renewed in time.
 
-All managers of a release share the Secret. Whoever finds its certificate missing or due writes a new one; the
+All managers of a release share the Secret. A manager that finds its certificate missing or due writes a new one; the
 resourceVersion decides between two. The previous authority stays in `ca.crt` beside the new one, and the API server
 trusts both before any manager shows the new certificate, so no question fails while they change.
 """
@@ -77,7 +77,7 @@ class Issuing:
                 log.warning("the webhook's certificate cannot be looked at: %s", error)
 
     async def look(self) -> None:
-        """Look once: make a certificate where one is due, tell the API server whom to trust, and write the files."""
+        """Look once: make a certificate where one is due, give the API server its authority, and write the files."""
         namespace, name = self.secret
         secret = await self.client.get(_SECRETS, namespace, name)
         if secret is None:

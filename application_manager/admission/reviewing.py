@@ -1,7 +1,7 @@
 """The webhook: AdmissionReviews over HTTPS, in the manager's own event loop.
 
-Whatever goes wrong here is an answer that the API server counts as none, and with failurePolicy Ignore it goes on: the
-object is stored, and its condition says later what we could not say now. So nothing waits in a queue: where too many
+Whatever goes wrong here is an answer that the API server counts as none, and with failurePolicy Ignore the
+object is stored, and its condition reports later what the review could not. So nothing waits in a queue: where too many
 come at once, those beyond are sent away.
 """
 

@@ -1,6 +1,6 @@
 """Which task claims which instance: an index, kept up to date task by task.
 
-It saves asking every task again whenever one changes. What it holds follows from tasks and templates alone.
+It saves determining every claim again whenever a task changes. What it holds follows from tasks and templates alone.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ class ClaimIndex:
         self._file(name, task)
         if isinstance(claimed, Verdict):
             served = before is not None and template_of_all(before.instance) is None
-            if claimed.standing is Standing.FINISHED and before is not None and served:  # its status may not say so yet
+            if (
+                claimed.standing is Standing.FINISHED and before is not None and served
+            ):  # its status may not have it yet
                 claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched
@@ -92,7 +94,7 @@ class ClaimIndex:
         return touched | {instance}
 
     def _beforehand(self, entry: Entry, task: ApplicationTask) -> Verdict | None:
-        """The verdict of a task that asks for too much, whatever its template says; None where there is none."""
+        """The verdict of a task that requests too much, whatever its template; None where there is none."""
         over = finished(task)
         if over is not None:
             return over

@@ -88,7 +88,7 @@ class ClusterCache:
         served: by instance; empty until it was reconciled for the first time.
         records: by instance; ahead of its status, and empty likewise.
         deadlines: by instance, its uid and the release time last decided; ahead of its status as well, since a status
-            may be written long after what it says was decided.
+            may be written long after its decision.
         limit: how many instances a namespace may have; None: any number.
         full: whether there is no memory for further tasks.
         tasks: what limits tasks; None: nothing.
@@ -256,7 +256,7 @@ class ClusterCache:
         self._findings[template.namespace, template.name] = (_version(template), findings)
 
     def forget_work(self) -> None:
-        """Drop what was decided and done here: another manager has acted since, and the statuses say what it did."""
+        """Drop what was decided and done here: another manager has acted since, and the statuses show what it did."""
         self.served.clear()
         self.records.clear()
         self.deadlines.clear()

@@ -1,4 +1,4 @@
-"""What is known of the detectors that the manager runs: their objects as they are, and what is said of them."""
+"""What is known of the detectors that the manager runs: their objects, and whether they run."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class DetectorIndex:
     Attributes:
         defaults: what holds for all pods; None: no detector is run.
         objects: by the uid of their Detector, and by kind.
-        said: the condition Running.
-        asking: the pods that ask for it to be in them.
+        running: the condition Running.
+        requesting: the pods that request it as a sidecar.
     """
 
     defaults: PodDefaults | None = None
     objects: dict[str, dict[str, Object]] = field(default_factory=dict)
-    said: dict[Name, Aspect] = field(default_factory=dict)
-    asking: dict[Name, list[Object]] = field(default_factory=dict)
+    running: dict[Name, Aspect] = field(default_factory=dict)
+    requesting: dict[Name, list[Object]] = field(default_factory=dict)
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
 
-    def take(self, objects: Iterable[Object], pods: Iterable[Object], asking: Iterable[Object] = ()) -> None:
+    def take(self, objects: Iterable[Object], pods: Iterable[Object], requesting: Iterable[Object] = ()) -> None:
         """Take all objects, their pods, and the pods that ask for detectors, as they were listed just now."""
         self.objects = {}
         deployments: set[tuple[str, str]] = set()
@@ -48,10 +48,10 @@ class DetectorIndex:
         for pod in pods:
             if _deployment_of(pod) in deployments and (each := trouble(pod)) is not None:
                 found.setdefault(_detector_of(pod), []).append(each)
-        self.asking = {}
-        for pod in asking:
+        self.requesting = {}
+        for pod in requesting:
             metadata = pod["metadata"]
-            self.asking.setdefault((metadata["namespace"], metadata["labels"][SIDECAR_LABEL]), []).append(pod)
+            self.requesting.setdefault((metadata["namespace"], metadata["labels"][SIDECAR_LABEL]), []).append(pod)
         self._troubles = {name: summary(troubles) for name, troubles in found.items()}
 
     def owned(self, uid: str) -> dict[str, Object]:
@@ -59,7 +59,7 @@ class DetectorIndex:
         return self.objects.setdefault(uid, {})
 
     def troubles(self, name: Name) -> list[Trouble]:
-        """The different troubles of the detector's pods, the most telling first."""
+        """The different troubles of the detector's pods, the most important first."""
         return self._troubles.get(name, [])
 
 

@@ -1,4 +1,4 @@
-"""Which templates fall back to which, and whose tasks turned to whom: an index, kept up to date one by one."""
+"""Which templates fall back to which, and which tasks turned to them: an index, kept up to date one by one."""
 
 from __future__ import annotations
 

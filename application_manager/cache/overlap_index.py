@@ -72,7 +72,7 @@ class OverlapIndex:
         return len(self._yielded)
 
     def note(self, template: Name, written: TemplateManager | None, now: float) -> None:
-        """Note what a template's status says; `now` in seconds since 1970."""
+        """Note the manager in a template's status; `now` in seconds since 1970."""
         own, namespace = self.own(), template[0]
         if own is None or written is None:
             return

@@ -1,7 +1,7 @@
 """Pods that are in trouble, by the instance that they belong to: an index, kept up to date pod by pod.
 
-Pods are told by the instance's label, which the rendering puts into pod templates. Of those that run well, which are
-nearly all, nothing is kept here.
+Pods are recognised by the instance's label, which the rendering puts into pod templates. Of those that run well, which
+are nearly all, nothing is kept here.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class PodIndex:
         self._troubles: dict[Name, dict[Name, Trouble]] = {}
 
     def note(self, pod: Object) -> bool:
-        """Note a pod as it is now; whether that changes what `troubles` says of its instance."""
+        """Note a pod as it is now; whether that changes the `troubles` of its instance."""
         instance = _instance_of(pod)
         if instance is None:
             return False
@@ -33,7 +33,7 @@ class PodIndex:
         return before != self.troubles(instance)
 
     def forget(self, pod: Object) -> bool:
-        """Forget a pod that is gone; whether that changes what `troubles` says of its instance."""
+        """Forget a pod that is gone; whether that changes the `troubles` of its instance."""
         instance = _instance_of(pod)
         if instance is None:
             return False
@@ -42,7 +42,7 @@ class PodIndex:
         return before != self.troubles(instance)
 
     def troubles(self, instance: Name) -> list[Trouble]:
-        """The different troubles of an instance's pods, the most telling first."""
+        """The different troubles of an instance's pods, the most important first."""
         members = self._troubles.get(instance)
         return summary(members.values()) if members else []
 

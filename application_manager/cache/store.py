@@ -74,7 +74,7 @@ class Store:
         yield from list(self._objects.get(kind, {}).items())
 
     def put(self, raw: Object) -> Entry | None:
-        """Note an object; the new entry, or None where this version is not news."""
+        """Note an object; the new entry, or None where this version is known."""
         kind, name = kind_of(raw), name_of(raw)
         uid = raw["metadata"]["uid"]
         known = self.get(kind, name)
@@ -92,7 +92,7 @@ class Store:
         return entry
 
     def remove(self, raw: Object) -> Entry | None:
-        """Note that an object is gone; what was known of it, or None where that is not news."""
+        """Note that an object is gone; what was known of it, or None where that is known."""
         uid = raw["metadata"]["uid"]
         self._deleted[uid] = None
         if len(self._deleted) > _TOMBSTONES:

@@ -3,8 +3,8 @@
     <folder>/charts/<sha256>.tgz        an archive
     <folder>/sources/<sha256>           a source, by its hash → the digest of its archive
 
-A version of a chart is taken not to change, so a source that is known is not fetched again, also not after a restart.
-An archive whose content is not as its name says is fetched anew. What was not used for longest goes first.
+A version of a chart is assumed not to change, so a source that is known is not fetched again, also not after a restart.
+An archive whose content does not match its name is fetched again. What was not used for longest goes first.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class ChartCache:
 
 
 def default_folder() -> Path:
-    """Where charts are kept unless the command line says otherwise."""
+    """Where charts are kept unless the command line names another folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wayside" / "charts"
 
 

@@ -1,6 +1,6 @@
-"""Renderings of charts: asked for at once, done in the background, kept while they are of use.
+"""Renderings of charts: requested at once, done in the background, kept while they are of use.
 
-An instance whose chart is not rendered yet is told so, and asked again once it is: no worker ever waits for Helm.
+An instance whose chart is not rendered yet reports it, and is enqueued once it is: no worker ever waits for Helm.
 Charts stand apart from each other: each source has few runs at a time, and one that cannot be had, or that takes too
 long, is left alone for a while that doubles. So a wrong chart costs its own template, and no other.
 """
@@ -30,7 +30,7 @@ from wayside.backoff import pause_after
 
 FIRST_PAUSE = 5.0  # s after a failure, doubled with each further one
 LONGEST_PAUSE = 300.0  # s
-KEPT = 2000  # renderings; those not asked for longest are forgotten, and done again when they are
+KEPT = 2000  # renderings; those not requested for longest are forgotten, and done again when they are
 _RUNS = 6  # of helm, at a time
 _RUNS_OF_ONE = 2  # of these for one source
 
@@ -79,7 +79,7 @@ class ChartDesk:
     """Takes requests. Only the event loop's thread uses it."""
 
     def __init__(self, helm: Helm, cache: ChartCache, again: Callable[[Name, float], None]) -> None:
-        """`again` asks for an instance at a time, in seconds since 1970."""
+        """`again` enqueues an instance at a time, in seconds since 1970."""
         self._helm = helm
         self._cache = cache
         self._again = again
@@ -88,7 +88,7 @@ class ChartDesk:
         self._runs = asyncio.Semaphore(_RUNS)
 
     def outcome(self, request: ChartRequest) -> ChartOutcome | None:
-        """What came of the request; None at first, and then the instance is asked again. A failure stays until a new
+        """What came of the request; None at first, and then the instance is enqueued. A failure stays until a new
         attempt, after a pause, goes better.
         """
         known = self._renderings.setdefault(request, _Rendering())

@@ -1,8 +1,8 @@
 """The helm program, run where it can neither reach the cluster nor keep the manager waiting.
 
 Each run has a folder of its own as its home, an environment with nothing in it that leads to a cluster or to somebody's
-settings, and limits: time, memory, size of files, size of what it writes. `helm template` asks no cluster. Only a pull
-sees the proxies, certificates and registry logins that the manager's environment names.
+settings, and limits: time, memory, size of files, size of what it writes. `helm template` queries no cluster. Only a
+pull sees the proxies, certificates and registry logins that the manager's environment names.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _OF_PULLS = (
 
 
 class HelmError(Exception):
-    """Helm did not do it; the text says why. `slow`: it was stopped at a limit of time."""
+    """Helm did not do it; the text gives the reason. `slow`: it was stopped at a limit of time."""
 
     def __init__(self, message: str, *, slow: bool = False) -> None:
         super().__init__(message)
@@ -116,8 +116,8 @@ class Helm:
                 _kill(process.pid)
                 await process.wait()
         if code != 0:
-            said = errors.decode(errors="replace")
-            raise HelmError(_cleaned(said) or f"helm {arguments[0]} ended with code {code}: it may have had a limit")
+            output = errors.decode(errors="replace")
+            raise HelmError(_cleaned(output) or f"helm {arguments[0]} ended with code {code}: it may have had a limit")
         return written
 
 
@@ -168,9 +168,9 @@ def _kill(pid: int) -> None:
         os.killpg(pid, signal.SIGKILL)
 
 
-def _cleaned(said: str) -> str:
-    """What Helm says, on one line and without its own advice."""
-    lines = [line.strip() for line in said.splitlines() if line.strip() and "--debug flag" not in line]
+def _cleaned(output: str) -> str:
+    """The output of Helm, on one line and without its own advice."""
+    lines = [line.strip() for line in output.splitlines() if line.strip() and "--debug flag" not in line]
     return " ".join(line.removeprefix("Error: ") for line in lines if not line.startswith("level="))[-1500:]
 
 

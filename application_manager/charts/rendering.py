@@ -1,4 +1,4 @@
-"""One chart rendered once, and what to say where that fails."""
+"""One chart rendered once, and the message where that fails."""
 
 from __future__ import annotations
 

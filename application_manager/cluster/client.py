@@ -2,8 +2,8 @@
 
 The generated model classes are left aside: they cost more time than the requests, and a manifest is JSON anyway.
 
-What the API server did not do because it is overloaded or just starting (429, or 503 with Retry-After) is asked again
-here, after the time that it asked for; nothing else is sent meanwhile. Only an active manager writes: each write has to
+What the API server did not do because it is overloaded or just starting (429, or 503 with Retry-After) is sent again
+here, after the time that it requests; nothing else is sent meanwhile. Only an active manager writes: each write has to
 be answered within the time for which it may act, and the API server itself gives up what takes longer.
 """
 
@@ -38,7 +38,7 @@ _STRATEGIC = "application/strategic-merge-patch+json"
 _JSON = "application/json"
 _TIMEOUT = 15.0  # s for one request
 _CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
-_PATIENCE = 30.0  # s in which a request is asked again that the API server did not look at
+_PATIENCE = 30.0  # s in which a request is sent again that the API server rejected unprocessed
 _FIRST, _MOST = 10, 100  # objects of a list's first page, and of any: each may have 1.5 MB
 _PAGE_BYTES = 4 * 1024 * 1024
 _RESTARTS = 3  # of a list whose rest is not there any more
@@ -337,7 +337,7 @@ class Client:
         finally:
             if request.writes and code == NO_ANSWER:
                 self.open_until = max(self.open_until, began + seconds)
-            self._measures.asked(request.method, time.monotonic() - began, code)
+            self._measures.requested(request.method, time.monotonic() - began, code)
         if response.status >= 400:
             raise self._error(response.status, raw, response.headers.get("Retry-After"))
         return cast("bytes", raw)

@@ -19,7 +19,7 @@ _REMEDY = "set KUBECONFIG to a kubeconfig file, or run in a pod with a service a
 _BROKEN = (ConfigException, OSError, YAMLError, ValueError, TypeError, KeyError, AttributeError)
 """What the loader stumbles over in files that are no text, no YAML or of another shape: it checks little itself."""
 
-# The package says that it is typed, yet these are not.
+# The package claims to be typed, yet these are not.
 _load_kube_config: Any = load_kube_config
 _ApiClient: Any = ApiClient
 

@@ -19,18 +19,18 @@ Lack = tuple[Right, str, str | None]
 """A right, the verb of it that is not allowed, and the namespace; None: all namespaces together."""
 
 
-async def lacking(client: Client, needed: Iterable[Right], namespaces: Collection[str]) -> list[Lack]:
+async def missing_rights(client: Client, needed: Iterable[Right], namespaces: Collection[str]) -> list[Lack]:
     """What of the rights the account has not, in the namespaces; none given: in all of them together.
 
-    Raises ApiError or Unreachable where the API server does not tell.
+    Raises ApiError or Unreachable where the API server does not answer.
     """
-    asked = [(right, verb, where) for where in namespaces or (None,) for right in needed for verb in right.verbs]
-    allowed = await asyncio.gather(*(may(client, *each) for each in asked))
-    return [each for each, may in zip(asked, allowed, strict=True) if not may]
+    verbs = [(right, verb, where) for where in namespaces or (None,) for right in needed for verb in right.verbs]
+    allowed = await asyncio.gather(*(may(client, *each) for each in verbs))
+    return [each for each, may in zip(verbs, allowed, strict=True) if not may]
 
 
 def judge(lacks: Collection[Lack]) -> None:
-    """Say what is lacking, each with what does not work without it and with the remedy.
+    """Report the missing rights, each with what does not work without it and with the remedy.
 
     Raises ConfigurationError where nothing works without it.
     """

@@ -28,8 +28,8 @@ class ApiError(Exception):
 
     Attributes:
         code: the HTTP status.
-        message: what the API server said.
-        retry_after: seconds that it asked us to wait; None where it did not say.
+        message: the API server's message.
+        retry_after: seconds to wait that it requests; None where it requests none.
         causes: the reasons of the causes, such as NamespaceTerminating.
     """
 
@@ -42,7 +42,7 @@ class ApiError(Exception):
 
     @property
     def permanent(self) -> bool:
-        """Whether asking the same again is in vain: a bad request, or a manifest of the wrong types (HTTP 500)."""
+        """Whether repeating the request is in vain: a bad request, or a manifest of the wrong types (HTTP 500)."""
         if self.code >= 500:
             return _BAD_MANIFEST in self.message
         return self.code not in (401, 408, 409, 429)

@@ -1,4 +1,4 @@
-"""A look at the Events that say why a workload's pods cannot be made, where its own status does not tell it.
+"""A look at the Events about a workload whose pods cannot be made, where its own status does not give the reason.
 
 They are not watched: a cluster has many Events, and these matter only while pods are missing.
 """
@@ -12,7 +12,7 @@ from application_manager.cluster.client import EVENTS, Client, Object
 from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.health.refusals import FAILED_CREATE
 
-FORBIDDEN_FOR = 60.0  # s until it is asked again whether Events may be listed
+FORBIDDEN_FOR = 60.0  # s until Events are listed again
 _NEWEST = 50  # Events of one workload that are read; their number is bounded by the API server keeping them for an hour
 
 log = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ class FailedPodsLook:
         self._told = False
 
     async def events(self, namespace: str, uid: str) -> list[Object]:
-        """Those of the object with this uid; none where they may not be listed, or the API server does not tell."""
+        """Those of the object with this uid; none where they may not be listed, or the API server does not answer."""
         if time.monotonic() < self._forbidden_until:
             return []
         try:
@@ -38,7 +38,10 @@ class FailedPodsLook:
             if error.code == 403:
                 self._forbidden_until = time.monotonic() + FORBIDDEN_FOR
             if not self._told:
-                log.info("Events cannot be listed (%s): why a StatefulSet's pods cannot be made is not said", error)
+                log.info(
+                    "Events cannot be listed (%s): statuses lack the reason why pods of a StatefulSet cannot be made",
+                    error,
+                )
                 self._told = True
             return []
         except Unreachable:

@@ -1,10 +1,10 @@
 """The last look before a write goes out: whether this manager may still act.
 
-Between asking and sending lies the opening of a connection, and a process may be stopped for any time in between. So it
-is looked at once more where the bytes are handed to the socket, in one go with that.
+Between the first check and the sending a connection is opened, and a process may be stopped for any time. So the check
+is repeated where the bytes are handed to the socket, in one go with that.
 
 What is left are the microseconds between that look and the system call: a process that is stopped just there, for
-longer than it may act, sends this one write when it goes on. No client can exclude that. The active manager then sees
+longer than it may act, sends this one write when it continues. No client can exclude that. The active manager then sees
 what came of it, and puts it right like anything else that nobody demands.
 """
 

@@ -22,13 +22,13 @@ log = logging.getLogger(__name__)
 
 
 class Grants:
-    """Asks the API server once for each namespace, and again while the answer is no."""
+    """Queries the API server once for each namespace, and again while the answer is no."""
 
     def __init__(self, client: Client, changed: Callable[[], None]) -> None:
         """Prepare.
 
         Args:
-            client: by which the API server is asked.
+            client: for the API server.
             changed: called when the account may write in a namespace in which it was not allowed to before.
         """
         self._client = client
@@ -55,12 +55,12 @@ class Grants:
         while True:
             await asyncio.sleep(LOOK_EVERY)
             try:
-                news = [each for each in sorted(self._refused) if await self._ask(each)]
+                granted = [each for each in sorted(self._refused) if await self._ask(each)]
             except (ApiError, Unreachable):
                 continue  # that the API server does not answer, others report
-            if news:
-                log.info("granted to this manager: namespace %s", ", ".join(news))
-                self._refused.difference_update(news)
+            if granted:
+                log.info("granted to this manager: namespace %s", ", ".join(granted))
+                self._refused.difference_update(granted)
                 self._changed()
 
     async def _ask(self, namespace: str) -> bool:

@@ -1,7 +1,7 @@
 """Being the one active manager: the Lease is renewed, or looked at until it can be taken.
 
-It has a client of its own, so that no other request holds up a renewal. What may be done is told by a time, never by a
-flag: a process that stood still finds its time over before anything had a chance to tell it so.
+It has a client of its own, so that no other request holds up a renewal. A time limits what may be done, never a
+flag: a process that stood still finds its time over before anything had a chance to report it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 def steady() -> float:
-    """Seconds of a clock that no one sets, and that goes on while the machine sleeps, where there is such a clock."""
+    """Seconds of a clock that no one sets, and that runs while the machine sleeps, where there is such a clock."""
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
@@ -79,7 +79,7 @@ class Leadership:
         self._measures = measures
         self._candidate = Candidate(identity or own_identity())
         self._changed = asyncio.Event()
-        self._said = ""
+        self._logged = ""
         self._was_active = False
         self._namespace_goes = False
         self._released = False
@@ -119,7 +119,7 @@ class Leadership:
             candidate.observe(await self._client.get(LEASES, self._key.namespace, self._key.name), steady())
             sent = steady()
             if not candidate.may_take(sent):
-                self._tell()
+                self._note_role()
                 return
         draft = candidate.draft(self._key.name, self._key.namespace, time.time())
         try:
@@ -128,13 +128,13 @@ class Leadership:
         except ApiError as error:
             if error.terminating:
                 self._namespace_goes = True
-                self._say(logging.INFO, f"the namespace of the Lease {self._key} is not there, or going")
+                self._log(logging.INFO, f"the namespace of the Lease {self._key} is not there, or going")
                 return
             if error.code not in (404, 409):
                 raise
             # Somebody else was first, or has removed it.
             candidate.observe(await self._client.get(LEASES, self._key.namespace, self._key.name), steady())
-        self._tell()
+        self._note_role()
 
     async def run(self) -> None:
         """Look until cancelled."""
@@ -144,7 +144,7 @@ class Leadership:
             except (ApiError, Unreachable) as error:
                 left = self.remaining()
                 until = f"; acting for {left:.0f} s more" if left > 0 else ""
-                self._say(
+                self._log(
                     logging.WARNING, f"the Lease {self._key} cannot be looked after{until}: {error}", str(type(error))
                 )
                 pause = LOOK_EVERY
@@ -166,7 +166,7 @@ class Leadership:
                 await asyncio.wait_for(self._changed.wait(), left)
             except TimeoutError:
                 continue
-        self._tell()
+        self._note_role()
 
     async def release(self) -> None:
         """Give the Lease back, so that a standby takes it at once. Nothing may be written any more when this is called.
@@ -189,22 +189,22 @@ class Leadership:
         else:
             log.info("released the Lease %s", self._key)
 
-    def _tell(self) -> None:
-        """Say what has become of us, once for each change."""
+    def _note_role(self) -> None:
+        """Log the role, once for each change."""
         active, was_active = self.active, self._was_active
         self._was_active = active
         self._measures.active(active)
         if active:
             self._namespace_goes = False
-            self._say(logging.INFO, f"active: holds the Lease {self._key} as {self._candidate.identity}")
+            self._log(logging.INFO, f"active: holds the Lease {self._key} as {self._candidate.identity}")
         elif was_active:
             why = f"the Lease {self._key} was not renewed within {DEADLINE:g} s, or another manager has taken it"
-            self._say(logging.INFO if self._namespace_goes else logging.WARNING, f"not active any more: {why}")
+            self._log(logging.INFO if self._namespace_goes else logging.WARNING, f"not active any more: {why}")
         else:
-            self._say(logging.INFO, f"{self.role}, by the Lease {self._key}")
+            self._log(logging.INFO, f"{self.role}, by the Lease {self._key}")
         self._changed.set()
 
-    def _say(self, level: int, message: str, about: str = "") -> None:
-        if self._said != (about or message):
-            self._said = about or message
+    def _log(self, level: int, message: str, about: str = "") -> None:
+        if self._logged != (about or message):
+            self._logged = about or message
             log.log(level, "%s", message)

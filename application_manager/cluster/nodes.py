@@ -1,4 +1,4 @@
-"""A look at the cluster's nodes, where the manager's account may list them: it tells what the scheduler does not.
+"""A look at the cluster's nodes, where the account may list them: it shows what the scheduler does not report.
 
 Nodes are not watched: they matter only while an application that is bound to some of them does not become ready.
 """
@@ -15,7 +15,7 @@ from application_manager.core.health.placement import Nodes
 
 NODES = Resource("v1", "Node", "nodes", namespaced=False)
 FRESH = 2.0  # s for which an answer is used again
-FORBIDDEN_FOR = 60.0  # s until it is asked again whether nodes may be listed
+FORBIDDEN_FOR = 60.0  # s until nodes are listed again
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class NodeLook:
         self._asking = asyncio.Lock()
 
     async def labels(self) -> Nodes | None:
-        """The labels of nodes by name; None where they may not be listed, or the API server does not tell."""
+        """The labels of nodes by name; None where they may not be listed, or the API server does not answer."""
         async with self._asking:
             if time.monotonic() >= self._until:
                 self._known = await self._listed()
@@ -43,7 +43,7 @@ class NodeLook:
         except ApiError as error:
             self._until = time.monotonic() + (FORBIDDEN_FOR if error.code == 403 else FRESH)
             if not self._told:
-                log.info("nodes cannot be listed (%s): why a pod fits none is left to the scheduler to say", error)
+                log.info("nodes cannot be listed (%s): only the scheduler reports why a pod fits none", error)
                 self._told = True
             return None
         except Unreachable:

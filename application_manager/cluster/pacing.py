@@ -1,4 +1,4 @@
-"""How fast we ask: so many requests at once, few writes in one namespace, and none while the API server wants a pause.
+"""The pace of requests: a limited number at once, few writes in one namespace, none while the API server wants a pause.
 
 Namespaces take turns, and one has as many writes under way as the API server answers without a queue: a flood in one
 leaves the others both the places here and the API server's time. docs/decisions/0029 has the measurements.
@@ -49,7 +49,7 @@ class Share:
         self._since = 0.0
 
     def note(self, took: float, now: float) -> None:
-        """A write took so many seconds; `now` is on any clock that goes forward."""
+        """A write took this time, in seconds; `now` is on any clock that goes forward."""
         self._times.append(took)
         if len(self._times) < _SAMPLE:
             return
@@ -84,7 +84,7 @@ class Pacing:
         return max(0.0, self._held_until - time.monotonic())
 
     def hold(self, seconds: float) -> None:
-        """Let no request begin for so long, as the API server asked us to; a shorter wish shortens no longer one."""
+        """Let no request begin for this time, as the API server requests; a shorter time shortens no longer one."""
         self._held_until = max(self._held_until, time.monotonic() + min(seconds, LONGEST_HOLD))
 
     @asynccontextmanager

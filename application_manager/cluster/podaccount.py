@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class AccountError(Exception):
-    """The pod's account is not there, or not whole; the message names what is lacking."""
+    """The pod's account is not there, or not whole; the message names what is missing."""
 
 
 def use_pod_account(configuration: Configuration, folder: Path = FOLDER) -> None:
@@ -45,7 +45,7 @@ def use_pod_account(configuration: Configuration, folder: Path = FOLDER) -> None
     def refresh(of: Configuration) -> None:
         of.api_key["BearerToken"] = f"Bearer {token.newest()}"
 
-    settings: Any = configuration  # whose type says that there is never a hook
+    settings: Any = configuration  # whose type has no hook
     settings.refresh_api_key_hook = refresh
 
 
@@ -73,7 +73,7 @@ class _Token:
         return found
 
     def newest(self) -> str:
-        """The token, read again if it is time; the last one while the file cannot be read, which is said once."""
+        """The token, read again if it is time; the last one while the file cannot be read, which is logged once."""
         if time.monotonic() - self._read_at < _READ_EVERY:
             return self._token
         try:

@@ -1,4 +1,4 @@
-"""`application-manager check`: what admission would say of files, with file, line and column. Without a cluster."""
+"""`application-manager check`: what admission would find in files, with file, line and column. Without a cluster."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _findings(about: Kind, documents: Sequence[Document], policy: Policy) -> Fin
             detectors = [each for each in here if isinstance(each, Detector)]
             rules = [each for each in here if isinstance(each, EventRule)]
             templates = [each for each in here if isinstance(each, ApplicationTemplate)]
-            # Rules are often kept apart from all templates: without any there is nothing to be said.
+            # Rules are often kept apart from all templates: without any there is nothing to check.
             remarks = deploy_remarks(about, templates) if templates else []
             return replace(rule_findings(about, detectors, (), rules), remarks=tuple(remarks))
     return None

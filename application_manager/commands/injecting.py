@@ -80,7 +80,7 @@ class _Injector:
     refusals: list[str] = field(default_factory=list)
 
     def manifest(self, raw: Manifest) -> Manifest:
-        """The manifest with its detector, where it asks for one."""
+        """The manifest with its detector, where it requests one."""
         if raw.get("kind") == "List":
             return raw | {"items": [self.manifest(each) for each in raw.get("items") or ()]}
         path = _TEMPLATES.get(str(raw.get("kind")))
@@ -138,7 +138,7 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
 
 
 def _wanted(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:
-    """The namespaces and names of the Detectors that the manifest asks for and does not have."""
+    """The namespaces and names of the Detectors that the manifest requests and does not have."""
     if raw.get("kind") == "List":
         for each in raw.get("items") or ():
             yield from _wanted(each, default)

@@ -23,7 +23,7 @@ from wayside.leases import lease_name
 
 Model = TypeVar("Model", bound=Kind)
 
-_contexts: Any = list_kube_config_contexts  # the package says that it is typed, yet this function is not
+_contexts: Any = list_kube_config_contexts  # the package claims to be typed, yet this function is not
 
 _TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
 _INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
@@ -35,7 +35,7 @@ _INSTANCE_WORDS = frozenset({"instance", "appinst", "applicationinstance", "appl
 
 
 class InquiryError(InputError):
-    """What was asked about cannot be explained; the message is one line, with the remedy."""
+    """The object cannot be explained; the message is one line, with the remedy."""
 
 
 async def inquire(subject: str, namespace: str | None) -> Explanation:
@@ -46,14 +46,14 @@ async def inquire(subject: str, namespace: str | None) -> Explanation:
         namespace: None for the kubeconfig's, else `default`.
 
     Raises:
-        InquiryError: there is no such thing, or the API server refuses to tell.
+        InquiryError: there is no such object, or the API server refuses to return it.
         ConfigurationError: there is no cluster.
     """
     client = Client(await load_configuration())
     try:
         return await _inquire(client, subject, namespace or _namespace_of_context())
     except (ApiError, Unreachable) as error:
-        raise InquiryError(f"the API server does not tell: {error}") from error
+        raise InquiryError(f"the API server does not answer: {error}") from error
     finally:
         await client.close()
 
@@ -76,7 +76,7 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
         what = kind or "ApplicationTask or ApplicationInstance"
         raise InquiryError(
             f"there is no {what} {name!r} in namespace {namespace}: `kubectl get apptask,appinst -n {namespace}` lists "
-            "those that there are, and -n says another namespace"
+            "those that there are, and -n names another namespace"
         )
     if task is not None and existing is not None:
         raise InquiryError(f"{name} is a task and an instance: write task/{name} or instance/{name}")
@@ -110,7 +110,7 @@ async def _read(
     kind: str = "",
     words: frozenset[str] = frozenset(),
 ) -> Model | None:
-    """The object, or None where there is none or another kind was asked for."""
+    """The object, or None where there is none or another kind was requested."""
     if kind and kind.lower() not in words:
         return None
     raw = await client.get(resource, namespace, name)
@@ -124,7 +124,7 @@ async def _read(
 
 
 async def _list(client: Client, resource: Resource, model: type[Model], namespace: str) -> Sequence[Model]:
-    """All of the namespace: who has a place under a limit, and who stands in for whom, hangs on the others too."""
+    """All of the namespace: places under a limit, and fallbacks, depend on the others too."""
     raws, _ = await client.list(resource, namespace)
     parsed = [_parsed(each) for each in raws]
     return [each for each in parsed if isinstance(each, model)]
@@ -151,4 +151,4 @@ def _parsed(raw: Object) -> Kind | None:
     try:
         return parse_object(raw)
     except ValueError:
-        return None  # older than its CRD: it claims nothing, as its status says
+        return None  # older than its CRD: it claims nothing, as its status shows

@@ -1,4 +1,4 @@
-"""What options say, read and checked: each names its option where it is wrong (typer.BadParameter).
+"""Options, read and checked: each names its option where it is wrong (typer.BadParameter).
 
 What is read into is imported when it is read, as all that a command runs.
 """

@@ -144,8 +144,8 @@ def inject(
     """Print the manifests with the detectors in them that their pods ask for by the label wayside.dev/detector.
 
     Pods, and what makes pods, e.g. a Deployment. The Detectors come from the files, else from the cluster of the
-    current kubeconfig. What asks for none, or has it already, is printed unchanged. If a pod cannot
-    have its detector, an error says why, the pod is printed unchanged, and the exit code is 1.
+    current kubeconfig. What requests none, or has it already, is printed unchanged. If a pod cannot
+    have its detector, an error gives the reason, the pod is printed unchanged, and the exit code is 1.
     """
     with importing():
         from application_manager.commands.injecting import print_injected

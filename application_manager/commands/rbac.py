@@ -127,6 +127,6 @@ async def _asked(kinds: list[KindKey]) -> dict[KindKey, str]:
             found[kind] = resource.plural
         return found
     except (ApiError, Unreachable) as error:
-        raise ConfigurationError(f"the cluster does not say what roles call {listed}: {error}: {remedy}") from error
+        raise ConfigurationError(f"the cluster does not know what roles call {listed}: {error}: {remedy}") from error
     finally:
         await client.close()

@@ -53,7 +53,7 @@ def print_webhooks(
 
 def _authority(given: Path | None, folder: Path | None, place: Place) -> bytes | None:
     if folder is not None:
-        from application_manager.admission.authority import make_certificates  # noqa: PLC0415  hardly ever asked for
+        from application_manager.admission.authority import make_certificates  # noqa: PLC0415  hardly ever needed
 
         return make_certificates(folder, place.hosts)
     if given is None:

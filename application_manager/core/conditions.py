@@ -13,7 +13,7 @@ MAXIMUM_MESSAGE = 4096  # characters, as the CRDs allow
 
 @dataclass(frozen=True, slots=True)
 class Aspect:
-    """What a condition should say now."""
+    """What a condition should be now."""
 
     type: str
     holds: bool
@@ -34,7 +34,7 @@ def updated(
     *,
     only_while: Iterable[str] = (),
 ) -> tuple[Condition, ...]:
-    """The conditions that say what the aspects say; one keeps its time of transition while its status stays.
+    """The conditions that the aspects make; one keeps its time of transition while its status stays.
 
     Conditions of other types are kept, but for those of the types `only_while`. `now` is in seconds since 1970.
     """

@@ -21,16 +21,16 @@ FOLDER_OPTION = "--metrics-certificates"
 STALLED_AFTER = 300.0
 """Seconds without the end of a resync, at the least, after which the manager counts as stalled."""
 
-_RESYNCS = 3  # and so many times the time between two
+_RESYNCS = 3  # and this multiple of the time between two
 
 Lack = Callable[[], str | None]
-"""What is lacking, in words; None where nothing is."""
+"""What is missing, in words; None where nothing is."""
 
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class Queue(Protocol):
-    """What tells of a worker that is at one key for too long."""
+    """What reports a worker that is at one key for too long."""
 
     def stuck(self, limit: float) -> str | None:
         """The key and for how long, in words."""
@@ -70,7 +70,7 @@ async def pages(
 ) -> AsyncIterator[int | None]:
     """Serve on all addresses while the block runs; the port, None where none is wanted. Port 0 takes a free one.
 
-    `role` is what /readyz says beside "ok", if anything: a standby is ready as well.
+    `role` is what /readyz has beside "ok", if anything: a standby is ready as well.
 
     `certificates`: the folder with tls.crt and tls.key, which may change; None: without TLS.
 
@@ -116,5 +116,5 @@ def _answer(text: bytes, status: int = 200) -> web.Response:
 
 
 def _judged(lack: str | None, role: str = "") -> web.Response:
-    said = lack or ", ".join(filter(None, ("ok", role)))
-    return _answer(f"{said}\n".encode(), 200 if lack is None else 503)
+    answer = lack or ", ".join(filter(None, ("ok", role)))
+    return _answer(f"{answer}\n".encode(), 200 if lack is None else 503)

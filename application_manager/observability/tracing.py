@@ -1,4 +1,4 @@
-"""The spans of what is done for tasks, where traces are on (see `wayside.tracing`), and the task bears its trace.
+"""The spans of what is done for tasks, where traces are on (see `wayside.tracing`), and the task has a trace.
 
 A task that an instance serves for the first time gets `reconcile`, with `apply` in it, and `ready` once its workloads
 are. Each is in the task's own trace; where an instance serves several tasks, `reconcile` is linked to the others.
@@ -45,16 +45,16 @@ class _Known:
 
 
 class TaskTraces:
-    """Tells the spans of tasks. Only the event loop's thread."""
+    """Emits the spans of tasks. Only the event loop's thread."""
 
-    def __init__(self, told: Tracing, cache: ClusterCache) -> None:
-        self.tracing = told
+    def __init__(self, tracing: Tracing, cache: ClusterCache) -> None:
+        self.tracing = tracing
         self._cache = cache
         self._known: OrderedDict[str, _Known] = OrderedDict()
         self._said = False
 
     async def reconciling(self, name: Name, work: Callable[[Name], Awaitable[None]]) -> None:
-        """Do the work on an instance, and tell what it did for tasks."""
+        """Do the work on an instance, and emit what it did for tasks."""
         began, before = time.time_ns(), self._cache.records.get(name)
         try:
             await work(name)
@@ -63,8 +63,8 @@ class TaskTraces:
             if record is not None and record is not before and not record.decision.withheld:
                 self._reconciled(name, began, record)
 
-    def told(self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus) -> None:
-        """A task's status was written: tell what came of it."""
+    def status_written(self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus) -> None:
+        """A task's status was written: emit what came of it."""
         context = _context(task)
         if context is None:
             return
@@ -91,7 +91,7 @@ class TaskTraces:
     ) -> None:
         """The task's demand is over: emit a failed `ready` if an instance served it and was never ready for it.
 
-        A task may end before its status says anything of an instance; then `reconcile` alone shows that one served it.
+        A task may end before its status names an instance; then `reconcile` alone shows that one served it.
         """
         known = self._known.get(task.metadata.uid)
         applied, ready = find(old.conditions, "Applied"), find(old.conditions, "Ready")
@@ -124,7 +124,7 @@ class TaskTraces:
         ended: int,
         record: Record,
     ) -> None:
-        """Tell `reconcile` and `apply` of a task, unless it was applied before, or this failure was told."""
+        """Emit `reconcile` and `apply` of a task, unless it was applied before, or this failure was emitted."""
         if task.status is not None and task.status.applied_time is not None:
             return
         known = self._remembered(task.metadata.uid)
@@ -183,19 +183,19 @@ class TaskTraces:
 class LostSpans(Collector):
     """Spans that nobody got, as a Prometheus metric."""
 
-    def __init__(self, told: Tracing) -> None:
-        self._told = told
+    def __init__(self, tracing: Tracing) -> None:
+        self._tracing = tracing
 
     def collect(self) -> Iterator[Metric]:
         """The metric as of now."""
         family = CounterMetricFamily(f"{PREFIX}spans_dropped", "Spans that nobody got", labels=("cause",))
-        family.add_metric(("full",), self._told.dropped)
-        family.add_metric(("failed",), self._told.failed)
+        family.add_metric(("full",), self._tracing.dropped)
+        family.add_metric(("failed",), self._tracing.failed)
         yield family
 
 
 def _context(task: ApplicationTask) -> TraceContext | None:
-    """Where the task stands; None where it bears no trace, or one that is not recorded."""
+    """Where the task stands; None where it has no trace, or one that is not recorded."""
     context = parse_traceparent(task.metadata.annotations.get(TRACEPARENT_ANNOTATION))
     return context if context is not None and context.sampled else None
 

@@ -31,19 +31,19 @@ class DetectorWatch:
 
     Attributes:
         namespaces: where; empty: everywhere.
-        detector: asks for a Detector's objects to be looked after.
+        detector: enqueues a Detector.
     """
 
     cache: ClusterCache
     client: Client
-    book: DetectorIndex
+    index: DetectorIndex
     namespaces: tuple[str, ...]
     detector: Callable[[Name], None]
 
     async def run(self) -> None:
         """Look until cancelled, where the manager runs detectors."""
         failed = ""
-        while self.book.defaults is not None:
+        while self.index.defaults is not None:
             try:
                 await self.look()
                 failed = ""
@@ -59,11 +59,11 @@ class DetectorWatch:
         objects: list[Object] = []
         for resource in _KINDS:
             objects += await self._list(resource, SELECTOR)
-        before = set(self.book.asking)
-        self.book.take(objects, await self._list(_PODS, SELECTOR), await self._list(_PODS, SIDECAR_LABEL))
+        before = set(self.index.requesting)
+        self.index.take(objects, await self._list(_PODS, SELECTOR), await self._list(_PODS, SIDECAR_LABEL))
         for name in {
             *before,
-            *self.book.asking,
+            *self.index.requesting,
             *(name for name, _ in self.cache.store.all(DETECTOR)),
         }:
             self.detector(name)

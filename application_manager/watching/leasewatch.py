@@ -28,7 +28,7 @@ class LeaseWatch:
     Attributes:
         probe: what is listed to see whether the API server and its storage answer.
         namespaces: where; empty: anywhere.
-        instance: asks for an instance to be reconciled.
+        instance: enqueues an instance.
     """
 
     cache: ClusterCache
@@ -69,7 +69,7 @@ class LeaseWatch:
         return True
 
     async def read_due(self) -> None:
-        """Read the Leases that are unchanged for longer than they last; news of them also come by watching.
+        """Read the Leases that are unchanged for longer than they last; changes also come by watching.
 
         One that cannot be read is left as it was seen last, and does not concern the others.
         """

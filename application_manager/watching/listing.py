@@ -30,7 +30,7 @@ class Listing:
         children: the kinds of instances' objects.
         namespaces: where; empty: everywhere.
         every: seconds between two resyncs.
-        measures: told of each resync.
+        measures: counts each resync.
     """
 
     cache: ClusterCache

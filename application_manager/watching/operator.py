@@ -77,7 +77,7 @@ async def watch(
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)
         settings.watching.label_selectors[resource.group, resource.version, resource.plural] = label
 
-    identity: Any = "application-manager"  # else kopf asks for the user's name, and a container's may have none
+    identity: Any = "application-manager"  # else kopf looks up the user's name, and a container's may have none
     with pulsing(pulse), relaying(observe, vanished, relist, failed):
         await kopf.operator(
             registry=registry,

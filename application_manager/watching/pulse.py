@@ -39,7 +39,7 @@ class Pulse(Collector):
     """When each watch last gave a sign of life; also as metrics. Any thread may read."""
 
     def __init__(self, limit: float, healthy: Callable[[], float]) -> None:
-        """A book of watches without any.
+        """No watch has any yet.
 
         Args:
             limit: seconds after which a watch is restarted.
@@ -98,7 +98,7 @@ class Pulse(Collector):
 
 @contextmanager
 def pulsing(pulse: Pulse) -> Iterator[None]:
-    """Have kopf's watches tell their signs of life while the block runs, and restart those that give none."""
+    """Have kopf's watches give their signs of life while the block runs, and restart those that give none."""
     original = watching.watch_objs
 
     async def watch_objs(*, resource: Any, namespace: Any, **more: Any) -> AsyncIterator[Any]:

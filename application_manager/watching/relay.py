@@ -57,7 +57,7 @@ def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callab
             version = raw["metadata"]["resourceVersion"]
             del event, raw
             yield {"type": "BOOKMARK", "object": {"metadata": {"resourceVersion": version}}}
-            await asyncio.sleep(0)  # many may have arrived: the work goes on in between
+            await asyncio.sleep(0)  # many may have arrived: the work continues in between
 
     async def fetch_objs(*, settings: Any, resource: Any, namespace: Any, **about: Any) -> AsyncIterator[Any]:
         version, labels = None, ",".join(sorted(set(settings.watching.label_selectors.collect(resource))))

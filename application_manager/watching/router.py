@@ -168,7 +168,7 @@ class Router:
             if self.cache.pods.note(raw):
                 self._enqueue_owner(entry.raw)
             if _is_a_workloads(entry.raw):
-                return  # that its pods are ready, a workload says itself
+                return  # that its pods are ready, a workload reports itself
         self.applier.note(entry.raw)
         if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
             self._enqueue_owner(entry.raw)
@@ -207,7 +207,7 @@ class Router:
     def _rules(self, namespace: str) -> None:
         """Rules and detectors of a namespace are judged together: either may be what is wrong with the other.
 
-        And what rules say of templates, these may have changed.
+        Findings of rules about templates may have changed too.
         """
         for kind in _RULES:
             for name, _ in self.cache.store.all(kind):
@@ -224,7 +224,7 @@ class Router:
 
 
 def _instance_of(raw: Object) -> Name | None:
-    """The instance whose label the object bears."""
+    """The instance whose label the object has."""
     owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
     return (raw["metadata"]["namespace"], owner) if owner else None
 

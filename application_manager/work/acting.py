@@ -1,7 +1,8 @@
 """What only the active manager does: the queues work, Events are posted, configurations published.
 
-Several times over, if need be: whoever cannot renew its Lease stops at once and becomes a standby, and may become
-active again. At the end of the process what is under way is finished, within a bound, and then the Lease is released.
+Several times over, if need be: a manager that cannot renew its Lease stops at once and becomes a standby, and may
+become active again. At the end of the process what is under way is finished, within a bound, and then the Lease is
+released.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from application_manager.cluster.client import Client
 from application_manager.cluster.leadership import Leadership
 
 FINISHING = 3.0
-"""Seconds that what is under way at the end is given; what is given up then, the next start takes up."""
+"""Seconds that what is under way at the end is given; the next start does what is given up then."""
 
-_AGAIN = 0.5  # s until a task that goes on is cancelled again
+_AGAIN = 0.5  # s until a task that continues is cancelled again
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +32,7 @@ class Begin(Protocol):
 
 
 class Worker(Protocol):
-    """What works until it is cancelled, or told to finish."""
+    """What works until it is cancelled, or finished."""
 
     async def run(self) -> None:
         """Work."""
@@ -44,17 +45,17 @@ async def acting(
     leadership: Leadership,
     client: Client,
     queues: Sequence[Worker],
-    tellers: Sequence[Worker],
+    reporters: Sequence[Worker],
     begin: Begin,
     stop: asyncio.Event,
 ) -> None:
-    """Act whenever this manager is active, until told to stop; the Lease is released then.
+    """Act whenever this manager is active, until `stop` is set; the Lease is released then.
 
     Args:
-        leadership: says when to act.
+        leadership: knows when to act.
         client: by which all is written.
         queues: what works.
-        tellers: what tells of the work, and therefore ends after it.
+        reporters: what reports the work, and therefore ends after it.
         begin: called each time before the work begins.
         stop: the end.
     """
@@ -63,7 +64,7 @@ async def acting(
     try:
         while await _first(leadership.wait_active(), stopping):
             over = asyncio.create_task(leadership.wait_over(), name="lost")
-            work = asyncio.create_task(_work(queues, tellers, begin, again), name="work")
+            work = asyncio.create_task(_work(queues, reporters, begin, again), name="work")
             try:
                 await asyncio.wait((work, over, stopping), return_when=asyncio.FIRST_COMPLETED)
                 if stopping.done() and not work.done():
@@ -80,20 +81,20 @@ async def acting(
     await _release(leadership, client)
 
 
-async def _work(queues: Sequence[Worker], tellers: Sequence[Worker], begin: Begin, again: bool) -> None:
-    """Act; returns once all queues have finished, and then all tellers."""
+async def _work(queues: Sequence[Worker], reporters: Sequence[Worker], begin: Begin, again: bool) -> None:
+    """Act; returns once all queues have finished, and then all reporters."""
     await begin(again=again)
     working = asyncio.create_task(_run(queues), name="queues")
-    telling = asyncio.create_task(_run(tellers), name="tellers")
+    reporting = asyncio.create_task(_run(reporters), name="reporters")
     try:
-        await asyncio.wait((working, telling), return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait((working, reporting), return_when=asyncio.FIRST_COMPLETED)
         if working.done():
-            for teller in tellers:
-                teller.finish()
-            await telling
+            for reporter in reporters:
+                reporter.finish()
+            await reporting
     finally:
-        await ended(working, telling)
-    for task in (working, telling):
+        await ended(working, reporting)
+    for task in (working, reporting):
         if not task.cancelled():
             task.result()
 

@@ -57,7 +57,7 @@ class Applier:
         self._controlled: dict[str, dict[str, ObjectKey]] = {}  # uid of the controller → uid → object
 
     def live(self, namespace: str, key: ObjectKey) -> Object | None:
-        """The object, where we watch it: it bears an instance's label."""
+        """The object, where we watch it: it has an instance's label."""
         entry = self._store.get((key[0], key[1]), (namespace, key[2]))
         return entry.raw if entry is not None else None
 
@@ -251,4 +251,4 @@ def _readable(message: str) -> str:
 
 
 def _counted(count: int) -> str:
-    return "1 object is as the template says" if count == 1 else f"{count} objects are as the template says"
+    return "1 object is as in the template" if count == 1 else f"{count} objects are as in the template"

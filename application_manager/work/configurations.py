@@ -1,7 +1,7 @@
 """Bringing an instance's configuration to those that follow it: its pods, by way of the kubelet, and Zenoh.
 
-Level-triggered: what the ConfigMap holds now is compared with what each pod was told last, so the work can be done
-again at any time. It only makes things fast: without it the kubelet brings the same content a minute later.
+Level-triggered: what the ConfigMap holds now is compared with what was announced to each pod last, so the work can be
+done again at any time. It only makes things fast: without it the kubelet brings the same content a minute later.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ConfigurationWork:
     publisher: Publisher
 
     async def reconcile(self, name: Name) -> None:
-        """Publish the instance's configuration, and tell those of its pods that were not told of it.
+        """Publish the instance's configuration, and announce it to those of its pods that do not have it.
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
@@ -47,21 +47,21 @@ class ConfigurationWork:
         files = live.get("data") or {}
         self.publisher.publish(name, files)
         try:
-            told = await self._tell(name, instance, following.fingerprint(files))
+            count = await self._announce(name, instance, following.fingerprint(files))
         except ApiError as error:
             if not error.permanent and not error.terminating:
                 raise
-            log.warning("instance %s/%s: its pods learn of their configuration late: %s", *name, error)
+            log.warning("instance %s/%s: its pods get their configuration late: %s", *name, error)
             return
-        if told:
-            log.info("instance %s/%s: %d pods are told of their new configuration", *name, told)
+        if count:
+            log.info("instance %s/%s: announced the new configuration to %d pods", *name, count)
 
-    async def _tell(self, name: Name, instance: ApplicationInstance, content: str) -> int:
+    async def _announce(self, name: Name, instance: ApplicationInstance, content: str) -> int:
         pods: dict[str, Object] = {}
         for selector in following.selectors(self._workloads(name, instance)):
             listed, _ = await self.client.list(PODS, name[0], labels=selector)
             pods |= {each["metadata"]["uid"]: each for each in listed}
-        told = 0
+        count = 0
         for pod, uid in following.behind(pods.values(), name[1], content):
             try:
                 await self.client.annotate(PODS, name[0], pod, uid, {following.ANNOTATION: content})
@@ -69,8 +69,8 @@ class ConfigurationWork:
                 if error.code not in (404, 409):  # gone, or another pod of that name
                     raise
             else:
-                told += 1
-        return told
+                count += 1
+        return count
 
     def _workloads(self, name: Name, instance: ApplicationInstance) -> list[Object]:
         record = self.cache.records.get(name)

@@ -1,4 +1,4 @@
-"""Reconciling the detectors that the manager runs: their objects are as their Detectors say, or are gone.
+"""Reconciling the detectors that the manager runs: their objects are as their Detectors want them, or are gone.
 
 What is not the Detector's own is left alone: an object of the same name that it does not control. What it owns goes
 with it, by Kubernetes' garbage collection, and without its mode by us.
@@ -25,7 +25,7 @@ from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
 from application_manager.core.statuses.running import NOT_ACCEPTED, NOT_RUN, RUNNING, carried, running
 from application_manager.work.applying import apply_owned
-from application_manager.work.sidecars import SidecarNews
+from application_manager.work.sidecars import SidecarEvents
 from wayside.api import Detector
 from wayside.api.pod import DetectorMode
 
@@ -39,56 +39,56 @@ class DetectorWork:
     """Makes, changes and removes a detector's objects.
 
     Attributes:
-        judge: asks for the Detector's status to be written.
-        sidecars: tells of pods that were to have a detector and have none.
+        judge: enqueues the Detector's status.
+        sidecars: posts Events about pods that were to have a detector and have none.
     """
 
     cache: ClusterCache
     client: Client
-    book: DetectorIndex
+    index: DetectorIndex
     judge: Callable[[Name], None]
-    sidecars: SidecarNews
+    sidecars: SidecarEvents
     _applied: dict[str, tuple[str, str]] = field(default_factory=dict)  # uid → what was applied, and our fields since
 
     async def reconcile(self, name: Name) -> None:
-        """Make the Detector's objects as it says, and note whether it runs.
+        """Make the Detector's objects, and note whether it runs.
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
         entry = self.cache.store.get(DETECTOR, name)
-        self.sidecars.tell(name)
+        self.sidecars.report(name)
         if entry is None:
-            self.book.said.pop(name, None)
+            self.index.running.pop(name, None)
             return
         if not isinstance(entry.model, Detector) or entry.raw["metadata"].get("deletionTimestamp"):
             return  # what is there stays, until the Detector can be read again or is gone
         detector = entry.model
         if detector.spec.mode is None:
-            said = None
-            await self._remove(name, entry.uid, self.book.owned(entry.uid))
+            aspect = None
+            await self._remove(name, entry.uid, self.index.owned(entry.uid))
         else:
-            said = await self._make(name, detector)
-        if self.book.said.get(name) == said:
+            aspect = await self._make(name, detector)
+        if self.index.running.get(name) == aspect:
             return
-        if said is None:
-            del self.book.said[name]
+        if aspect is None:
+            del self.index.running[name]
         else:
-            self.book.said[name] = said
+            self.index.running[name] = aspect
         self.judge(name)
 
     async def _make(self, name: Name, detector: Detector) -> Aspect:
-        if self.book.defaults is None:
+        if self.index.defaults is None:
             return NOT_RUN
         if detector.spec.mode is DetectorMode.SIDECAR:
-            return await self._make_rights(name, detector, self.book.defaults)
-        there = self.book.owned(detector.metadata.uid).get("Deployment")
+            return await self._make_rights(name, detector, self.index.defaults)
+        there = self.index.owned(detector.metadata.uid).get("Deployment")
         if detector_findings(detector).problems:
-            return NOT_ACCEPTED if there is None else running(there, self.book.troubles(name))
-        for manifest in detector_objects(detector, self.book.defaults):
+            return NOT_ACCEPTED if there is None else running(there, self.index.troubles(name))
+        for manifest in detector_objects(detector, self.index.defaults):
             problem = await self._apply(name, detector, manifest)
             if problem is not None:
                 return problem
-        return running(self.book.owned(detector.metadata.uid).get("Deployment"), self.book.troubles(name))
+        return running(self.index.owned(detector.metadata.uid).get("Deployment"), self.index.troubles(name))
 
     async def _make_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> Aspect:
         """Give the accounts of others' pods what the detector needs in them; by the webhook it comes into them.
@@ -97,20 +97,20 @@ class DetectorWork:
         """
         manifests = detector_objects(detector, defaults)
         kinds = {each["kind"] for each in manifests}
-        await self._remove(name, detector.metadata.uid, set(self.book.owned(detector.metadata.uid)) - kinds)
+        await self._remove(name, detector.metadata.uid, set(self.index.owned(detector.metadata.uid)) - kinds)
         for manifest in manifests:
             problem = await self._apply(name, detector, manifest)
             if problem is not None:
                 return problem
-        asking = self.book.asking.get(name, [])
-        if detector_findings(detector).problems and not any(has_sidecar(each["spec"]) for each in asking):
+        requesting = self.index.requesting.get(name, [])
+        if detector_findings(detector).problems and not any(has_sidecar(each["spec"]) for each in requesting):
             return NOT_ACCEPTED
-        return carried(detector, asking)
+        return carried(detector, requesting)
 
     async def _apply(self, name: Name, detector: Detector, manifest: Manifest) -> Aspect | None:
-        """Make one object as the manifest says; what keeps it from being so, if anything."""
+        """Apply one object; what prevents it, if anything."""
         kind, called = manifest["kind"], manifest["metadata"]["name"]
-        known = self.book.owned(detector.metadata.uid)
+        known = self.index.owned(detector.metadata.uid)
         live = known.get(kind) or await self.client.get(_RESOURCES[kind], name[0], called)
         digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
         if live is not None and controller_uid(live) == detector.metadata.uid:
@@ -137,8 +137,8 @@ class DetectorWork:
     async def _remove(self, name: Name, uid: str, kinds: Iterable[str]) -> None:
         """Remove what the Detector controls of these kinds: with its mode as it is they are not needed."""
         for kind in list(kinds):
-            raw = self.book.owned(uid)[kind]
+            raw = self.index.owned(uid)[kind]
             await self.client.delete(_RESOURCES[kind], name[0], raw["metadata"]["name"], raw["metadata"]["uid"])
-            self.book.owned(uid).pop(kind, None)
+            self.index.owned(uid).pop(kind, None)
             self._applied.pop(raw["metadata"]["uid"], None)
             log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])

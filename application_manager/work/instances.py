@@ -1,8 +1,8 @@
 """Reconciling one instance: decide, apply the instance, apply its objects. All the way in one go.
 
-Nothing here waits for our own watch events: each answer of the API server enters the store, and the next step goes on
+Nothing here waits for our own watch events: each answer of the API server enters the store, and the next step starts
 from it. What fails is tried again as a whole, from what is known then. How it went is noted in the cache's record of
-the instance, and said afterwards (`instancestatus`).
+the instance, and reported afterwards (`instancestatus`).
 """
 
 from __future__ import annotations
@@ -79,16 +79,16 @@ class InstanceWork:
     Attributes:
         instances: where ApplicationInstances live.
         tasks: where ApplicationTasks live.
-        again: asks for an instance at a time, in seconds since 1970.
+        again: enqueues an instance at a time, in seconds since 1970.
         enqueue: enqueues an instance.
-        done: told when an instance's record is new.
-        absent: told what was decided of an instance that neither exists nor should.
+        done: called when an instance's record is new.
+        absent: called with the decision about an instance that neither exists nor should.
         observe: takes an object that was read.
-        configured: told when an instance's configuration was applied.
+        configured: called when an instance's configuration was applied.
         objects: the objects of an instance, or why it has none; None: they are being worked out, and the instance is
-            asked again once they are.
+            enqueued once they are.
         attempts: knows what was refused, and when it is tried again.
-        not_made: told why an instance cannot be made that should be.
+        not_made: called with the reason why an instance cannot be made.
     """
 
     cache: ClusterCache
@@ -308,6 +308,6 @@ class InstanceWork:
             return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)
         why = over.yields or "no demand came within its linger"
-        self.recorder.say(instance, Reason.PREEMPTED if over.yields else Reason.RELEASED, why, time.time())
+        self.recorder.event(instance, Reason.PREEMPTED if over.yields else Reason.RELEASED, why, time.time())
         log.info("instance %s/%s: released: %s", *name, why)
         return True

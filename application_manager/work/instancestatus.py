@@ -1,7 +1,7 @@
-"""Saying how an instance is, after the work: its status, its Events, and the news for its tasks.
+"""Reporting on an instance after the work: its status, its Events, and what its tasks need to know.
 
-Apart from the work itself, so that words never hold up what runs. Until a status is written, the cache's record of the
-instance stands for it; should we die before, the work is done again, and finds that nothing is left to do.
+Apart from the work itself, so that statuses never hold up what runs. Until a status is written, the cache's record of
+the instance stands for it; should we die before, the work is done again, and finds that nothing is left to do.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class InstanceStatusWork:
 
     Attributes:
         instances: where ApplicationInstances live.
-        task_changed: asks for a task's status to be looked at.
-        nodes: tells of the cluster's nodes.
-        failed_pods: tells why pods could not be made.
-        again: asks for an instance at a time, in seconds since 1970.
+        task_changed: enqueues a task.
+        nodes: lists the cluster's nodes.
+        failed_pods: finds why pods could not be made.
+        again: enqueues an instance at a time, in seconds since 1970.
     """
 
     cache: ClusterCache
@@ -61,7 +61,7 @@ class InstanceStatusWork:
     again: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
-        """Write the instance's status if it is news.
+        """Write the instance's status if it differs.
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
@@ -89,7 +89,7 @@ class InstanceStatusWork:
             return
         elif old.release_time is None and new.release_time is not None:
             note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
-            self.statuses.recorder.say(instance, Reason.LINGERING, note, now)
+            self.statuses.recorder.event(instance, Reason.LINGERING, note, now)
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message
         reason = ""
@@ -112,13 +112,13 @@ class InstanceStatusWork:
             suspended=instance.spec.suspended,
             stopped=serves and suspended is not None and suspended.holds,
         )
-        self.tell(name, record.decision, service)
+        self.report(name, record.decision, service)
 
-    def tell_why_not_made(self, name: Name, decision: Decision, problem: str) -> None:
+    def report_not_made(self, name: Name, decision: Decision, problem: str) -> None:
         """Let the tasks know why the instance is not there that they demand."""
-        self.tell(name, decision, Service(name[1], applied=False, ready=False, problem=problem))
+        self.report(name, decision, Service(name[1], applied=False, ready=False, problem=problem))
 
-    def tell(self, name: Name, decision: Decision | None, service: Service | None) -> None:
+    def report(self, name: Name, decision: Decision | None, service: Service | None) -> None:
         """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
         old = self.cache.served.pop(name, None)
         verdicts = decision.verdicts if decision is not None else {}
@@ -142,7 +142,7 @@ class InstanceStatusWork:
         return summary([*self.cache.pods.troubles(name), *refused, *looked_up])
 
     async def _looked_up(self, instance: ApplicationInstance, applied: Applied) -> list[Trouble]:
-        """The troubles of what is not ready that no watch tells: no node is as required, pods are refused."""
+        """The troubles of what is not ready that no watch shows: no node is as required, pods are refused."""
         if instance.spec.suspended:
             return []
         live = [each for each in self._live(instance, applied).values() if each is not None and not_ready(each)]
@@ -158,13 +158,13 @@ class InstanceStatusWork:
         return [] if nodes is None else [trouble for each in bound if (trouble := misplaced(each, nodes)) is not None]
 
     async def _refused(self, live: Sequence[Object]) -> list[Trouble]:
-        """Why pods of the objects are refused that say so in Events alone."""
-        lacking = [each["metadata"] for each in live if lacks_pods(each)]
-        told = [
+        """Why pods of the objects are refused of which only Events have the reason."""
+        without_pods = [each["metadata"] for each in live if lacks_pods(each)]
+        troubles = [
             refused_by_events(await self.failed_pods.events(each["namespace"], each["uid"]), time.time())
-            for each in lacking
+            for each in without_pods
         ]
-        return [each for each in told if each is not None]
+        return [each for each in troubles if each is not None]
 
     def _live(self, instance: ApplicationInstance, applied: Applied) -> dict[ObjectKey, Object | None]:
         """The instance's objects, as watched."""
@@ -192,7 +192,7 @@ class InstanceStatusWork:
         if missing:
             reason = troubles[0].reason.value if troubles else "NotReady"
             refused = [found for each in objects.values() if each is not None and (found := refused_pods(each))]
-            others = [each for each in troubles if each not in refused]  # which the words of the workload tell already
+            others = [each for each in troubles if each not in refused]  # which the message of the workload has already
             return Aspect("Ready", False, reason, ": ".join(filter(None, ("; ".join(missing), _text(others)))))
         return Aspect("Ready", True, "Ready", "all workloads are ready")
 
@@ -209,7 +209,7 @@ def _settles(instance: ApplicationInstance, record: Record, live: Iterable[Objec
 
 
 def _overdue(ready: Aspect, decision: Decision) -> Aspect:
-    """The condition Ready of what is beyond its readyTimeout: it says so, unless it knows better why."""
+    """The condition Ready of what is beyond its readyTimeout: the reason is that, unless there is a better one."""
     if ready.holds or not decision.overdue or ready.reason == "Suspended":
         return ready
     reason = READY_TIMEOUT if ready.reason in ("NotReady", "NotApplied") else ready.reason
@@ -217,6 +217,6 @@ def _overdue(ready: Aspect, decision: Decision) -> Aspect:
 
 
 def _text(troubles: Sequence[Trouble]) -> str:
-    """The most telling troubles, as a condition says them."""
+    """The most important troubles, as a condition has them."""
     more = f"; and {len(troubles) - _TROUBLES_SHOWN} more" if len(troubles) > _TROUBLES_SHOWN else ""
     return "; ".join(each.text for each in troubles[:_TROUBLES_SHOWN]) + more

@@ -1,7 +1,7 @@
-"""The instances' configurations on Zenoh: each is published when it changes, and told to whoever asks for it.
+"""The instances' configurations on Zenoh: each is published when it changes, and the reply to queries.
 
 On `wayside/instances/<namespace>/<name>/configuration`, as a JSON object of file names and texts. A deletion of the key
-says that the instance is gone.
+means that the instance is gone.
 
 Zenoh has threads of its own and may be slow or away, so it never touches the event loop: the loop leaves what is newest
 of each instance here, and one thread brings it out. What is not yet out is replaced by what is newer, so there is at
@@ -28,7 +28,7 @@ from wayside.backoff import Backoff
 _ALL = "wayside/instances/*/*/configuration"
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 2.0  # s between attempts to reach the network
 _REPEATS = (0.0, 1.0, 5.0)
-"""Seconds after a new connection at which all is published: what is put before the other side has told of its
+"""Seconds after a new connection at which all is published: what is put before the other side has announced its
 subscribers reaches nobody."""
 _CLOSING = 2.0  # s that the thread is given to end
 
@@ -41,7 +41,7 @@ def key_of(name: Name) -> str:
 
 
 def settings(given: Sequence[str]) -> zenoh.Config:
-    """How to take part in the network: as a client of the endpoints given, or as the one file given says.
+    """How to take part in the network: as a client of the endpoints given, or by the one file given.
 
     Raises ConfigurationError for what is neither.
     """
@@ -86,7 +86,7 @@ class Publisher:
         self._over = asyncio.Event()
 
     def publish(self, name: Name, files: Mapping[str, str]) -> None:
-        """Publish the content of the files if it is news."""
+        """Publish the content of the files if it differs."""
         key, content = key_of(name), json.dumps(files, ensure_ascii=False, sort_keys=True).encode()
         with self._lock:
             if self._config is not None and self._contents.get(key) != content:
@@ -95,7 +95,7 @@ class Publisher:
                 self._lock.notify()
 
     def withdraw(self, name: Name) -> None:
-        """Say that the instance is gone, or has no configuration any more, if it had one."""
+        """Announce that the instance is gone, or has no configuration any more, if it had one."""
         key = key_of(name)
         with self._lock:
             if self._contents.pop(key, None) is not None:
@@ -103,7 +103,7 @@ class Publisher:
                 self._lock.notify()
 
     def forget(self) -> None:
-        """Know of no configuration any more, without saying anything: another manager has published since."""
+        """Know of no configuration any more, without publishing it: another manager has published since."""
         with self._lock:
             self._contents.clear()
             self._pending.clear()
@@ -113,7 +113,7 @@ class Publisher:
         self._over.set()
 
     async def run(self) -> None:
-        """Publish until cancelled, or told to finish. Cancelled, it can be run again."""
+        """Publish until cancelled, or finished. Cancelled, it can be run again."""
         config = self._config
         if config is None:
             await self._over.wait()
@@ -177,7 +177,7 @@ class Publisher:
                     return None
 
     def _next(self) -> list[tuple[str, bytes | None]] | None:
-        """Wait for news; None once we are to end."""
+        """Wait for changes; None once we are to end."""
         with self._lock:
             while not self._ended and not self._pending:
                 now = time.monotonic()
@@ -188,9 +188,9 @@ class Publisher:
                     self._lock.wait(self._repeats[0] - now if self._repeats else None)
             if self._ended:
                 return None
-            news = [(key, self._contents.get(key)) for key in self._pending]
+            changes = [(key, self._contents.get(key)) for key in self._pending]
             self._pending.clear()
-            return news
+            return changes
 
     def _transport(self, event: zenoh.TransportEvent) -> None:
         """Zenoh's thread calls it for every connection that opens or closes."""
@@ -204,11 +204,11 @@ class Publisher:
                 log.warning("zenoh: a connection is lost; trying on")
 
     def _answer(self, query: zenoh.Query) -> None:
-        """Zenoh's thread calls it for every question."""
-        asked = query.key_expr
+        """Zenoh's thread calls it for every query."""
+        key_expr = query.key_expr
         with self._lock:
-            exact = self._contents.get(str(asked))
-            found = {str(asked): exact} if exact is not None else dict(self._contents)
+            exact = self._contents.get(str(key_expr))
+            found = {str(key_expr): exact} if exact is not None else dict(self._contents)
         for key, content in found.items():
-            if content is not None and asked.intersects(zenoh.KeyExpr(key)):
+            if content is not None and key_expr.intersects(zenoh.KeyExpr(key)):
                 query.reply(key, content, encoding=zenoh.Encoding.APPLICATION_JSON)

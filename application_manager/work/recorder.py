@@ -1,7 +1,7 @@
 """Kubernetes Events: what happened to a task or an instance, for `kubectl describe` and `kubectl get events`.
 
 The reasons are a fixed list. An Event follows from a change of a condition, which is stored in the cluster, so neither
-a restart nor a resync tells the same again. What is repeated is one Event with a series, as events.k8s.io has it.
+a restart nor a resync posts the same again. What is repeated is one Event with a series, as events.k8s.io has it.
 Namespaces take turns, and each has room for its own.
 """
 
@@ -118,7 +118,7 @@ _EXPECTED = frozenset({"Waiting", "ChartPending", "NotApplied", "NotReady"})  # 
 
 
 @dataclass(frozen=True, slots=True)
-class _Said:
+class _Event:
     regarding: Kind
     reason: Reason
     note: str
@@ -173,14 +173,14 @@ class Recorder:
         self._client = client
         self._measures = measures or Measures()
         self._allowance = Allowance()
-        self._waiting: Turns[_Said] = Turns()
+        self._waiting: Turns[_Event] = Turns()
         self._wake = asyncio.Event()
         self._ending = False
         self._instance = f"{socket.gethostname()}-{os.getpid()}"[:128]
         self._drops = _Drops()
         self._series: OrderedDict[tuple[str, str, str], _Series] = OrderedDict()
 
-    def say(self, regarding: Kind, reason: Reason, note: str, now: float, *, once: bool = False) -> None:
+    def event(self, regarding: Kind, reason: Reason, note: str, now: float, *, once: bool = False) -> None:
         """Post an Event about the object, unless there were too many of it.
 
         Args:
@@ -190,8 +190,8 @@ class Recorder:
             now: seconds since 1970.
             once: not if there is the same already, also of an earlier run: for what follows from no change of a status.
         """
-        said = _Said(regarding, reason, note, now, once)
-        if self._repeats(said):
+        event = _Event(regarding, reason, note, now, once)
+        if self._repeats(event):
             return
         if not self._allowance.takes(regarding.metadata.uid, now):
             self._measures.unposted("limited")
@@ -199,20 +199,20 @@ class Recorder:
             self._measures.unposted("full")
             self._drops.note("more than could be posted")
         else:
-            self._waiting.add(regarding.namespace, said)
+            self._waiting.add(regarding.namespace, event)
             self._wake.set()
 
-    def _repeats(self, said: _Said) -> bool:
+    def _repeats(self, event: _Event) -> bool:
         """Whether the Event was posted a short while ago, and nothing is to be written about its repetition yet."""
-        known = self._series.get(said.what)
+        known = self._series.get(event.what)
         if known is None:
             return False
-        if said.now - known.last > _SERIES:
-            del self._series[said.what]
+        if event.now - known.last > _SERIES:
+            del self._series[event.what]
             return False
         known.count += 1
-        known.last = said.now
-        return said.now - known.written < _REFRESHED and known.count > 2
+        known.last = event.now
+        return event.now - known.written < _REFRESHED and known.count > 2
 
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
         """Post an Event for each condition that changed, if it is worth one: not yet being ready is none.
@@ -223,9 +223,9 @@ class Recorder:
         was_true = {each.type for each in old if each.status == "True"}
         is_false = {each.type for each in new if each.status == "False"}
         concludes = not is_false.isdisjoint(("Applied",)) or any(each.type == "Accepted" for each in new)
-        news = changed(old, new)
-        at_once = {each.type for each in news if each.status == "True"} >= {"Applied", READY}
-        for each in news:
+        changes = changed(old, new)
+        at_once = {each.type for each in changes if each.status == "True"} >= {"Applied", READY}
+        for each in changes:
             if each.type == STALLED or (each.type == READY and concludes) or (each.type == "Applied" and at_once):
                 continue
             if (regarding.kind, each.reason) == ("ApplicationTask", Reason.ACCEPTED) and not old:
@@ -237,7 +237,7 @@ class Recorder:
                 reason = Reason.NOT_SUSPENDED
             expected = each.status == "False" and each.type not in was_true and each.reason in _EXPECTED
             if reason is not None and not expected:
-                self.say(regarding, reason, each.message, now)
+                self.event(regarding, reason, each.message, now)
 
     def finish(self) -> None:
         """Let `run` return once what waits is posted."""
@@ -245,11 +245,11 @@ class Recorder:
         self._wake.set()
 
     async def run(self) -> None:
-        """Post until cancelled, or told to finish. An Event that cannot be posted is dropped."""
+        """Post until cancelled, or finished. An Event that cannot be posted is dropped."""
         while True:
-            said = self._waiting.next()
-            if said is not None:
-                await self._post(said)
+            event = self._waiting.next()
+            if event is not None:
+                await self._post(event)
             elif self._ending:
                 break
             else:
@@ -266,39 +266,39 @@ class Recorder:
             async with asyncio.timeout(self._drops.due_in(time.monotonic())):
                 await self._wake.wait()
 
-    async def _post(self, said: _Said) -> None:
+    async def _post(self, event: _Event) -> None:
         try:
-            await self._write(said)
-            self._measures.posted(said.reason.value)
+            await self._write(event)
+            self._measures.posted(event.reason.value)
         except ApiError as error:
-            if said.once and error.code == 409:
+            if event.once and error.code == 409:
                 return
             self._measures.unposted("failed")
             if not error.terminating:
-                self._drops.note(f"{said.reason} about {said.regarding.name}: {error}")
+                self._drops.note(f"{event.reason} about {event.regarding.name}: {error}")
         except Unreachable as error:
             self._measures.unposted("failed")
             self._drops.note(str(error))
 
-    async def _write(self, said: _Said) -> None:
+    async def _write(self, event: _Event) -> None:
         """Post the Event, or bring the series of the one that it repeats up to date."""
-        known = self._series.get(said.what)
+        known = self._series.get(event.what)
         if known is not None and known.count > 1:
-            known.written = said.now
+            known.written = event.now
             series = {"count": known.count, "lastObservedTime": _microseconds(known.last)}
-            if await self._client.merge(EVENTS, said.regarding.namespace, known.name, {"series": series}):
+            if await self._client.merge(EVENTS, event.regarding.namespace, known.name, {"series": series}):
                 return
-        manifest = self._manifest(said)
+        manifest = self._manifest(event)
         await self._client.create(EVENTS, manifest)
-        self._series.pop(said.what, None)
-        self._series[said.what] = _Series(manifest["metadata"]["name"], 1, said.now, said.now)
+        self._series.pop(event.what, None)
+        self._series[event.what] = _Series(manifest["metadata"]["name"], 1, event.now, event.now)
         if len(self._series) > _KEPT:
             self._series.popitem(last=False)
 
-    def _manifest(self, said: _Said) -> dict[str, Any]:
-        regarding = said.regarding
-        same = "\0".join((regarding.metadata.uid, said.reason, said.note)).encode()
-        ending = hashlib.sha256(same).hexdigest() if said.once else uuid.uuid4().hex
+    def _manifest(self, event: _Event) -> dict[str, Any]:
+        regarding = event.regarding
+        same = "\0".join((regarding.metadata.uid, event.reason, event.note)).encode()
+        ending = hashlib.sha256(same).hexdigest() if event.once else uuid.uuid4().hex
         return {
             "apiVersion": "events.k8s.io/v1",
             "kind": "Event",
@@ -306,13 +306,13 @@ class Recorder:
                 "name": f"{regarding.name[:_NAME_LENGTH].rstrip('-.')}.{ending[:16]}",
                 "namespace": regarding.namespace,
             },
-            "eventTime": _microseconds(said.now),
+            "eventTime": _microseconds(event.now),
             "reportingController": COMPONENT,
             "reportingInstance": self._instance,
             "action": "Reconcile",
-            "reason": said.reason.value,
-            "type": "Warning" if said.reason in _WARNINGS else "Normal",
-            "note": said.note[:_NOTE_LENGTH],
+            "reason": event.reason.value,
+            "type": "Warning" if event.reason in _WARNINGS else "Normal",
+            "note": event.note[:_NOTE_LENGTH],
             "regarding": {
                 "apiVersion": regarding.api_version,
                 "kind": regarding.kind,

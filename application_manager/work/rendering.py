@@ -1,6 +1,6 @@
 """The objects of instances, worked out in the worker processes; those of small templates that only read, here.
 
-What is not there yet is asked for, and the instance asked again once it is. A rendering that takes too much is a
+What is not there yet is requested, and the instance enqueued once it is. A rendering that takes too much is a
 problem of its template, whose status gives it; what runs of the instance stays as it is.
 """
 
@@ -44,8 +44,8 @@ class Renderings:
             cache: the policy, and what exceeded.
             answers: has the renderings worked out.
             charts: knows what became of a chart.
-            again: asks for an instance at a time, in seconds since 1970.
-            template_changed: asks for a template whose renderings exceed the limit, or do so no more.
+            again: enqueues an instance at a time, in seconds since 1970.
+            template_changed: enqueues a template whose renderings exceed the limit, or do so no more.
         """
         self._cache = cache
         self._answers = answers
@@ -56,10 +56,10 @@ class Renderings:
         self._plain: OrderedDict[tuple[str, int], bool] = OrderedDict()
 
     def objects(self, wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
-        """The instance's objects, or why it has none, as the condition Applied gives it; None: it is asked again."""
-        lacking = drafting.lacking(wanted, template)
-        if lacking is not None or not isinstance(template, ApplicationTemplate):
-            return lacking
+        """The instance's objects, or why it has none, as the condition Applied gives it; None: it is enqueued later."""
+        problem = drafting.without_template(wanted, template)
+        if problem is not None or not isinstance(template, ApplicationTemplate):
+            return problem
         found = self._answer("rendering", wanted, template, None)
         if isinstance(found, ChartRequest):
             outcome = self._charts(found)

@@ -28,7 +28,7 @@ Status = EventRuleStatus | DetectorStatus
 
 @dataclass(frozen=True, slots=True)
 class RuleWork:
-    """Says how rules and detectors are.
+    """Writes the statuses of rules and detectors.
 
     Attributes:
         resources: where EventRules and Detectors live.
@@ -43,7 +43,7 @@ class RuleWork:
     detectors: DetectorIndex = field(default_factory=DetectorIndex)
 
     async def reconcile(self, key: RuleKey) -> None:
-        """Write the status of the rule or detector if it is news.
+        """Write the status of the rule or detector if it differs.
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
@@ -75,7 +75,7 @@ class RuleWork:
         old, judged = DetectorStatus.model_validate(written), entry.model
         if not isinstance(judged, Detector):
             return old, unreadable_status(old, DETECTOR_INVALID, entry.problem, generation, now)
-        rules, running = self.cache.models(EVENT_RULE, EventRule, namespace), self.detectors.said.get(name)
+        rules, running = self.cache.models(EVENT_RULE, EventRule, namespace), self.detectors.running.get(name)
         try:
             return old, await self.pool.run(namespace, DetectorStatusJob(judged, rules, now, running))
         except ExceededError as error:

@@ -1,7 +1,7 @@
 """Taking an instance's workloads to zero, and back to what they were, whenever the manager may be killed in between.
 
 What they had is written into the instance's status before any of them is touched, and removed from it only once all of
-them are back. So what is found there tells at any time what is left to do; a look at the objects tells what is done.
+them are back. So the status shows at any time what is left to do; a look at the objects shows what is done.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Suspending:
         return live is None or live["spec"].get("replicas", 1) == 0
 
     async def _own(self, instance: ApplicationInstance, key: ObjectKey) -> Object | None:
-        """The object, read anew; None where there is none, or one that is not the instance's."""
+        """The object, read again; None where there is none, or one that is not the instance's."""
         raw = await self.client.get(await self.applier.resource(key), instance.namespace, key[2])
         return raw if raw is not None and controller_uid(raw) == instance.metadata.uid else None
 

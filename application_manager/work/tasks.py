@@ -32,23 +32,23 @@ _SHED = Verdict(
     "the application manager is near its memory limit and takes in no further tasks: it takes this one in once there "
     "is room; end tasks, or raise the limit",
 )
-_OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, whose Events tell of them
+_OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, which has Events about them
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class TaskWork:
-    """Says what became of tasks.
+    """Writes the statuses of tasks.
 
     Attributes:
         tasks: where ApplicationTasks live.
         templates: where ApplicationTemplates live.
         ttl: seconds that a finished task is kept.
-        again: asks for a task at a time, in seconds since 1970.
+        again: enqueues a task at a time, in seconds since 1970.
         observe: takes an object that was read.
-        measures: told of refusals, and of the times from event to service.
-        traces: told likewise, where traces are on.
+        measures: counts refusals, and measures the times from event to service.
+        traces: emits spans, where traces are on.
     """
 
     cache: ClusterCache
@@ -63,12 +63,12 @@ class TaskWork:
     traces: TaskTraces | None = None
 
     async def reconcile(self, name: Name) -> None:
-        """Write the task's status if it is news; delete the task when its time has come.
+        """Write the task's status if it differs; delete the task when its time has come.
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
         if name in self.cache.store.shed:
-            await self._tell_shed(name)
+            await self._write_shed(name)
             return
         task = self.cache.task(name)
         known = self._verdict(name)
@@ -76,20 +76,20 @@ class TaskWork:
             return
         verdict, service = known
         if verdict.reason == Refused.TEMPLATE_NOT_FOUND and await self._has_template(name[0], task.spec.template):
-            return  # the watch of templates was behind that of tasks; the template's news bring us back
-        await self._tell(name, task, verdict, service)
+            return  # the watch of templates was behind that of tasks; the template's event enqueues the task again
+        await self._write(name, task, verdict, service)
 
-    async def _tell_shed(self, name: Name) -> None:
-        """Say of a task that it is not taken in; it is read for that alone."""
+    async def _write_shed(self, name: Name) -> None:
+        """Write that a task is not taken in; it is read for that alone."""
         raw = await self.client.get(self.tasks, *name)
         try:
             task = parse_object(trimming.own(raw)) if raw is not None else None
         except ValueError:
             return
         if isinstance(task, ApplicationTask):
-            await self._tell(name, task, finished(task) or _SHED, None)
+            await self._write(name, task, finished(task) or _SHED, None)
 
-    async def _tell(self, name: Name, task: ApplicationTask, verdict: Verdict, service: Service | None) -> None:
+    async def _write(self, name: Name, task: ApplicationTask, verdict: Verdict, service: Service | None) -> None:
         now = time.time()
         old = task.status or ApplicationTaskStatus()
         new = task_status(task, verdict, service, now)
@@ -98,7 +98,7 @@ class TaskWork:
                 return
             self._measure(task, old, new, now)
             if self.traces is not None:
-                self.traces.told(task, old, new)
+                self.traces.status_written(task, old, new)
             if verdict.standing is Standing.FINISHED:
                 await self._expire(name)
         except ApiError as error:
@@ -108,7 +108,7 @@ class TaskWork:
     def _measure(
         self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus, now: float
     ) -> None:
-        """Tell what became of the task, once for each news of it."""
+        """Measure what became of the task, once for each change."""
         for each in changed(old.conditions, new.conditions):
             if each.type == "Accepted" and each.status == "False":
                 self.measures.refused(each.reason)
@@ -145,7 +145,7 @@ class TaskWork:
         return verdict, serves.service
 
     def _of_all(self, name: Name, claimed: Claim, template: Name) -> tuple[Verdict, Service | None] | None:
-        """What became of a task that means all instances of a template, from what was said of it by each."""
+        """What became of a task that means all instances of a template, from the verdict of each."""
         alone = self.cache.served.get((name[0], claimed.instance))
         if alone is None or name[1] not in alone.verdicts:
             return None

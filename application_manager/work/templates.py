@@ -23,12 +23,12 @@ from wayside.api.base import Kind, Metadata
 
 @dataclass(frozen=True, slots=True)
 class TemplateWork:
-    """Says how templates are.
+    """Writes the statuses of templates.
 
     Attributes:
         templates: where ApplicationTemplates live.
         pool: where templates are judged.
-        again: asks for a template at a time, in seconds since 1970.
+        again: enqueues a template at a time, in seconds since 1970.
     """
 
     cache: ClusterCache
@@ -38,7 +38,7 @@ class TemplateWork:
     again: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
-        """Write the template's status if it is news.
+        """Write the template's status if it differs.
 
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
@@ -64,7 +64,7 @@ class TemplateWork:
         """Find out by the template's status whether the manager is alive that looks after the namespace as well."""
         other = self.cache.overlap.waits_for(regarding.namespace)
         note = f"the managers of the Leases {other} and {own.lease} look after this namespace: the second one waits"
-        self.statuses.recorder.say(regarding, Reason.MANAGERS_OVERLAP, note, now, once=True)
+        self.statuses.recorder.event(regarding, Reason.MANAGERS_OVERLAP, note, now, once=True)
         await self.statuses.merge(self.templates, regarding, {"manager": own.to_json()})
 
     async def _findings(self, name: Name) -> Findings:

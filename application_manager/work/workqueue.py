@@ -2,9 +2,9 @@
 
 Namespaces take turns, and none may have all workers where a `share` is given: a flood of keys in one delays no other.
 
-A key that is asked for while it waits is not added again; asked for while it runs, it runs once more afterwards. So
+A key that is added while it waits is not added again; added while it runs, it runs once more afterwards. So
 there are never more entries than objects, and the queue needs no other bound. A failure is tried again after a growing,
-jittered pause, or after what the API server asks for.
+jittered pause, or after what the API server requests.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 class WorkQueue(Generic[Key]):
-    """Runs `work(key)` for every key asked for, on `concurrency` workers.
+    """Runs `work(key)` for every key added, on `concurrency` workers.
 
     While keys of a namespace wait in the queue `after`, those of the namespace in this one are slowed down to four a
     second and worker.
@@ -57,7 +57,7 @@ class WorkQueue(Generic[Key]):
             work: reconciles a key.
             concurrency: how many keys are worked on at a time.
             after: the queue that goes first.
-            measures: told of each reconciliation.
+            measures: counts each reconciliation.
             share: how many keys of one namespace are worked on at a time; None: any number.
         """
         self.name = name
@@ -82,7 +82,7 @@ class WorkQueue(Generic[Key]):
         return len(self._queued), len(self._timers)
 
     def stuck(self, limit: float) -> str | None:
-        """The key that a worker is at for longer than so many seconds, in words; any thread may ask."""
+        """The key that a worker is at for longer than this number of seconds, in words; any thread may call it."""
         now = time.monotonic()
         for key, began in list(self._running.items()):
             if now - began > limit:
@@ -90,7 +90,7 @@ class WorkQueue(Generic[Key]):
         return None
 
     def add(self, key: Key) -> None:
-        """Ask for the key to be worked on soon."""
+        """Enqueue the key."""
         if key in self._running:
             self._again.add(key)
         elif key not in self._queued:
@@ -99,7 +99,7 @@ class WorkQueue(Generic[Key]):
             self._wake.set()
 
     def add_at(self, key: Key, when: float) -> None:
-        """Ask for the key at `when`, in seconds since 1970; the earliest time asked for counts."""
+        """Enqueue the key at `when`, in seconds since 1970; the earliest time counts."""
         self._add_after(key, max(_SHORTEST_DELAY, when - time.time()))
 
     def _add_after(self, key: Key, delay: float) -> None:
@@ -121,7 +121,7 @@ class WorkQueue(Generic[Key]):
         self._wake.set()
 
     async def run(self) -> None:
-        """Work until cancelled, or told to finish. Cancelled, it can be run again, and goes on with what waits."""
+        """Work until cancelled, or finished. Cancelled, it can be run again, and continues with what waits."""
         try:
             async with asyncio.TaskGroup() as group:
                 for index in range(self._concurrency):
@@ -184,7 +184,7 @@ class WorkQueue(Generic[Key]):
         try:
             await self._work(key)
         except NotGranted:
-            self._failures.pop(key, None)  # once the namespace is granted, all its keys are asked for again
+            self._failures.pop(key, None)  # once the namespace is granted, all its keys are enqueued
         except (ApiError, Unreachable) as error:
             pause = self._pause(key, error.retry_after if isinstance(error, ApiError) else None)
             log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
@@ -198,9 +198,9 @@ class WorkQueue(Generic[Key]):
             self._failures.pop(key, None)
         self._measures.reconciled(self.name, time.monotonic() - began, failed=failed)
 
-    def _pause(self, key: Key, asked: float | None) -> float:
+    def _pause(self, key: Key, at_least: float | None) -> float:
         self._failures[key] += 1
-        return max(asked or 0.0, pause_after(self._failures[key], FIRST_PAUSE, LONGEST_PAUSE))
+        return max(at_least or 0.0, pause_after(self._failures[key], FIRST_PAUSE, LONGEST_PAUSE))
 
 
 def _heed_cancellation() -> None:

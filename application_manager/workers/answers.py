@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Exceeded:
-    """The answer to a question whose job was ended; the text says by which limit."""
+    """The answer to a question whose job was ended; the text names the limit."""
 
     message: str
 
@@ -53,7 +53,7 @@ class AnswerCache:
         self._limit = kept
         self._size = 0
         self._kept: OrderedDict[Hashable, _Kept] = OrderedDict()
-        self._asked: dict[Hashable, asyncio.Task[None]] = {}
+        self._requested: dict[Hashable, asyncio.Task[None]] = {}
 
     def answer(
         self, key: Hashable, question: object, namespace: str, job: Callable[[], Job[object]], done: Callable[[], None]
@@ -65,15 +65,15 @@ class AnswerCache:
             question: what the answer follows from; compared with that of the answer that is there.
             namespace: whose CPU time it takes.
             job: makes the job.
-            done: called once, however the job ends; who still wants the answer asks again.
+            done: called once, however the job ends; who still wants the answer requests it again.
         """
         known = self._kept.get(key)
         if known is not None and known.question == question and time.monotonic() < known.until:
             self._kept.move_to_end(key)
             return known.answer if isinstance(known.answer, Exceeded) else unpickled(known.answer)
-        if key not in self._asked:
+        if key not in self._requested:
             work = self._work(key, question, namespace, job(), done)
-            self._asked[key] = asyncio.create_task(work, name="answer of a worker process")
+            self._requested[key] = asyncio.create_task(work, name="answer of a worker process")
         return None
 
     def forget(self, key: Hashable) -> None:
@@ -84,7 +84,7 @@ class AnswerCache:
 
     async def close(self) -> None:
         """End all work."""
-        tasks = list(self._asked.values())
+        tasks = list(self._requested.values())
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -99,11 +99,11 @@ class AnswerCache:
         except JobError as error:
             log.error("%s: %s; tried again", key, error)
             await asyncio.sleep(1.0)
-            del self._asked[key]
+            del self._requested[key]
             done()
             return
         self._keep(key, question, answer)
-        del self._asked[key]
+        del self._requested[key]
         done()
 
     def _keep(self, key: Hashable, question: object, answer: bytes | Exceeded) -> None:

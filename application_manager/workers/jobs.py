@@ -46,7 +46,7 @@ class RenderJob:
     Attributes:
         uid, generation: the template's.
         template: the template, pickled.
-        chart: what became of the instance's chart, where that was asked for.
+        chart: what became of the instance's chart, where that was requested.
     """
 
     uid: str
@@ -58,10 +58,10 @@ class RenderJob:
 
     def run(self) -> Rendering | Problem | ChartRequest:
         """The objects, or why there are none, or the chart that is to be rendered first."""
-        asked: list[ChartRequest] = []
+        requested: list[ChartRequest] = []
 
         def charts(request: ChartRequest) -> ChartOutcome:
-            asked.append(request)
+            requested.append(request)
             if self.chart is None:
                 raise _ChartWantedError
             return self.chart
@@ -69,7 +69,7 @@ class RenderJob:
         try:
             return self._renderer().render(self.instance, charts)
         except _ChartWantedError:
-            return asked[0]
+            return requested[0]
         except RenderError as error:
             return Problem(error.reason, str(error))
 
@@ -98,7 +98,7 @@ class _ChartWantedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ClaimJob:
-    """What a task asks for of its template."""
+    """What a task requests of its template."""
 
     template: ApplicationTemplate
     task: ApplicationTask

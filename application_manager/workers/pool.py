@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class ExceededError(Exception):
-    """A job that was ended; the text says by which limit."""
+    """A job that was ended; the text names the limit."""
 
 
 class JobError(Exception):
@@ -125,7 +125,7 @@ class Pool:
         """The next job: of the namespace that has used the least among those of which none is running."""
         now = time.monotonic()
         for namespace in [each for each, tickets in self._waiting.items() if all(t.answer.done() for t in tickets)]:
-            del self._waiting[namespace]  # who asked has gone
+            del self._waiting[namespace]  # nobody waits for it
         free = [each for each in self._waiting if not self._running[each]]
         if not free:
             return None
@@ -169,7 +169,7 @@ class Pool:
         self._idle.append(child)
 
     async def _do(self, ticket: _Ticket, child: Child) -> Child:
-        """Do one job; the process to go on with."""
+        """Do one job; the process for the next one."""
         began = time.monotonic()
         try:
             answer, used = await child.do(ticket.job)

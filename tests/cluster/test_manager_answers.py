@@ -94,7 +94,7 @@ def test_explain_goes_from_the_event_over_merged_values_to_the_pods(
     for line in (
         "event: scene of car1, started 2026-01-02T03:04:05Z",
         "distance = 7",
-        "asked for by detector town, holder town",
+        "requested by detector town, holder town",
         "rate = 9 (merge Max)",
         "5 of one (car1) is outbid: a larger value counts",
         "9 of two is it",

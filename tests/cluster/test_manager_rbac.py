@@ -16,7 +16,7 @@ import yaml
 
 from application_manager.cluster.client import Client
 from application_manager.cluster.connection import load_configuration
-from application_manager.cluster.entitlement import lacking
+from application_manager.cluster.entitlement import missing_rights
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.objects.policy import PLURALS as ALL_PLURALS
 from application_manager.core.objects.policy import Policy
@@ -303,8 +303,8 @@ def test_each_verb_that_lacks_is_noticed(
         async def ask() -> list[Verb]:
             client = Client(await load_configuration())
             try:
-                found = await lacking(client, needed, [namespace])
-                found += await lacking(client, lease_rights("application-manager"), [namespace])
+                found = await missing_rights(client, needed, [namespace])
+                found += await missing_rights(client, lease_rights("application-manager"), [namespace])
             finally:
                 await client.close()
             return sorted({(right.group, right.resource, verb) for right, verb, _ in found})

@@ -1,4 +1,4 @@
-"""What one task asks for by itself: an instance and values for it, or why it cannot be had.
+"""What one task requests by itself: an instance and values for it, or why it cannot be had.
 
 Pure, and independent of all other tasks: it depends on the task's spec and on the template's parameters and key only.
 """
@@ -90,7 +90,7 @@ class InvalidTemplate:
 
 
 def claim(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Refusal:
-    """What the task asks for of its template, None where there is no such template."""
+    """What the task requests of its template, None where there is no such template."""
     if isinstance(template, InvalidTemplate):
         message = f"spec.template: ApplicationTemplate {template.name} is not valid: {template.problem}"
         return Refusal(Refused.TEMPLATE_INVALID, f"{message}; correct the template")
@@ -144,14 +144,14 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
         return Refusal(
             Refused.INVALID_KEY,
             f"spec.parameters.{missing[0]}: is missing, and the key of template {template.name}, {template.spec.key}, "
-            "needs it to tell the instance: give it, or give none of the key's parameters to mean all instances",
+            "needs it to identify the instance: give it, or give none of the key's parameters to mean all instances",
         )
     key = _key_or_refusal(template, given)
     return key if isinstance(key, Refusal) else Claim(task, instance_name(template.name, key), key, rest)
 
 
 def _which(of_key: frozenset[str]) -> str:
-    return f" (the key's, {', '.join(sorted(of_key))}, only say which instance is meant)" if of_key else ""
+    return f" (the key's, {', '.join(sorted(of_key))}, only identify the instance)" if of_key else ""
 
 
 def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> str | Refusal:

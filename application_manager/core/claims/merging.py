@@ -1,4 +1,4 @@
-"""Several demands made one: the values of tasks, merged parameter by parameter as the template says.
+"""Several demands made one: the values of tasks, merged parameter by parameter by the template's strategies.
 
 Pure. The contributions come in their order of precedence, and nothing else about them matters: which of them arrived
 first, or how often, has no influence. A default counts only where nobody gives the parameter, so it is not added here.
@@ -41,7 +41,7 @@ class Conflict:
         return (
             f"spec.parameters.{self.parameter}: {values.shown(self.value)} differs from {values.shown(self.other)} of "
             f"{whose}, and its merge strategy is Same: give the same value, {until}"
-            "or let the template's key tell the two apart"
+            "or let the template's key distinguish the two"
         )
 
 
@@ -67,14 +67,14 @@ def merge(
 ) -> Merged:
     """Merge the tasks' values, which fit the template, in the order given: the first of them has precedence.
 
-    What the baseline says, all must agree with where the strategy is Same; elsewhere it has the lowest priority.
+    All must agree with the baseline where the strategy is Same; elsewhere it has the lowest priority.
     """
-    taken, conflicts = _agreeing(declared, contributions, baseline or {})
-    said = [each.parameters for each in taken] + ([baseline] if baseline is not None else [])
+    agreeing, conflicts = _agreeing(declared, contributions, baseline or {})
+    values_of = [each.parameters for each in agreeing] + ([baseline] if baseline is not None else [])
     result: dict[str, Any] = {}
     capped: list[str] = []
     for name, parameter in declared.items():
-        given = [each[name] for each in said if name in each]
+        given = [each[name] for each in values_of if name in each]
         if not given:
             continue
         value = _merged(parameter.merge, given)
@@ -95,7 +95,7 @@ def _agreeing(
     """Those that take part: greedily in their order, each that agrees with all before it where all must agree."""
     same = {name for name, each in declared.items() if each.merge is Merge.SAME}
     agreed: dict[str, tuple[Any, str | None]] = {name: (baseline[name], None) for name in same & baseline.keys()}
-    taken: list[Contribution] = []
+    agreeing: list[Contribution] = []
     conflicts: dict[str, Conflict] = {}
     for each in contributions:
         for name in sorted(same & each.parameters.keys() & agreed.keys()):
@@ -104,10 +104,10 @@ def _agreeing(
                 conflicts[each.task] = Conflict(name, each.parameters[name], other, task)
                 break
         else:
-            taken.append(each)
+            agreeing.append(each)
             for name in same & each.parameters.keys() - agreed.keys():
                 agreed[name] = (each.parameters[name], each.task)
-    return taken, conflicts
+    return agreeing, conflicts
 
 
 def _merged(strategy: Merge, given: Sequence[Any]) -> Any:
@@ -139,7 +139,7 @@ def _shown(total: Fraction) -> str:
     try:
         return f"{float(total):g}"
     except OverflowError:
-        return "more than any number can say"
+        return "more than any number can hold"
 
 
 def _within(parameter: Parameter, total: Fraction) -> int | float:

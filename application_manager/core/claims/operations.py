@@ -19,7 +19,7 @@ from wayside.api import ApplicationTemplate
 from wayside.api.operation import Operation
 
 ACCEPTED = "Accepted"
-"""Reason of the condition Accepted of a task that counts, and of whom there is nothing more to say."""
+"""Reason of the condition Accepted of a task that counts, without anything else to report."""
 
 NOTHING_RUNS = "NothingRuns"
 """Reason of the condition Accepted of a task that waits for something that it could change or stop."""

@@ -1,4 +1,4 @@
-"""What tasks say, checked against what the template asks for.
+"""The parameters of tasks, checked against those that the template declares.
 
 Pure. A task whose values do not fit is refused as a whole, and then contributes nothing to any parameter.
 """
@@ -91,7 +91,7 @@ def _remedy(parameter: Parameter) -> str:
 
 
 def baseline(template: ApplicationTemplate) -> dict[str, Any] | None:
-    """The values of the template's baseline; None where it has none, or one that does not fit, which it is told."""
+    """The values of the template's baseline; None where it has none, or a wrong one, which its status reports."""
     spec = template.spec
     if spec.baseline is None or _baseline_problems(template):
         return None
@@ -99,10 +99,10 @@ def baseline(template: ApplicationTemplate) -> dict[str, Any] | None:
 
 
 def _baseline_problems(template: ApplicationTemplate) -> list[str]:
-    said = template.spec.baseline
-    if said is None:
+    given_baseline = template.spec.baseline
+    if given_baseline is None:
         return []
-    return problems(template.spec.parameters, said.parameters, template.name, "spec.baseline.parameters")
+    return problems(template.spec.parameters, given_baseline.parameters, template.name, "spec.baseline.parameters")
 
 
 def template_problems(template: ApplicationTemplate) -> list[str]:

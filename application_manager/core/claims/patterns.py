@@ -34,7 +34,7 @@ def pattern_problem(pattern: str) -> str | None:
 def mismatch(pattern: str, value: Any) -> str | None:
     """Why the text, or the array of texts, does not match the pattern; None if it does, or if the pattern is none."""
     if pattern_problem(pattern):
-        return None  # the template is told, and not the task
+        return None  # the status of the template reports it, not that of the task
     for index, text in enumerate(value if isinstance(value, list) else [value]):
         which = f"item {index}, {values.shown(text)}," if isinstance(value, list) else values.shown(text)
         if (size := len(text.encode(errors="replace"))) > LONGEST_INPUT:

@@ -1,7 +1,7 @@
-"""What people say of an instance by annotations: leave it as it is (pause), or keep it running (hold). Pure.
+"""What people request of an instance by annotations: leave it as it is (pause), or keep it running (hold). Pure.
 
-An annotation counts by being there, whatever its value, which may say who wants it and why; only `false` is as if it
-were absent. Both are conditions of the instance's status while they hold, and say so once more when they are gone.
+An annotation counts by being there, whatever its value, which may name who wants it and why; only `false` is as if it
+were absent. Both are conditions of the instance's status while they hold, and are False once it is gone.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ _CONDITIONS = (
     ("Paused", PAUSE_ANNOTATION, "the instance and its objects are left as they are"),
     ("Held", HOLD_ANNOTATION, "the instance is kept, demanded or not"),
 )
-_BARE = frozenset({"", "true"})  # values that say nothing more
+_BARE = frozenset({"", "true"})  # values without a reason
 
 
 def is_paused(instance: ApplicationInstance) -> bool:
     """Whether the instance is to be left as it is."""
-    return _said(instance, PAUSE_ANNOTATION) is not None
+    return _reason(instance, PAUSE_ANNOTATION) is not None
 
 
 def is_held(instance: ApplicationInstance) -> bool:
     """Whether the instance is to be kept though nobody demands it."""
-    return _said(instance, HOLD_ANNOTATION) is not None
+    return _reason(instance, HOLD_ANNOTATION) is not None
 
 
 def aspects(instance: ApplicationInstance) -> Iterator[Aspect]:
     """The conditions Paused and Held: True while the annotation is there, False once it is gone, absent before."""
     known = instance.status.conditions if instance.status else ()
     for type_, annotation, meaning in _CONDITIONS:
-        said = _said(instance, annotation)
-        if said is not None:
-            why = "" if said in _BARE else f" ({said})"
+        reason = _reason(instance, annotation)
+        if reason is not None:
+            why = "" if reason in _BARE else f" ({reason})"
             message = f"{meaning} until the annotation {annotation} is removed{why}"
             yield Aspect(type_, True, f"{type_}ByAnnotation", message)
         elif find(known, type_) is not None:
             yield Aspect(type_, False, f"Not{type_}", f"there is no annotation {annotation}")
 
 
-def _said(instance: ApplicationInstance, annotation: str) -> str | None:
+def _reason(instance: ApplicationInstance, annotation: str) -> str | None:
     value = instance.metadata.annotations.get(annotation)
     return None if value is None or value.strip().lower() == "false" else value.strip()

@@ -106,8 +106,8 @@ def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_ma
     if unlimited is None:
         return Request(None, None)
     template = indexes.template(unlimited.template)
-    asked = candidate(unlimited, indexes.instance(name), template, being_made=being_made)
-    return Request(asked, unlimited.next_change)
+    wanted = candidate(unlimited, indexes.instance(name), template, being_made=being_made)
+    return Request(wanted, unlimited.next_change)
 
 
 def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float) -> Fallback | None:
@@ -201,7 +201,7 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
 
 
 def _was_served(task: ApplicationTask) -> bool:
-    """Whether the task's status says that its instance ran, or gave way to another."""
+    """Whether the task's status shows that its instance ran, or gave way to another."""
     conditions = task.status.conditions if task.status else ()
     accepted = find(conditions, "Accepted")
     applied = task.status is not None and task.status.applied_time is not None

@@ -28,11 +28,11 @@ class Decision:
         baseline: whether the template demands it by itself.
         suspended: whether it is to be at zero; None where that stays as it is.
         suspender: the task that suspends it.
-        rank: of the demand, which says who has a place where there is a limit; None where nobody demands it.
+        rank: of the demand, which determines who has a place where there is a limit; None where nobody demands it.
         ran: whether a task that demands it was served before.
         yields: why it goes though its time has not come: another has its place.
         overdue: the readyTimeout that it is beyond; empty where it is not.
-        fallback: what its tasks turn to meanwhile, if its template says so.
+        fallback: what its tasks turn to meanwhile, if its template has a fallback.
         stands_in_for: the instances that are not ready, and whose tasks it serves.
         borrowed: these tasks, of which it has not the last word.
     """

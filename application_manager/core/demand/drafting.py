@@ -74,8 +74,8 @@ EXPRESSION_LIMIT = "ExpressionLimit"
 """The reason of the condition Applied where the expressions of the template take more than they may."""
 
 
-def lacking(wanted: ApplicationInstance, template: TemplateState) -> Aspect | None:
-    """Why the instance has no objects, where that is for want of a template, as the condition Applied says it."""
+def without_template(wanted: ApplicationInstance, template: TemplateState) -> Aspect | None:
+    """Why the instance has no objects, where that is for want of a template, as the condition Applied has it."""
     of = wanted.spec.template
     if template is None:
         message = (

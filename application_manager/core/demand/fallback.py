@@ -1,7 +1,7 @@
 """What a demand turns to when its application does not become ready: `lifecycle.readyTimeout` and `fallback`. Pure.
 
 An instance is overdue once it has not been ready for `readyTimeout` in one go, and no longer so once it has been ready
-for as long in one go: both are told by conditions of its status with their times of transition, so a restart of the
+for as long in one go: both are shown by conditions of its status with their times of transition, so a restart of the
 manager changes nothing, and what is ready for a moment now and then does not flap. While it is overdue, its tasks also
 claim an instance of the fallback template, with those of their parameters that it knows; the overdue one stays, and
 tries on. A fallback has no fallback of its own for what it took over.
@@ -30,7 +30,7 @@ FALLEN_BACK = "FallenBack"
 """Reason of the condition Accepted of a task that the fallback serves."""
 
 FALLBACK_FAILED = "FallbackFailed"
-"""The same where the fallback cannot, as the message says."""
+"""The same where the fallback cannot, for the reason in the message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def fallback(
     name = fallback_of(template)
     if name is None:
         return None
-    taken: list[Claim] = []
+    claims_there: list[Claim] = []
     refused: dict[str, str] = {}
     for each in claims:
         if each.operation is not Operation.DEPLOY or each.instead_of:
@@ -118,8 +118,8 @@ def fallback(
         if isinstance(result, Refusal):
             refused[each.task.name] = result.message
         else:
-            taken.append(replace(result, task=each.task, instead_of=instance, fallback=name))
-    return Fallback(name, tuple(taken), refused)
+            claims_there.append(replace(result, task=each.task, instead_of=instance, fallback=name))
+    return Fallback(name, tuple(claims_there), refused)
 
 
 def _claim(other: ApplicationTemplate | InvalidTemplate, each: Claim) -> Claim | Refusal:

@@ -19,7 +19,7 @@ def written_deadline(instance: ApplicationInstance) -> float | None:
 
 
 def linger_of(instance: ApplicationInstance, template: ApplicationTemplate | None) -> Duration:
-    """How long the instance lingers: as its template says, or said while there was one."""
+    """How long the instance lingers: by its template, or by what that had while there was one."""
     if template is not None:
         return template.spec.lifecycle.linger
     noted = instance.metadata.annotations.get(LINGER_ANNOTATION)

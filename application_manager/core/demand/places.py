@@ -60,7 +60,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How many instances there may be: of each template that says so, and in the namespace."""
+    """How many instances there may be: of each template with a limit, and in the namespace."""
 
     templates: Mapping[str, int] = field(default_factory=dict)
     namespace: int | None = None
@@ -76,7 +76,7 @@ class Place:
     Attributes:
         given: whether it runs, or stays; otherwise it does not start, and goes if it is there.
         preempts: the one whose place it has, in words; empty where there is none.
-        awaits: of one that is to run: whom it waits for to be gone, in words; empty where it may start.
+        awaits: of one that is to run: the instances that must be gone first, in words; empty where it may start.
         limit: of one that is not to run: the limit that it is beyond, in words.
         yields_to: of one that is not to run and did before: who has its place, in words.
         outbid_from: of one that is not to run: the priority that would have a place; None where none would.
@@ -133,13 +133,13 @@ class Placement:
 
     def updated(self, requests: Mapping[str, Request], limits: Limits, now: float) -> Placement:
         """The placement with these requests in place of the instances' former ones."""
-        news = {name: each for name, each in requests.items() if self.requests.get(name, _NOTHING) != each}
+        changed = {name: each for name, each in requests.items() if self.requests.get(name, _NOTHING) != each}
         stale = now >= self.until or limits != self.limits
-        if not news and not stale:
+        if not changed and not stale:
             return self
-        merged = {name: each for name, each in {**self.requests, **news}.items() if each != _NOTHING}
+        merged = {name: each for name, each in {**self.requests, **changed}.items() if each != _NOTHING}
         if not stale and all(
-            self.requests.get(name, _NOTHING).candidate == each.candidate for name, each in news.items()
+            self.requests.get(name, _NOTHING).candidate == each.candidate for name, each in changed.items()
         ):
             return replace(self, requests=merged)
         candidates = [each.candidate for each in merged.values() if each.candidate is not None]

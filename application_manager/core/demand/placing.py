@@ -1,4 +1,4 @@
-"""Bringing limits to bear: what a decision by itself asks for, and what becomes of it once places are given. Pure."""
+"""Limits: what a decision by itself requests, and what becomes of it once places are given. Pure."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def candidate(
     *,
     being_made: bool = False,
 ) -> Candidate | None:
-    """What the decision asks for; None where that is nothing, or the instance is a person's, beyond all limits."""
+    """What the decision requests; None where that is nothing, or the instance is a person's, beyond all limits."""
     if instance is not None and not is_managed(instance):
         return None
     if instance is None and decision.rank is None:

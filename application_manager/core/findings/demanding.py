@@ -51,8 +51,8 @@ def deploy_remarks(
 
 def _of_parameters(deploy: Deploy, template: ApplicationTemplate, where: str) -> Iterator[str]:
     declared, given = template.spec.parameters, deploy.parameters
-    told = {name: each for name, each in given.items() if name not in declared or "${" not in json.dumps(each)}
-    yield from parameters.problems(declared, told, template.name, where, whole=False)
+    literal = {name: each for name, each in given.items() if name not in declared or "${" not in json.dumps(each)}
+    yield from parameters.problems(declared, literal, template.name, where, whole=False)
     if deploy.operation is Operation.DEPLOY:
         for name, parameter in declared.items():
             if parameter.required and given.get(name) is None:

@@ -23,12 +23,12 @@ class Example:
     Attributes:
         given: those that tasks give; defaults come in besides.
         made_up: the names of those whose value is no task's, nor the template's.
-        said: when it is so, to end a sentence.
+        phrase: when it is so, to end a sentence.
     """
 
     given: Mapping[str, Any]
     made_up: frozenset[str]
-    said: str
+    phrase: str
 
 
 def examples(template: ApplicationTemplate) -> tuple[Example, ...]:
@@ -74,7 +74,7 @@ def example_of(parameter: Parameter) -> Any:
 
 
 def is_open(parameter: Parameter) -> bool:
-    """Whether values may be of a shape that cannot be guessed, so that an example that fails says nothing."""
+    """Whether values may be of a shape that cannot be guessed, so that an example that fails proves nothing."""
     shapeless = parameter.type in (ParameterType.OBJECT, ParameterType.ARRAY) or parameter.pattern is not None
     return shapeless and not _is_real(parameter)
 

@@ -1,7 +1,7 @@
-"""Whether a pod gets the detector that its label names, and the answer to the API server, which asks on its way. Pure.
+"""Whether a pod gets the detector that its label names, and the answer to the API server's request. Pure.
 
-A pod is never refused. Where it cannot have its detector it is made without, a warning says why to who made it, and
-later an Event of the pod says it to everybody.
+A pod is never refused. Where it cannot have its detector it is made without, a warning gives the reason to who made it,
+and later an Event of the pod gives it to everybody.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager.core.findings.reviews import REVIEW_VERSION, Json, ReviewError, told
+from application_manager.core.findings.reviews import REVIEW_VERSION, Json, ReviewError, shortened
 from application_manager.core.findings.rulefindings import detector_findings
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import SIDECAR_LABEL, Addition, UnfitError, addition, patch
@@ -47,7 +47,7 @@ class Injection:
 
     Attributes:
         addition: what it gets; None: nothing.
-        why_not: why it gets nothing; None also where it has its detector already, or asks for none.
+        why_not: why it gets nothing; None also where it has its detector already, or requests none.
     """
 
     addition: Addition | None = None
@@ -55,7 +55,7 @@ class Injection:
 
 
 def detector_of(metadata: Mapping[str, Any] | None) -> str | None:
-    """The Detector that a pod, or the template of pods, with this metadata asks for; None: none."""
+    """The Detector that a pod, or the template of pods, with this metadata requests; None: none."""
     name = ((metadata or {}).get("labels") or {}).get(SIDECAR_LABEL)
     return None if name is None else str(name)
 
@@ -73,7 +73,7 @@ def injection(
         metadata: of the pod, or of the template that it is made from.
         spec: likewise.
         namespace: the pod's, for messages.
-        detector: the one of that namespace that it asks for; None where there is none that can be read.
+        detector: the one of that namespace that it requests; None where there is none that can be read.
         defaults: what holds for all detectors; None where the manager runs none.
     """
     name = detector_of(metadata)
@@ -103,7 +103,7 @@ def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], de
         listed = f"only {', '.join(names)}" if names else "none"
         return f"spec.serviceAccountName: serviceAccountNames of Detector {name} has {listed}, not {account}: add it"
     if detector_findings(detector).problems:
-        return f"Detector {name} is not accepted: its condition Accepted says why"
+        return f"Detector {name} is not accepted: its condition Accepted gives the reason"
     if _MIRROR in (metadata.get("annotations") or {}):
         return "a static pod has no account: make it by the API server"
     return None
@@ -113,15 +113,15 @@ def read_pod(review: Any) -> PodRequest:
     """The question in an AdmissionReview about a pod. Raises ReviewError."""
     if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
         raise ReviewError(f"is no AdmissionReview of {REVIEW_VERSION}: only the API server has business here")
-    asked = review.get("request")
-    if not isinstance(asked, dict) or not isinstance(asked.get("uid"), str):
+    raw = review.get("request")
+    if not isinstance(raw, dict) or not isinstance(raw.get("uid"), str):
         raise ReviewError("request.uid: is missing: only the API server has business here")
-    pod, kind = asked.get("object"), asked.get("kind")
-    made = asked.get("operation") == "CREATE" and not asked.get("subResource")
+    pod, kind = raw.get("object"), raw.get("kind")
+    made = raw.get("operation") == "CREATE" and not raw.get("subResource")
     ours = isinstance(kind, dict) and (kind.get("group"), kind.get("kind")) == ("", "Pod")
     if not (made and ours and isinstance(pod, dict) and isinstance(pod.get("spec"), dict)):
         pod = {}
-    return PodRequest(asked["uid"], str(asked.get("namespace") or ""), pod)
+    return PodRequest(raw["uid"], str(raw.get("namespace") or ""), pod)
 
 
 def answer_pod(request: PodRequest, found: Injection) -> Json:
@@ -131,5 +131,5 @@ def answer_pod(request: PodRequest, found: Injection) -> Json:
         operations = json.dumps(patch(request.pod["spec"], found.addition)).encode()
         response |= {"patchType": "JSONPatch", "patch": base64.b64encode(operations).decode()}
     if found.why_not is not None:
-        response["warnings"] = told((f"it is made without a detector: {found.why_not}",))
+        response["warnings"] = shortened((f"it is made without a detector: {found.why_not}",))
     return {"apiVersion": REVIEW_VERSION, "kind": "AdmissionReview", "response": response}

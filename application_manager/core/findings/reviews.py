@@ -1,4 +1,4 @@
-"""AdmissionReviews: what the API server asks before it stores an object of ours, and what it is answered. Pure.
+"""AdmissionReviews: the API server's requests before it stores an object of ours, and the answers. Pure.
 
 Only a new spec can be refused. Whatever leaves the spec as it is passes, also of an object that was wrong all along:
 else nobody could label it, and a finalizer could never be removed. Deleting passes, and so does what is going anyway.
@@ -61,32 +61,32 @@ def read(review: Any) -> Request:
     """The question in an AdmissionReview. Raises ReviewError."""
     if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
         raise ReviewError(f"is no AdmissionReview of {REVIEW_VERSION}: only the API server has business here")
-    asked = review.get("request")
-    if not isinstance(asked, dict) or not isinstance(asked.get("uid"), str):
+    raw = review.get("request")
+    if not isinstance(raw, dict) or not isinstance(raw.get("uid"), str):
         raise ReviewError("request.uid: is missing: only the API server has business here")
-    kind, new, old = (asked.get(name) for name in ("kind", "object", "oldObject"))
+    kind, new, old = (raw.get(name) for name in ("kind", "object", "oldObject"))
     kind = kind if isinstance(kind, dict) else {}
     new = dict(new) if isinstance(new, dict) else {}
     old = old if isinstance(old, dict) else None
     ours = kind.get("group") == GROUP and kind.get("kind") in REVIEWED
-    name, namespace = str(kind["kind"]) if ours else "", _line(str(asked.get("namespace") or ""))
+    name, namespace = str(kind["kind"]) if ours else "", _line(str(raw.get("namespace") or ""))
     if ours and new:
         new |= {"apiVersion": API_VERSION, "kind": name}
-        named = {"name": asked.get("name") or "unnamed", **_metadata(new), "namespace": namespace}
+        named = {"name": raw.get("name") or "unnamed", **_metadata(new), "namespace": namespace}
         new["metadata"] = named
-    weight = _weight(asked, new, old) if ours else Weight.NONE
-    return Request(asked["uid"], name, namespace, new, old, weight)
+    weight = _weight(raw, new, old) if ours else Weight.NONE
+    return Request(raw["uid"], name, namespace, new, old, weight)
 
 
-def _weight(asked: Mapping[str, Any], new: Json, old: Json | None) -> Weight:
-    operation = asked.get("operation")
-    if operation not in ("CREATE", "UPDATE") or asked.get("subResource") or not new:
+def _weight(raw: Mapping[str, Any], new: Json, old: Json | None) -> Weight:
+    operation = raw.get("operation")
+    if operation not in ("CREATE", "UPDATE") or raw.get("subResource") or not new:
         return Weight.NONE
     if _metadata(new).get("deletionTimestamp"):
         return Weight.NONE
     if operation == "CREATE" or old is None or new.get("spec") != old.get("spec"):
         return Weight.REFUSED
-    # Labels say which Detectors select a rule.
+    # Labels determine which Detectors select a rule.
     return Weight.WARNED if _metadata(new).get("labels") != _metadata(old).get("labels") else Weight.NONE
 
 
@@ -98,9 +98,9 @@ def answer(request: Request, findings: Findings) -> Json:
     response: Json = {"uid": request.uid, "allowed": not refused}
     warnings = findings.warnings if refused else findings.all
     if warnings:
-        response["warnings"] = told(warnings)
+        response["warnings"] = shortened(warnings)
     if refused:
-        problems = told(findings.problems)
+        problems = shortened(findings.problems)
         response["status"] = {
             "status": "Failure",
             "code": 422,
@@ -122,7 +122,7 @@ def _cause(problem: str) -> Json:
     return {"reason": "FieldValueInvalid", "field": field or "spec", "message": message}
 
 
-def told(texts: tuple[str, ...]) -> list[str]:
+def shortened(texts: tuple[str, ...]) -> list[str]:
     """The texts as headers can hold them, the first of them where there are many."""
     lines = [_line(each) for each in texts[:MOST_TOLD]]
     left = len(texts) - len(lines)

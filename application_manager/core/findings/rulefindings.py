@@ -1,4 +1,4 @@
-"""What is wrong with EventRules and Detectors, as far as can be told without the message types. Pure.
+"""What is wrong with EventRules and Detectors, as far as can be known without the message types. Pure.
 
 The same compiler that the detector runs judges here. A rule is judged with all Detectors that select it. What the rule
 alone has, or has with every one of them, is its own fault; what only some have, what stands in a field of theirs, and
@@ -119,4 +119,4 @@ def _remedies(detectors: Sequence[Detector], invalid: Sequence[str]) -> Iterator
     wanted = [f"{each.name} selects {each.spec.rules}" for each in sorted(detectors, key=lambda each: each.name)]
     if wanted:
         yield f"correct metadata.labels: {'; '.join(wanted)}"
-    yield from (f"correct Detector {name}, whose status says what is wrong with it" for name in sorted(invalid))
+    yield from (f"correct Detector {name}, whose status shows what is wrong with it" for name in sorted(invalid))

@@ -2,7 +2,7 @@
 
 It is compiled, its expressions are checked for the types of the parameters they read, and it is rendered on examples.
 What fails on an example counts against the template only if no value of a task could change it; else it is a remark,
-and where the example can say nothing, it is nothing.
+and where the example proves nothing, it is nothing.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _on_examples(template: ApplicationTemplate, policy: Policy) -> Findings:
             if not read & example.made_up:
                 problems.append(problem)
             elif not read & unguessable & example.given.keys():
-                remarks.append(Finding(FAILING_EXAMPLE.name, f"{problem}; so it is {example.said}"))
+                remarks.append(Finding(FAILING_EXAMPLE.name, f"{problem}; so it is {example.phrase}"))
     if FAILING_EXAMPLE.name in ignored_by(template.metadata.annotations):
         remarks.clear()
     return Findings(tuple(dict.fromkeys(problems)), remarks=tuple(dict.fromkeys(remarks)))
@@ -144,7 +144,7 @@ def _no_objects(_: ChartRequest) -> ChartOutcome:
 
 
 def _read(problem: str, template: ApplicationTemplate, reads: Reads) -> frozenset[str]:
-    """The parameters that what is said to be wrong may depend on."""
+    """The parameters that a problem may depend on."""
     field = field_of(problem)
     if field == "spec.key":
         return claims.key_parameters(template)

@@ -1,9 +1,9 @@
-"""The configurations by which the API server asks the manager about objects that are to be stored. Pure.
+"""The configurations by which the API server requests the manager's review of objects before it stores them. Pure.
 
 A ValidatingWebhookConfiguration for templates, rules and detectors, and a MutatingWebhookConfiguration for pods that
 ask for a detector. What makes them safe to have is here: failurePolicy Ignore and a short timeout, so that a manager
-that is away or hangs delays a change and never prevents it; new specs only, of three kinds, and new pods only that bear
-the label; and no side effects, so that a dry run asks as well.
+that is away or hangs delays a change and never prevents it; new specs only, of three kinds, and new pods only that have
+the label; and no side effects, so that a dry run is reviewed as well.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Whether any node is as an object's pods require it, in words that name the field and the value. Pure.
 
 What is looked at is what a template renders from parameters: `nodeName`, `nodeSelector`, and the node affinity that is
-required. Taints, room and all else are the scheduler's to tell, on the pod.
+required. Taints, room and all else are the scheduler's to report, on the pod.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _holds(operator: str, value: str | None, values: list[str]) -> bool:
             except (ValueError, IndexError):
                 return False
             return have > limit if operator == "Gt" else have < limit
-    return True  # an operator of the future: the scheduler will tell
+    return True  # an operator of the future: the scheduler will report it
 
 
 def _instead(key: str, nodes: Nodes) -> str:

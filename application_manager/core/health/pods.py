@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-_LONGEST = 600  # characters of what a kubelet or a scheduler says
+_LONGEST = 600  # characters of a message of a kubelet or a scheduler
 
 _IMAGE = frozenset(
     {
@@ -56,7 +56,7 @@ class Trouble:
 
     Attributes:
         message: names the image or container, and the cause; the same for all pods that have the same trouble.
-        hint: where to look further, which names the pod; empty where the message says it all.
+        hint: where to look further, which names the pod; empty where the message is complete.
     """
 
     reason: TroubleReason
@@ -149,7 +149,7 @@ def _ending(ended: Mapping[str, Any]) -> str:
 
 
 def _pull_cause(message: str) -> str:
-    """The cause of a failed pull, without what says that it is being tried again."""
+    """The cause of a failed pull, without the words about the next attempt."""
     return _plain(re.sub(r'^Back-off pulling image "[^"]*"(: )?', "", message).removeprefix("ErrImagePull: "))
 
 

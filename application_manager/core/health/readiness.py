@@ -1,7 +1,7 @@
 """Whether an object that exists also does its work, judged by its status. Pure.
 
 The rules are those of `kubectl rollout status` for workloads and of the conditions Ready and Available for all else. A
-kind that says neither is ready by being there.
+kind without either is ready by being there.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _claim(status: Mapping[str, Any]) -> str | None:
 
 
 def _by_conditions(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
-    """Why an object of any other kind is not ready, as its condition Ready, else Available, says."""
+    """Why an object of any other kind is not ready, as its condition Ready, else Available, has it."""
     if not isinstance(status, Mapping) or not isinstance(status.get("conditions", []), list):
         return None  # a kind with a status of another shape
     for type_ in ("Ready", "Available"):

@@ -1,4 +1,4 @@
-"""What the cluster's own rules refuse: quotas, limit ranges, admission. Told from what the API server says. Pure."""
+"""Refusals by quotas, limit ranges and admission, recognised by the messages of the API server. Pure."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def with_remedy(reason: str, message: str) -> str:
 
 
 def refused_pods(live: Mapping[str, Any]) -> Trouble | None:
-    """Why the pods of a Deployment or ReplicaSet are refused, if they are; of the others only Events tell it."""
+    """Why the pods of a Deployment or ReplicaSet are refused, if they are; of the others only Events report it."""
     if live.get("kind") not in ("Deployment", "ReplicaSet"):
         return None
     for each in (live.get("status") or {}).get("conditions") or ():
@@ -56,7 +56,7 @@ def refused_pods(live: Mapping[str, Any]) -> Trouble | None:
 
 
 def lacks_pods(live: Mapping[str, Any]) -> bool:
-    """Whether the controller of a StatefulSet, DaemonSet or Job has yet to make pods, and only its Events say why."""
+    """Whether a StatefulSet, DaemonSet or Job lacks pods that its controller makes; only Events give the reason."""
     spec, status = live.get("spec") or {}, live.get("status") or {}
     match live.get("kind"):
         case "StatefulSet":
@@ -74,8 +74,8 @@ def refused_by_events(events: Iterable[Mapping[str, Any]], now: float) -> Troubl
 
     `now` is in seconds since 1970. The controllers try again after 17 minutes at the latest.
     """
-    told = [(_last(each), str(each.get("note", ""))) for each in events if each.get("reason") == FAILED_CREATE]
-    at, note = max(told, default=(0.0, ""))
+    notes = [(_last(each), str(each.get("note", ""))) for each in events if each.get("reason") == FAILED_CREATE]
+    at, note = max(notes, default=(0.0, ""))
     return _trouble(note) if now - at < _RETRIED else None
 
 
@@ -85,9 +85,9 @@ def without_names(message: str) -> str:
 
 
 def _trouble(message: str) -> Trouble:
-    said = without_names(message)
-    reason = TroubleReason(_of_pods(said))
-    return Trouble(reason, with_remedy(reason.value, f"pods are refused: {said}"))
+    short = without_names(message)
+    reason = TroubleReason(_of_pods(short))
+    return Trouble(reason, with_remedy(reason.value, f"pods are refused: {short}"))
 
 
 def _of_pods(message: str) -> str:

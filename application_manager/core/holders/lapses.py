@@ -43,7 +43,7 @@ def _lapse(
 ) -> tuple[Verdict | None, float | None]:
     """The task's verdict where its holder is lost, None where it counts; and when that changes by itself.
 
-    What the status says of a loss survives our own restart: the holder counts as lost until its Lease is seen to be
+    The loss in the status survives our own restart: the holder counts as lost until its Lease is seen to be
     renewed, since a new manager has not observed anything yet.
     """
     holder = task.spec.requester.holder

@@ -3,8 +3,8 @@
 The active one renews the Lease and may act for `DEADLINE` seconds after it *sent* its last renewal that was taken. A
 standby takes the Lease once it has itself *observed it unchanged* for its duration, or at once where it was released.
 Since a renewal is sent before anyone can observe it and the deadline is shorter than the duration, the old one has
-stopped before a new one begins, whatever their clocks say and however long either stood still: every write of the Lease
-carries the resourceVersion that was read, so only one of two can succeed. No time written by others is believed.
+stopped before a new one begins, whatever their clocks show and however long either stood still: every write of the
+Lease carries the resourceVersion that was read, so only one of two can succeed. No time written by others is believed.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Candidate:
 
     @property
     def created(self) -> str:
-        """When the Lease was created, as the API server says; empty while there is none."""
+        """When the Lease was created, by the API server; empty while there is none."""
         return str(self._metadata().get("creationTimestamp", ""))
 
     def observe(self, lease: Mapping[str, Any] | None, now: float) -> None:

@@ -40,7 +40,7 @@ class HealthyTime:
     """Seconds during which we reached the API server.
 
     The time between two looks counts when both succeeded and were at most `longest` seconds apart; a longer gap means
-    that we ourselves stood still, and then nothing can be said about others.
+    that we ourselves stood still, and then nothing is known about others.
     """
 
     def __init__(self, longest: float = 5.0) -> None:
@@ -70,7 +70,7 @@ class _Observation:
     looked: float  # healthy seconds at which it was seen last
     duration: float = DEFAULT_DURATION
     renewed: bool = False
-    seen: bool = True  # else it was only asked for: what is seen first is neither old nor a renewal
+    seen: bool = True  # else it was only requested: what is seen first is neither old nor a renewal
 
 
 @dataclass(slots=True)
@@ -110,8 +110,8 @@ class LeaseIndex:
     def due(self, key: HolderKey, at: float) -> bool:
         """Whether the Lease should be read: it is unchanged for longer than its duration, as far as we know.
 
-        A watch that broke unnoticed looks just like a holder that is lost, so only a look can tell. The longer a
-        Lease was seen to be overdue, the rarer the looks, so that many lost holders cost little.
+        A watch that broke unnoticed looks just like a holder that is lost, so only a look can distinguish them. The
+        longer a Lease was seen to be overdue, the rarer the looks, so that many lost holders cost little.
         """
         known = self._observed.get(key)
         if known is None or not known.seen:

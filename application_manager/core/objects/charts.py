@@ -1,4 +1,4 @@
-"""Helm charts as applications: what is asked of Helm, and the objects in what it answers. Pure.
+"""Helm charts as applications: requests to Helm, and the objects in its output. Pure.
 
 The program itself runs elsewhere. Here a template and an instance become a request, the text that `helm template` gave
 for it becomes objects, and everything that is not applied like a manifest is refused: hooks, which would run at moments
@@ -31,7 +31,7 @@ _HOOK = "helm.sh/hook"
 
 @dataclass(frozen=True, slots=True)
 class ChartSource:
-    """Where a chart is, as the template says."""
+    """Where a chart is, by the template."""
 
     chart: str
     version: str | None = None

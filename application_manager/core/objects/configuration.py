@@ -2,7 +2,7 @@
 
 A ConfigMap of its own, so that a change reaches the running application and never the pod template, which would
 replace the pods. A text stays as it is; a map, a list, a number or a boolean is written in the format that the file's
-extension says.
+extension determines.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Configuration:
             text = _text(name, value)
             if text is None:
                 problems.append(
-                    f"{_path(name)}: is {_kind(value)}, and the name says no format: name the file .yaml or .json, or "
+                    f"{_path(name)}: is {_kind(value)}, and the name has no format: name the file .yaml or .json, or "
                     "give a text"
                 )
             else:
@@ -90,7 +90,7 @@ def _path(name: str) -> str:
 
 
 def _text(name: str, value: Any) -> str | None:
-    """The file's text, None where its name does not say how to write the value."""
+    """The file's text, None where its name does not determine how to write the value."""
     if isinstance(value, str):
         return value
     plain = values.normal(value)

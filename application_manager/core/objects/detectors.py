@@ -3,7 +3,7 @@
 Of one in others' pods (mode Sidecar, see `sidecars`) these are its rights alone, for the accounts of those pods.
 
 Only what is part of the pod stands in the Deployment: the image, resources, volumes and Secrets. All else of the
-Detector, and its rules, the detector follows itself, so a change of these starts nothing anew.
+Detector, and its rules, the detector follows itself, so a change of these restarts nothing.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _deployment(detector: Detector, defaults: PodDefaults) -> Manifest:
 
 
 def _pod(detector: Detector, defaults: PodDefaults) -> Manifest:
-    """The pod, as the restricted Pod Security Standard asks for it."""
+    """The pod, as the restricted Pod Security Standard requires."""
     pod = detector.spec.pod or DetectorPod()
     volumes, mounts = volumes_of(detector, defaults)
     probes = {
@@ -216,11 +216,11 @@ def pull_secrets(detector: Detector, defaults: PodDefaults) -> list[Manifest]:
 
 
 def run_as(defaults: PodDefaults) -> Manifest:
-    """As whom a detector runs, as a security context says it."""
+    """The user of a detector, as a security context has it."""
     return {} if defaults.user is None else {"runAsUser": defaults.user, "runAsGroup": defaults.user}
 
 
-def told(variable: str, path: str) -> Manifest:
+def field_variable(variable: str, path: str) -> Manifest:
     """An environment variable that has a field of the pod, by the downward API."""
     return {"name": variable, "valueFrom": {"fieldRef": {"fieldPath": path}}}
 
@@ -232,14 +232,14 @@ def probe(defaults: PodDefaults, path: str, period: int, failures: int, port_nam
 
 
 def _environment(pod: DetectorPod, defaults: PodDefaults) -> list[Manifest]:
-    """Who the pod is, then what holds for all detectors, unless the Detector says otherwise, then what it says."""
+    """Who the pod is, then what holds for all detectors, unless the Detector gives its own, then what it gives."""
 
     given: dict[str, Manifest] = {name: {"value": value} for name, value in sorted(defaults.environment.items())}
     for each in pod.env:
         given.pop(each.name, None)
         source = each.value_from
         given[each.name] = {"value": each.value or ""} if source is None else {"valueFrom": source.to_json()}
-    own = [told("POD_NAME", "metadata.name"), told("POD_UID", "metadata.uid")]
+    own = [field_variable("POD_NAME", "metadata.name"), field_variable("POD_UID", "metadata.uid")]
     return [*own, *({"name": name, **value} for name, value in given.items())]
 
 

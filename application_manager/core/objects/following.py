@@ -1,8 +1,8 @@
-"""Which pods follow an instance's configuration, and how each shows what it was told last. Pure.
+"""Which pods follow an instance's configuration, and how each shows what it received last. Pure.
 
 The kubelet brings a changed ConfigMap into a pod at its next look at that pod, which may be more than a minute away.
-It looks at once when the pod itself changes, and an annotation is enough. It says which content it stands for, so the
-same content is never told twice.
+It looks at once when the pod itself changes, and an annotation is enough. It names the content that it stands for, so
+the same content is never announced twice.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from application_manager.core.claims import values
 from application_manager.core.objects.configuration import config_map_name
 
 ANNOTATION = "wayside.dev/configuration"
-"""On a pod: `fingerprint` of the configuration that it was told of last."""
+"""On a pod: `fingerprint` of the configuration that was announced to it last."""
 
 Object = Mapping[str, Any]
 
@@ -34,7 +34,7 @@ def selectors(objects: Iterable[Object]) -> tuple[str, ...]:
 
 
 def behind(pods: Iterable[Object], instance: str, content: str) -> Iterator[tuple[str, str]]:
-    """Name and uid of the pods that mount the instance's configuration and were not told of this content."""
+    """Name and uid of the pods that mount the instance's configuration and do not have this content announced."""
     for pod in pods:
         metadata = pod["metadata"]
         going = "deletionTimestamp" in metadata or (pod.get("status") or {}).get("phase") in _OVER

@@ -1,6 +1,6 @@
 """The labels by which an instance's objects, and the pods of its workloads, are found again. Pure.
 
-Pods bear the instance's label alone: it never changes while the instance lives, so it never makes a workload roll out.
+Pods have the instance's label alone: it never changes while the instance lives, so it never makes a workload roll out.
 """
 
 from __future__ import annotations

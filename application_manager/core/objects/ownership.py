@@ -1,4 +1,4 @@
-"""What belongs to whom: the objects of an owner, told from those of others by their controller and uid. Pure."""
+"""The objects of an owner, distinguished from those of others by their controller and uid. Pure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Known:
 
     @classmethod
     def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> Known:
-        """What references say, as `references` makes them."""
+        """The content of references, as `references` makes them."""
         return cls(digest, {(each.api_version, each.kind, each.name): each.uid for each in references})
 
 

@@ -1,4 +1,4 @@
-"""What holds for the pods of all detectors that a manager runs, beside what each Detector says. Pure."""
+"""What holds for the pods of all detectors that a manager runs, beside what each Detector has. Pure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ USER = 65532  # of our image
 
 @dataclass(frozen=True, slots=True)
 class PodDefaults:
-    """As the manager's options say.
+    """From the manager's options.
 
     Attributes:
         image: of Detectors that name none.
@@ -26,7 +26,8 @@ class PodDefaults:
         environment: of the containers, e.g. where traces go; what a Detector gives itself wins.
         metrics_secret: the Secret with tls.crt and tls.key by which they serve metrics and health, in each namespace
             with detectors; None: without TLS.
-        user: as whom they run, and the group of their volumes; None: as the cluster chooses, as OpenShift does.
+        user: the user that they run as, and the group of their volumes; None: as the cluster
+            chooses, as OpenShift does.
     """
 
     image: str

@@ -39,7 +39,7 @@ PLURALS: Mapping[KindKey, str] = {
 """The kinds that are known without a cluster, and what paths and roles call them."""
 
 DEFAULT_KINDS: frozenset[KindKey] = frozenset(PLURALS) - {SECRET}
-"""The kinds that are allowed where the administrator says nothing."""
+"""The kinds that are allowed where the administrator names none."""
 
 _NEVER_KINDS = frozenset({"Role", "RoleBinding", "ClusterRole", "ClusterRoleBinding", "ServiceAccount", "Namespace"})
 _NEVER_GROUPS = frozenset(

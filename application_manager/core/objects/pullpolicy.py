@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class PullPolicy(StrEnum):
-    """When a node asks the registry for an image, as Kubernetes names it."""
+    """When a node pulls an image, as Kubernetes names it."""
 
     ALWAYS = "Always"
     IF_NOT_PRESENT = "IfNotPresent"

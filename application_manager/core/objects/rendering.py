@@ -1,7 +1,7 @@
 """Rendering: a template and an instance give manifests, and the same two give the same bytes.
 
-Pure. A `Renderer` holds a template compiled once; `render` fills in an instance. What the template may not do is said
-with the field, the value and the remedy; then nothing is rendered at all.
+Pure. A `Renderer` holds a template compiled once; `render` fills in an instance. What the template may not do is
+reported with the field, the value and the remedy; then nothing is rendered at all.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Rendering:
     replicas: Mapping[tuple[str, str, str], int | None] = field(default_factory=dict)
 
     def keys(self) -> set[tuple[str, str, str]]:
-        """What tells the objects apart: apiVersion, kind and name of each."""
+        """What identifies the objects: apiVersion, kind and name of each."""
         return {object_key(each) for each in self.manifests}
 
 
@@ -231,7 +231,7 @@ class Renderer:
             )
         for reserved in _RESERVED_METADATA:
             if reserved in metadata:
-                yield f"metadata.{reserved}", "is the manager's to say: remove it"
+                yield f"metadata.{reserved}", "is set by the manager: remove it"
         for member in ("labels", "annotations"):
             texts = metadata.get(member)
             if texts is not None and not isinstance(texts, dict):
@@ -257,7 +257,7 @@ def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
 
 
 def object_key(manifest: Mapping[str, Any]) -> tuple[str, str, str]:
-    """What tells the objects of one instance apart: apiVersion, kind and name."""
+    """What identifies the objects of one instance: apiVersion, kind and name."""
     return manifest["apiVersion"], manifest["kind"], manifest["metadata"]["name"]
 
 

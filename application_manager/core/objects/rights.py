@@ -1,6 +1,6 @@
 """What the manager's account must be allowed to do, from the kinds that templates may create. Pure.
 
-One table, read three times: `application-manager rbac` prints it as roles, a manager that starts asks the API server
+One table, read three times: `application-manager rbac` prints it as roles, a manager that starts queries the API server
 for each of its entries, and the tests hold it against what a manager does. A verb that nothing needs is not in it.
 """
 
@@ -21,7 +21,7 @@ _RBAC = "rbac.authorization.k8s.io"
 _LOOKING = ("list", "watch")
 _READING = frozenset({"get", *_LOOKING})
 _TOLD_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
-"""The kinds whose status does not tell that their pods are refused (core/health/refusals.py)."""
+"""The kinds whose status does not show that their pods are refused (core/health/refusals.py)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Right:
         return {"apiGroups": [self.group], "resources": [self.resource], "verbs": list(self.verbs)} | names
 
     def lack(self, verb: str, where: str) -> str:
-        """What to say where the verb is not allowed; `where` is "in namespace x" or "in all namespaces"."""
+        """The message where the verb is not allowed; `where` is "in namespace x" or "in all namespaces"."""
         of = f" of {self.group}" if self.group else ""
         name = f" {self.name}" if self.name else ""
         return f"its account may not {verb} {self.resource}{name}{of} {where}: {self.purpose}"
@@ -80,7 +80,7 @@ def writing(needed: Iterable[Right]) -> list[Right]:
 
 
 def granting() -> Right:
-    """The right that a manager of all namespaces asks about to learn whether it may write in one."""
+    """The right that a manager of all namespaces queries to learn whether it may write in one."""
     return Right(_GROUP, "applicationtasks/status", ("patch",), "nobody learns how they are")
 
 
@@ -145,7 +145,7 @@ def certificate_rights(secret: str, webhooks: str) -> tuple[list[Right], list[Ri
 
 def node_rights() -> list[Right]:
     """What is of use for the whole cluster, and can be done without: nodes belong to no namespace."""
-    return [Right("", "nodes", ("list",), "that no node is as a template requires is left to the scheduler to say")]
+    return [Right("", "nodes", ("list",), "only the scheduler reports that no node is as a template requires")]
 
 
 def _own() -> Iterator[Right]:
@@ -188,7 +188,10 @@ def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
             yield Right(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
     if _TOLD_BY_EVENTS & plurals.keys():
         yield Right(
-            "events.k8s.io", "events", ("list",), "why pods of other workloads than Deployments are refused is not said"
+            "events.k8s.io",
+            "events",
+            ("list",),
+            "statuses lack the reason why pods of other workloads than Deployments are refused",
         )
     if ("v1", "Pod") not in plurals:
         yield Right("", "pods", _LOOKING, "why workloads do not run is not seen", vital=True)
@@ -241,7 +244,7 @@ def roles(
 
 
 def merged(needed: Iterable[Right]) -> list[dict[str, Any]]:
-    """As few rules as say the same: resources of a group with the same verbs are one."""
+    """As few rules as possible: resources of a group with the same verbs are one."""
     verbs: dict[tuple[str, str, str], dict[str, None]] = {}
     for each in needed:
         verbs.setdefault((each.group, each.name, each.resource), {}).update(dict.fromkeys(each.verbs))

@@ -5,7 +5,7 @@ that is always restarted: it starts before the pod's own containers, ends after 
 
 The pod shall not suffer from it. So nothing of it is waited for: no startup probe holds back the other containers, and
 no readiness probe takes the pod out of its Services. It comes after all other init containers, for which it would be
-too late anyway; its names are its own; and its token is a volume of its own, whatever the pod or its account say about
+too late anyway; its names are its own; and its token is a volume of its own, whatever the pod or its account have for
 mounting one.
 """
 
@@ -18,10 +18,10 @@ from typing import Any
 from application_manager.core.objects.detectors import (
     Manifest,
     container,
+    field_variable,
     probe,
     pull_secrets,
     run_as,
-    told,
     volumes_of,
 )
 from application_manager.core.objects.poddefaults import PodDefaults
@@ -131,12 +131,12 @@ def patch(spec: Mapping[str, Any], given: Addition) -> list[dict[str, Any]]:
 def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], port: int | None) -> Manifest:
     made = container(detector, defaults, mounts, name=CONTAINER, port=port, port_name=_METRICS)
     made["command"] += ["--as-pod", "--namespace=$(POD_NAMESPACE)"]
-    made["env"].append(told("POD_NAMESPACE", "metadata.namespace"))
+    made["env"].append(field_variable("POD_NAMESPACE", "metadata.namespace"))
     for each in made["env"]:  # a Secret that is not there would keep the whole pod from starting
         for reference in ("secretKeyRef", "configMapKeyRef"):
             if reference in each.get("valueFrom", {}):
                 each["valueFrom"][reference] |= {"optional": True}
-    # The pod's own securityContext is its author's, so all that the restricted standard asks for is said here.
+    # The pod's own securityContext is its author's, so all that the restricted standard requires is here.
     made["securityContext"] |= {
         "runAsNonRoot": True,
         **run_as(defaults),
@@ -151,7 +151,7 @@ def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], 
 
 
 def _port(spec: Mapping[str, Any]) -> int | None:
-    """A port for metrics and health that no other container of the pod says to be its own.
+    """A port for metrics and health that no other container of the pod declares.
 
     None in a pod of the node's network: there it could be another pod's, and would keep a second pod from the node.
     """

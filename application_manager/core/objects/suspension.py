@@ -1,10 +1,10 @@
-"""What of an instance is at zero while it is suspended, and who says how many replicas there are otherwise. Pure.
+"""What of an instance is at zero while it is suspended, and what determines its replicas otherwise. Pure.
 
 - What has the `scale` subresource goes to zero replicas. What a HorizontalPodAutoscaler scales is thereby paused, as
-  Kubernetes has it: an autoscaler leaves alone what has been set to zero, and goes on once it has replicas again. So
+  Kubernetes has it: an autoscaler leaves alone what has been set to zero, and continues once it has replicas again. So
   the autoscaler itself stays as it is, and nothing is fought over.
 - Jobs and CronJobs have a field for it, `spec.suspend`.
-- A DaemonSet and a bare Pod can only be there or not: they are removed, and made anew afterwards.
+- A DaemonSet and a bare Pod can only be there or not: they are removed, and made again afterwards.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Json = dict[str, Any]
 ObjectKey = tuple[str, str, str]
 
 SCALED = frozenset({("apps/v1", "Deployment"), ("apps/v1", "StatefulSet")})
-"""The kinds, among those that can be allowed, whose `scale` subresource says how many replicas there are."""
+"""The kinds, among those that can be allowed, whose `scale` subresource has the number of replicas."""
 
 _SUSPENDABLE = frozenset({"Job", "CronJob"})
 _REMOVED = frozenset({"DaemonSet", "Pod"})
@@ -30,7 +30,7 @@ def is_scaled(manifest: Mapping[str, Any]) -> bool:
 
 
 def yielded(manifests: Iterable[Json]) -> list[Json]:
-    """The manifests, where an autoscaler among them says how many replicas a workload has: without `replicas` there."""
+    """The manifests, where an autoscaler among them determines the replicas of a workload: without `replicas` there."""
     everything = list(manifests)
     autoscaled = {(each["kind"], each["name"]) for each in _targets(everything)}
     return [
@@ -72,7 +72,7 @@ def autoscalers(manifests: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def pods_left(live: Mapping[str, Any]) -> int:
-    """How many pods of a workload that is to be at zero there still are, as far as its status tells."""
+    """How many pods of a workload that is to be at zero there still are, as far as its status shows."""
     status, spec = live.get("status") or {}, live.get("spec") or {}
     if (live.get("apiVersion"), live.get("kind")) in SCALED:
         return int(max(status.get("replicas") or 0, spec.get("replicas", 1)))
@@ -91,6 +91,6 @@ def _with_spec(manifest: Json, **changes: Any) -> Json:
     """A copy with other members of the spec; None removes one."""
     spec = manifest.get("spec")
     if not isinstance(spec, dict):
-        return manifest  # the API server will say what is wrong with it
+        return manifest  # the API server will report what is wrong with it
     changed = {key: value for key, value in copy.deepcopy(spec).items() if key not in changes}
     return {**manifest, "spec": changed | {key: value for key, value in changes.items() if value is not None}}

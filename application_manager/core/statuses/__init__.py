@@ -1,1 +1,1 @@
-"""What is said: statuses, Events and explanations."""
+"""Reports: statuses, Events and explanations."""

@@ -1,4 +1,4 @@
-"""How often something may be said of one object: a few times at once, then only now and then. Pure."""
+"""How often an Event may be posted about one object: a few times at once, then only now and then. Pure."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ BURST = 10
 """Events of one object that may follow each other at once."""
 
 REFILL = 60.0
-"""Seconds after which one more may follow: an object that changes all the time is told of once a minute."""
+"""Seconds after which one more may follow: an object that changes all the time has an Event a minute."""
 
-_KEPT = 10_000  # objects that are remembered; the one that was told of the longest ago is forgotten, and starts anew
+_KEPT = 10_000  # objects that are remembered; the one with the oldest Event is forgotten, and starts over
 
 
 class Allowance:
@@ -21,7 +21,7 @@ class Allowance:
         self._left: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()  # tokens, as of when
 
     def takes(self, key: Hashable, now: float) -> bool:
-        """Whether one more may be said of the object at `now`, in seconds; if so, it is counted."""
+        """Whether one more may be posted about the object at `now`, in seconds; if so, it is counted."""
         tokens, since = self._left.pop(key, (float(BURST), now))
         tokens = min(float(BURST), tokens + max(0.0, now - since) / REFILL)
         allowed = tokens >= 1

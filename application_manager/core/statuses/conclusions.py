@@ -18,7 +18,7 @@ STALLED = "Stalled"
 def concluded(
     known: Sequence[Condition], aspects: Sequence[Aspect], generation: int, now: float, *, stalled: Collection[str]
 ) -> tuple[Condition, ...]:
-    """The conditions that say what the aspects say, with Ready and Stalled as follows from them.
+    """The conditions that the aspects make, with Ready and Stalled as follows from them.
 
     Args:
         known: as they are.

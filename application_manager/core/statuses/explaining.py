@@ -1,7 +1,7 @@
 """Why a task is served or not, and why an instance runs as it does: one chain from the event to the pods. Pure.
 
-Nothing is taken from what the manager wrote but what it alone can know (lost holders, deadlines): the demand is
-computed anew from what is live, by the same functions. So an explanation is also right while no manager runs.
+Of what the manager wrote, only what it alone can know counts (lost holders, deadlines): the demand is
+computed from what is live, by the same functions. So an explanation is also right while no manager runs.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _LATER = {
     Merge.MAX: "a larger value counts",
     Merge.MIN: "a smaller value counts",
     Merge.HIGHEST_PRIORITY: "a task that comes before it counts",
-    Merge.ALL: "another task says false",
-    Merge.ANY: "another task says true",
+    Merge.ALL: "another task gives false",
+    Merge.ANY: "another task gives true",
 }
 """Why a value is outbid."""
 
@@ -57,7 +57,7 @@ class Found:
 
     Attributes:
         objects: those that the instance's status lists; None where one is gone.
-        pods: those that bear the instance's label.
+        pods: those that have the instance's label.
         leases: the Leases of holders that have one.
     """
 
@@ -116,22 +116,30 @@ def explain(found: Found, *, task: str | None, instance: str | None, now: float)
     """
     outcome = _outcome(found, now)
     decision = (outcome.instances | outcome.waiting).get(instance) if instance else None
-    asked = next((each for each in found.tasks if each.name == task), None)
+    subject = next((each for each in found.tasks if each.name == task), None)
     existing = next((each for each in found.instances if each.name == instance), None)
-    of = asked.spec.template if asked else decision.template if decision else existing.spec.template if existing else ""
+    of = (
+        subject.spec.template
+        if subject
+        else decision.template
+        if decision
+        else existing.spec.template
+        if existing
+        else ""
+    )
     template = next((each for each in found.templates if each.name == of), None)
     served = next((each for each in found.templates if decision and each.name == decision.template), template)
     others = [
         each
         for each in sorted(found.tasks, key=precedence)
-        if each.name in (decision.verdicts if decision else ()) or each is asked or _names(each, instance)
+        if each.name in (decision.verdicts if decision else ()) or each is subject or _names(each, instance)
     ]
-    told = [_task(each, outcome.verdicts[each.name], found.leases, now) for each in others]
+    explained = [_task(each, outcome.verdicts[each.name], found.leases, now) for each in others]
     return Explanation(
-        task=next((each for each in told if each.name == task), None),
+        task=next((each for each in explained if each.name == task), None),
         template=_template(of, template),
         instance=_instance(instance, existing, decision),
-        tasks=told,
+        tasks=explained,
         parameters=_parameters(served, others, decision, existing),
         objects=[_object(key, live) for key, live in sorted(found.objects.items())],
         pods=[_pod(each) for each in sorted(found.pods, key=lambda each: str(each["metadata"]["name"]))],
@@ -218,7 +226,7 @@ def _parameters(
     decision: Decision | None,
     existing: ApplicationInstance | None,
 ) -> list[ExplainedParameter]:
-    """Each parameter with its value and who has a part in it; of tasks that do not count, what they would have said."""
+    """Each parameter with its value and the contributions of tasks, also of those that do not count."""
     if not isinstance(template, ApplicationTemplate) or decision is None:
         return []
     merged = decision.parameters if decision.parameters is not None else existing.spec.parameters if existing else {}
@@ -230,14 +238,14 @@ def _parameters(
         and each.name in decision.verdicts
         and decision.verdicts[each.name].standing is Standing.COUNTS
     }
-    # One that suspends gives parameters only to say which instance it means.
+    # One that suspends gives parameters only to identify its instance.
     speaking = [each for each in tasks if each.spec.operation is not Operation.SUSPEND and each.spec.end_time is None]
     always = template.spec.baseline.parameters if template.spec.baseline else {}
     result = []
     for name, parameter in sorted(template.spec.parameters.items()):
         value = merged.get(name)
         layered = any(each.name in changing and each.spec.parameters.get(name) is not None for each in tasks)
-        said = [
+        contributions = [
             Contribution(task=each.name, value=each.spec.parameters[name], effect="outbid", why=_BELOW)
             if layered and each.name in counting
             else _contribution(
@@ -246,7 +254,7 @@ def _parameters(
             for each in speaking
             if each.spec.parameters.get(name) is not None
         ]
-        source = "tasks" if any(each.effect != "none" for each in said) else "none"
+        source = "tasks" if any(each.effect != "none" for each in contributions) else "none"
         if source == "none" and value is not None:
             is_default = values.canonical(value) == values.canonical(parameter.default)
             source = (
@@ -263,7 +271,7 @@ def _parameters(
                 value=value,
                 source=source,
                 note=next((each[len(name) + 2 :] for each in decision.capped if each.startswith(f"{name}: ")), None),
-                said=said,
+                contributions=contributions,
             )
         )
     return result

@@ -13,7 +13,7 @@ from wayside.api.base import Model
 
 
 class Contribution(Model):
-    """What one task says of one parameter, and what came of it.
+    """What one task gives for one parameter, and what came of it.
 
     `effect` is `decides` (the merged value is this one), `part` (it is in it), `outbid` (another value counts), or
     `none` (the task does not count).
@@ -29,7 +29,7 @@ class ExplainedParameter(Model):
     """One parameter of the template.
 
     `source` is `tasks`, `default`, `baseline`, `earlier` (no task gives it now; the instance keeps what it
-    has), or `none`. `note` says where a merged sum is held at a bound.
+    has), or `none`. `note` names the bound that holds a merged sum.
     """
 
     name: str
@@ -37,13 +37,13 @@ class ExplainedParameter(Model):
     value: Any = None
     source: str
     note: str | None = None
-    said: list[Contribution] = Field(default_factory=list)
+    contributions: list[Contribution] = Field(default_factory=list)
 
 
 class ExplainedTask(Model):
     """One task, and why it counts or does not.
 
-    `phase` and `conditions` are as written; `standing`, `reason` and `message` are computed anew. `not_looked_at`: the
+    `phase` and `conditions` are as written; `standing`, `reason` and `message` are computed now. `not_looked_at`: the
     manager has not written of its present version.
     """
 
@@ -68,7 +68,7 @@ class ExplainedTask(Model):
 
 
 class ExplainedTemplate(Model):
-    """The template; `problem` says why it cannot be used."""
+    """The template; `problem` is the reason why it cannot be used."""
 
     name: str
     problem: str | None = None
@@ -92,7 +92,7 @@ class ExplainedInstance(Model):
 
 
 class ExplainedObject(Model):
-    """An object of the instance; `problem` says why it is not ready."""
+    """An object of the instance; `problem` is the reason why it is not ready."""
 
     api_version: str
     kind: str
@@ -102,7 +102,7 @@ class ExplainedObject(Model):
 
 
 class ExplainedPod(Model):
-    """A pod of the instance; `problem` says what keeps it from running, where something does."""
+    """A pod of the instance; `problem` is what keeps it from running, where something does."""
 
     name: str
     phase: str
@@ -112,7 +112,7 @@ class ExplainedPod(Model):
 
 
 class Explanation(Model):
-    """The chain: the task that was asked about, if it was one, its template, the instance and all of its tasks, the
+    """The chain: the task in question, if it was one, its template, the instance and all of its tasks, the
     merged parameters, the objects and the pods."""
 
     task: ExplainedTask | None = None

@@ -1,8 +1,8 @@
 """Statuses of EventRules and Detectors: whether a detector can evaluate them, and if not, what is wrong where. Pure.
 
 The same compiler that the detector runs judges here. It does not know the message types of ROS, which are the
-detector's to know, so a misspelt type, or field of a message, is told by the detector alone: what is accepted here is
-accepted as far as can be told, and says so.
+detector's to know, so a misspelt type, or field of a message, is reported by the detector alone: what is accepted here
+is accepted as far as can be known, which the message adds.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DETECTOR_INVALID = "DetectorInvalid"
 
 _NAMES_LISTED = 5  # in a column of a table
 
-_AS_FAR_AS = "as far as can be told without the message types; what they show to be wrong, the detector's log says"
+_AS_FAR_AS = "as far as can be known without the message types; the detector's log reports what they show to be wrong"
 
 
 def rule_status(
@@ -81,7 +81,7 @@ def detector_status(
         detector: the Detector.
         rules: those of its namespace.
         now: seconds since 1970.
-        running: whether it runs, where that is for the manager to say and is known.
+        running: whether it runs, where the manager runs it and knows.
     """
     old = detector.status or DetectorStatus()
     aspects = [_aspect(detector_findings(detector), DETECTOR_INVALID), *([] if running is None else [running])]

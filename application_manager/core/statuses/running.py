@@ -21,10 +21,10 @@ NOT_RUN = Aspect(
     "this manager runs no detectors: start it with --detector-image and with the rights that `application-manager rbac "
     "--detectors` prints, or remove spec.mode and run the detector yourself",
 )
-"""What is said where the manager was told no image."""
+"""The condition where the manager has no image."""
 
 NOT_ACCEPTED = Aspect(RUNNING, False, "NotAccepted", "nothing is made of a Detector that is not accepted")
-"""What is said of a Detector that cannot run and was never made."""
+"""The condition of a Detector that cannot run and was never made."""
 
 
 def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> Aspect:
@@ -38,13 +38,13 @@ def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> Aspect:
     running = sum(1 for each in sidecars if _runs(each))
     if troubles:
         return Aspect(RUNNING, False, troubles[0].reason.value, f"it runs in {running} {of}: {troubles[0].text}")
-    lacking = len(pods) - len(sidecars)
-    but = f"; {lacking} were made without it: their Events say why" if lacking else ""
+    missing = len(pods) - len(sidecars)
+    but = f"; {missing} were made without it: their Events give the reason" if missing else ""
     return Aspect(RUNNING, True, "InPods", f"it runs in {running} {of}{but}")
 
 
 def _is_over(pod: Mapping[str, Any]) -> bool:
-    """Whether the pod has ended or is about to: a Job's, whose own containers have, and whose sidecars are told to."""
+    """Whether the pod has ended or is about to: a Job's, whose own containers have, and whose sidecars are about to."""
     status, spec = pod.get("status") or {}, pod.get("spec") or {}
     if pod["metadata"].get("deletionTimestamp") or status.get("phase") in ("Succeeded", "Failed"):
         return True

@@ -1,7 +1,7 @@
-"""Statuses: what the manager says of tasks, instances and templates. Pure.
+"""Statuses of tasks, instances and templates. Pure.
 
 They are honest (Ready means that the workload is ready) and quiet: the same state gives the same status, so nothing is
-written that is not news.
+written that is known.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Service:
     Attributes:
         applied: whether all objects are as they should be.
         ready: whether its workloads are ready.
-        problem: why it is not applied or not ready, in words; empty where only time is lacking.
+        problem: why it is not applied or not ready, in words; empty where it only takes time.
         reason: the problem's word for programs, where it keeps the instance from being ready.
         suspended: whether it is to be at zero.
         stopped: whether it is at zero.
@@ -120,7 +120,7 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
 
 
 def finished_since(task: ApplicationTask) -> float | None:
-    """When the task's status began to say that it is finished, in seconds since 1970; None where it does not."""
+    """Since when the task's status has it as finished, in seconds since 1970; None where it is not."""
     condition = find(task.status.conditions, "Finished") if task.status else None
     return parse_seconds(condition.last_transition_time) if condition and condition.status == "True" else None
 
@@ -157,14 +157,14 @@ def _task_phase(verdict: Verdict, service: Service | None, suspends: bool) -> Ta
 def _task_message(verdict: Verdict, service: Service | None, suspends: bool) -> str | None:
     if verdict.standing is not Standing.COUNTS:
         return _short(verdict.message)
-    told = [] if verdict.reason == ACCEPTED else [verdict.message]
+    notes = [] if verdict.reason == ACCEPTED else [verdict.message]
     if service is None:
-        return _short("; ".join([*told, f"instance {verdict.instance} is not made yet"]))
+        return _short("; ".join([*notes, f"instance {verdict.instance} is not made yet"]))
     done, word = (service.stopped, "suspended") if suspends else (service.ready, "ready")
     if service.applied and done:
-        return _short("; ".join(told))
+        return _short("; ".join(notes))
     lacks = word if service.applied else "applied"
-    return _short("; ".join([*told, service.problem or f"instance {service.instance} is not {lacks} yet"]))
+    return _short("; ".join([*notes, service.problem or f"instance {service.instance} is not {lacks} yet"]))
 
 
 def instance_status(
@@ -254,7 +254,7 @@ def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:
     if decision.capped:
         return [Aspect("Capped", True, "SumBeyondBounds", "; ".join(decision.capped))]
     if find(known, "Capped") is not None:
-        return [Aspect("Capped", False, "WithinBounds", "all merged values are as the tasks say")]
+        return [Aspect("Capped", False, "WithinBounds", "all merged values are those of the tasks")]
     return []
 
 

@@ -320,7 +320,7 @@ def test_the_condition_says_in_how_many_pods_it_runs_and_what_keeps_it_from_runn
     said = carried(of, [runs, pod()])
     assert (said.holds, said.message) == (
         True,
-        "it runs in 1 of 2 pods that ask for it; 1 were made without it: their Events say why",
+        "it runs in 1 of 2 pods that ask for it; 1 were made without it: their Events give the reason",
     )
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
     said = carried(of, [runs, state(injected(pod(), of), state=waiting)])

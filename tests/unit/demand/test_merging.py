@@ -114,7 +114,7 @@ def test_the_instance_says_that_a_sum_is_capped_and_when_it_is_no_more() -> None
 
     assert after(20) == (20, None)
     assert after(20, 40) == (50, ("True", "rate: the sum of 2 values, 60, is held at the maximum of 50"))
-    assert after(20) == (20, ("False", "all merged values are as the tasks say"))
+    assert after(20) == (20, ("False", "all merged values are those of the tasks"))
 
 
 @given(st.lists(st.tuples(st.sampled_from(["x", "y"]), NUMBERS), min_size=1, max_size=5))

@@ -69,8 +69,8 @@ def test_tasks_instances_and_templates_are_counted_by_what_they_are() -> None:
 
 def test_requests_events_and_times_are_counted() -> None:
     measures = Measures()
-    measures.asked("GET", 0.03, "200")
-    measures.asked("PATCH", 0.03, "409")
+    measures.requested("GET", 0.03, "200")
+    measures.requested("PATCH", 0.03, "409")
     measures.applied(0.3)
     measures.ready(-5)  # the detector's clock is ahead of ours
     measures.refused("Conflict")

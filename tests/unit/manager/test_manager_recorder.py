@@ -30,7 +30,7 @@ def say(events: Recorder, first: int, count: int) -> None:
     for each in range(first, first + count):
         about = task(f"t{each}")
         about = about.model_copy(update={"metadata": about.metadata.model_copy(update={"uid": f"u{each}"})})
-        events.say(about, Reason.ACCEPTED, "counts", NOW)
+        events.event(about, Reason.ACCEPTED, "counts", NOW)
 
 
 class Taking:
@@ -51,7 +51,7 @@ def test_namespaces_take_turns() -> None:
         say(events, 0, 100)
         one = task("one")
         quiet = one.metadata.model_copy(update={"namespace": "quiet", "uid": "quiet"})
-        events.say(one.model_copy(update={"metadata": quiet}), Reason.ACCEPTED, "counts", NOW)
+        events.event(one.model_copy(update={"metadata": quiet}), Reason.ACCEPTED, "counts", NOW)
         events.finish()
         await events.run()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from application_manager.commands.telling import text
+from application_manager.commands.explanationtext import text
 from application_manager.core.statuses.explaining import Found, explain, serving
 from application_manager.core.statuses.explanation import Explanation
 from tests.guides import guide
@@ -84,7 +84,7 @@ def explained(about: str | None = "scene-a", tasks: Any = TASKS, **more: Any) ->
 
 def contributions(explanation: Explanation, parameter: str) -> dict[str, str]:
     (found,) = (each for each in explanation.parameters if each.name == parameter)
-    return {each.task: each.effect for each in found.said}
+    return {each.task: each.effect for each in found.contributions}
 
 
 def test_who_gives_a_value_and_who_is_outbid() -> None:

@@ -35,12 +35,12 @@ def _lines(explanation: Explanation) -> Iterator[str]:
         origin = {"default": ", the default", "earlier": ", kept from before", "none": ""}.get(each.source, "")
         shown = "absent" if each.value is None else values.shown(each.value)
         yield f"  {each.name} = {shown} (merge {each.merge}{origin})" + (f": {each.note}" if each.note else "")
-        for said in each.said:
-            why = f": {said.why}" if said.why else ""
+        for part in each.contributions:
+            why = f": {part.why}" if part.why else ""
             effect = {"decides": "is it", "part": "is part of it", "outbid": "is outbid", "none": "is nothing"}[
-                said.effect
+                part.effect
             ]
-            yield f"    {values.shown(said.value)} of {said.task}{about.get(said.task, '')} {effect}{why}"
+            yield f"    {values.shown(part.value)} of {part.task}{about.get(part.task, '')} {effect}{why}"
     if explanation.objects:
         yield "objects"
     for thing in explanation.objects:
@@ -64,13 +64,13 @@ def _task(task: ExplainedTask) -> Iterator[str]:
     if task.detector or task.holder:
         age = "" if task.lease_age_seconds is None else f", its Lease was renewed {task.lease_age_seconds:g} s ago"
         lost = ", counted as lost" if task.holder_is_lost else ""
-        yield f"  asked for by detector {task.detector or '(unnamed)'}, holder {task.holder or 'none'}{age}{lost}"
+        yield f"  requested by detector {task.detector or '(unnamed)'}, holder {task.holder or 'none'}{age}{lost}"
     else:
-        yield "  asked for by a person: it never lapses"
+        yield "  requested by a person: it never lapses"
     yield f"  {task.operation}, priority {task.priority}, created {task.created or 'just now'}"
     yield f"  {task.standing}, {task.reason}: {task.message}"
-    said = ("Accepted", "Finished") if task.standing == "Finished" else ("Accepted",)  # by the line above
-    yield from _conditions(task.conditions, but=said)
+    shown = ("Accepted", "Finished") if task.standing == "Finished" else ("Accepted",)  # by the line above
+    yield from _conditions(task.conditions, but=shown)
     if task.not_looked_at:
         yield "  the manager has not looked at it as it is now: does `application-manager run` run for this namespace?"
 
