@@ -29,7 +29,7 @@ from application_manager.cluster.errors import ApiError
 from application_manager.cluster.grants import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
 from application_manager.cluster.pacing import Pacing, Share
-from application_manager.cluster.starting import until_answered
+from application_manager.cluster.repeating import until_answered
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
 from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures

@@ -24,8 +24,8 @@ from application_manager.admission.authority import AUTHORITY, VALID, issued, wr
 from application_manager.admission.reviewing import Serving
 from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.errors import ApiError, Unreachable
-from application_manager.cluster.starting import until_answered
+from application_manager.cluster.errors import ApiError
+from application_manager.cluster.repeating import repeatedly, until_answered
 from application_manager.core.findings.webhooks import Place
 from wayside.servingcertificate import CERTIFICATE, KEY
 
@@ -69,12 +69,8 @@ class Issuing:
 
     async def follow(self) -> None:
         """Look again and again, until cancelled."""
-        while True:
-            await asyncio.sleep(EVERY)
-            try:
-                await self.look()
-            except (ApiError, Unreachable, ConfigurationError) as error:
-                log.warning("the webhook's certificate cannot be looked at: %s", error)
+        await asyncio.sleep(EVERY)
+        await repeatedly(self.look, EVERY, "cannot look after the webhook's certificate")
 
     async def look(self) -> None:
         """Look once: make a certificate where one is due, give the API server its authority, and write the files."""

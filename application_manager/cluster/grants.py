@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from application_manager.cluster.client import Client
 from application_manager.cluster.entitlement import may
-from application_manager.cluster.errors import ApiError, Unreachable
+from application_manager.cluster.repeating import repeatedly
 from application_manager.core.objects.rights import granting
 
 LOOK_EVERY = 5.0  # s between two questions about a namespace, while something is to be written there
@@ -52,16 +52,14 @@ class Grants:
 
     async def run(self) -> None:
         """Ask again about the namespaces that are not granted, until cancelled."""
-        while True:
-            await asyncio.sleep(LOOK_EVERY)
-            try:
-                granted = [each for each in sorted(self._refused) if await self._ask(each)]
-            except (ApiError, Unreachable):
-                continue  # that the API server does not answer, others report
-            if granted:
-                log.info("granted to this manager: namespace %s", ", ".join(granted))
-                self._refused.difference_update(granted)
-                self._changed()
+        await repeatedly(self._look, LOOK_EVERY, "")  # the look at its health reports that the API server is away
+
+    async def _look(self) -> None:
+        granted = [each for each in sorted(self._refused) if await self._ask(each)]
+        if granted:
+            log.info("granted to this manager: namespace %s", ", ".join(granted))
+            self._refused.difference_update(granted)
+            self._changed()
 
     async def _ask(self, namespace: str) -> bool:
         right = granting()

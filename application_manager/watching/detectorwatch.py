@@ -6,14 +6,13 @@ There are few of them, and a look shows all that a watch could have missed.
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
+from application_manager.cluster.repeating import repeatedly
 from application_manager.core.objects.detectors import KINDS, SELECTOR
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import SIDECAR_LABEL
@@ -21,8 +20,6 @@ from application_manager.core.objects.sidecars import SIDECAR_LABEL
 LOOK_EVERY = 3.0  # s
 _KINDS = tuple(Resource(*each) for each in KINDS)
 _PODS = Resource("v1", "Pod", "pods")
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +39,9 @@ class DetectorWatch:
 
     async def run(self) -> None:
         """Look until cancelled, where the manager runs detectors."""
-        failed = ""
-        while self.index.defaults is not None:
-            try:
-                await self.look()
-                failed = ""
-            except (ApiError, Unreachable) as error:
-                if str(error) != failed:
-                    log.warning("the objects of detectors cannot be looked at: %s", error)
-                failed = str(error)
-            await asyncio.sleep(LOOK_EVERY)
-        await asyncio.Event().wait()
+        if self.index.defaults is None:
+            await asyncio.Event().wait()
+        await repeatedly(self.look, LOOK_EVERY, "cannot list the objects of detectors")
 
     async def look(self) -> None:
         """Look once. Raises ApiError or Unreachable."""

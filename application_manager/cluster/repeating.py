@@ -1,4 +1,4 @@
-"""The start: requests that the manager cannot do without are repeated until the API server answers."""
+"""Requests to the API server that are repeated: until it answers, or again and again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
+from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.errors import ApiError, Unreachable
+
+_FAILURES = (ApiError, Unreachable, ConfigurationError)
 
 PAUSE = 1.0  # s between two attempts, unless the API server requests more
 
@@ -42,3 +45,23 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
             if waiting:
                 log.info("the API server answers")
             return answer
+
+
+async def repeatedly(look: Callable[[], Awaitable[object]], every: float, problem: str) -> None:
+    """Look again and again, until cancelled. A failure is logged once for each reason, and retried at the next look.
+
+    Args:
+        look: looks once.
+        every: seconds between two looks.
+        problem: what cannot be done, for the log; empty where somebody else reports failures.
+    """
+    reported = ""
+    while True:
+        try:
+            await look()
+            reported = ""
+        except _FAILURES as error:
+            if problem and str(error) != reported:
+                log.warning("%s: %s", problem, error)
+            reported = str(error)
+        await asyncio.sleep(every)
