@@ -102,7 +102,7 @@ class Watching:
         rule, client = self._run.rule, view["client"]
         for signal in rule.signals:
             if signal.name not in view:
-                yield signal.name, self._of_stream(client, signal.stream)
+                yield signal.name, self._of_stream(signal.client or client, signal.stream)
         for model in rule.models:
             if model.name not in view:
                 yield model.name, "an input of the model is unknown, or the model failed"

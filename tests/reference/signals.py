@@ -88,6 +88,10 @@ class Sources:
     def signal(self, signal: dict[str, Any], client: str, now: int, ticks: list[int]) -> Any:
         """The value at a tick; `ticks` are those at which the rule was evaluated for the client, this one included."""
         aggregate = signal.get("aggregate", "Last")
+        if "client" in signal:
+            client = signal["client"]
+            if client not in self.world.known:
+                return NOTHING
         if "rule" in signal:
             if signal["rule"] not in self.open_of:
                 return NOTHING

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from wayside.api.actions.action import Action
 from wayside.api.base import (
+    ClientName,
     Condition,
     Duration,
     Expression,
@@ -83,8 +84,7 @@ _OF = "a signal with of has no value or where, and its aggregate is not Age or A
 _LAG = "lag is for a signal with of, and not with over: Episode"
 _EPISODE = f"over: Episode is for a signal with of and the aggregates {', '.join(sorted(OF_AN_EPISODE))}; Age has no of"
 _QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95, and other aggregates have none"
-
-
+_CLIENT = "client is for a signal with stream or rule: remove it"
 _ENDS = "samples: Ends is for a signal with rule and an aggregate other than Active"
 
 
@@ -123,6 +123,7 @@ class Signal(Model):
             _EPISODE,
         ),
         ("(self.aggregate == 'Quantile') == has(self.quantile)", _QUANTILE),
+        ("!has(self.client) || has(self.stream) || has(self.rule)", _CLIENT, ".client", "Forbidden"),
         ("self.samples == 'Starts' || (has(self.rule) && self.aggregate != 'Active')", _ENDS, ".samples"),
         (
             "!(has(self.model) || has(self.plugin)) || !(has(self.where) || has(self.over) || has(self.value))",
@@ -157,6 +158,11 @@ class Signal(Model):
         "The samples are the values of the expression at the evaluations of the subject. Without over and lag, the "
         "signal is the value itself. In a pairs scope, the value belongs to the pair: expressions use the bare name. "
         "The values are kept for over and lag: at most 25 bytes for each evaluation of each subject.",
+    )
+    client: ClientName | None = Field(
+        default=None,
+        description="With stream or rule: the client whose samples or episodes these are, for every subject, e.g. a "
+        "traffic light. Unknown while that client is not known. Default: the subject's own.",
     )
     value: Expression | None = Field(
         default=None,
@@ -214,6 +220,8 @@ class Signal(Model):
             raise ValueError(_LAG)
         if (self.aggregate is Aggregate.QUANTILE) != (self.quantile is not None):
             raise ValueError(_QUANTILE)
+        if self.client is not None and self.stream is None and self.rule is None:
+            raise ValueError(_CLIENT)
         if self.samples is Samples.ENDS and (self.rule is None or self.aggregate is Aggregate.ACTIVE):
             raise ValueError(_ENDS)
         if self.model is not None or self.plugin is not None:

@@ -33,6 +33,8 @@ class CompiledSignal:
     """The element that it is computed for, where value or where read it."""
     quantile: float | None = None
     """Of the aggregate Quantile, in [0, 1]."""
+    client: str | None = None
+    """Whose samples these are, for every subject; None: the subject's own."""
 
     @property
     def place(self) -> str:

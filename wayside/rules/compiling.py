@@ -181,6 +181,9 @@ class _RuleCompiler:
         value = self.sample((*at, "value"), signal.value, stream, Kind.DYN, element_of(self.spec))
         where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL, element_of(self.spec))
         over = None if signal.over is None else signal.over.ns
+        only = None if stream is None or stream.names_by_message else stream.client
+        if only is not None and signal.client not in (None, only):
+            self.problem((*at, "client"), f"stream {signal.stream} has no client but {only}: name that one")
         if stream is not None and over is not None:
             kept = self.kept_ns(stream)
             if over > kept:
@@ -190,8 +193,9 @@ class _RuleCompiler:
                     f"stream {stream.name}: shorten it, or raise the stream's buffer.duration",
                 )
         return CompiledSignal(
-            signal.name, signal.stream, signal.aggregate, value, where, over, self.parameters, quantile=signal.quantile
-        )
+            signal.name, signal.stream, signal.aggregate, value, where, over, self.parameters,
+            quantile=signal.quantile, client=signal.client,
+        )  # fmt: skip
 
     def _episode_signal(self, at: FieldPath, signal: Signal, rule: str) -> CompiledSignal:
         """A signal whose samples are the episode starts or ends of another rule."""
@@ -207,7 +211,7 @@ class _RuleCompiler:
         over = None if signal.over is None else signal.over.ns
         return CompiledSignal(
             signal.name, episode_stream(rule, ends=ends), signal.aggregate, value, where, over, self.parameters, rule,
-            quantile=signal.quantile,
+            quantile=signal.quantile, client=signal.client,
         )  # fmt: skip
 
     def _actions(self, *, deploy: bool) -> list[tuple[int, Action]]:

@@ -138,6 +138,11 @@ class Clients:
             if now - present[name].last > self._timeout and not self.tokens.hold(name)
         ]
 
+    def knows(self, client: str, time: int) -> bool:
+        """Whether the client is known since this time at least; nanoseconds."""
+        presence = self._present.get(client)
+        return presence is not None and presence.since <= time
+
     def since(self, client: str) -> int:
         """Since when the client is known, in nanoseconds since the epoch."""
         return self._present[client].since

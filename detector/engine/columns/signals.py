@@ -10,6 +10,7 @@ import numpy as np
 from detector.engine.buffering.buffer import NEVER
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.episodes import of_episodes
+from detector.engine.columns.named import NamedSignals
 from detector.engine.columns.reading import Reading, Used
 from detector.engine.columns.table import Integers, Truths, rows_between
 from detector.engine.columns.watching import SampleAges
@@ -35,14 +36,22 @@ class Key(NamedTuple):
 class SignalColumns:
     """The signals of all rules of a group."""
 
-    def __init__(self, context: Context, tracks: Sequence[Track], *, shared: bool = True) -> None:
+    def __init__(
+        self, context: Context, tracks: Sequence[Track], *, shared: bool = True, client: str | None = None
+    ) -> None:
         """`shared`: samples without a value are counted when they are read; else when a window first holds them.
 
-        The first is for rules that look at all clients, the second for those that look at some.
+        The first is for rules that look at all clients, the second for those that look at some. `client`: compute the
+        signals that name this client, of this client alone; None: all signals.
         """
+        self._client = client
+        self._named: dict[str, NamedSignals] = {}
+        """By client, the signals that name it."""
         self._context = context
         self._tracks = tracks
         self._keys: dict[Key, int] = {}
+        self._places: dict[tuple[int, str], int] = {}
+        """Of the signals that are computed here, by track and name."""
         self._users: list[list[tuple[int, CompiledSignal]]] = []
         """By signal: which tracks have it, and under which name."""
         self._over_rules: list[tuple[int, Track, CompiledSignal]] = []
@@ -58,11 +67,17 @@ class SignalColumns:
         for row, track in enumerate(tracks):
             own = {signal.name: signal for signal in track.element.signals}
             for signal in track.rule.signals:
-                track.signals[signal.name] = self._place(row, own.get(signal.name, signal))
+                placed = own.get(signal.name, signal)
+                if client is None:
+                    track.signals[signal.name] = self._place(row, placed)
+                elif signal.client == client:
+                    self._place(row, placed)
         self._by_stream: dict[str, list[tuple[int, Key]]] = {}
         """The signals and their places, by the stream that they read."""
         for key, at in self._keys.items():
             self._by_stream.setdefault(key.stream, []).append((at, key))
+        for name, named in self._named.items():
+            named.columns = SignalColumns(context, tracks, shared=shared, client=name)
         self._nested = _nested(self._keys)
         """The signals that differ in the length of their windows alone, from the shortest on."""
 
@@ -78,6 +93,16 @@ class SignalColumns:
             self._context.tables.add(stream)
 
     def _place(self, row: int, signal: CompiledSignal) -> int:
+        if signal.client != self._client:
+            assert signal.client is not None  # noqa: S101  of the signals that name a client, its own ones are here
+            self._users.append([(row, signal)])
+            named = self._named.setdefault(signal.client, NamedSignals(signal.client))
+            named.add(len(self._users) - 1, self._tracks[row], signal.name)
+            return len(self._users) - 1
+        self._places[row, signal.name] = at = self._place_own(row, signal)
+        return at
+
+    def _place_own(self, row: int, signal: CompiledSignal) -> int:
         if signal.rule is not None:
             self._users.append([(row, signal)])
             self._over_rules.append((len(self._users) - 1, self._tracks[row], signal))
@@ -122,7 +147,13 @@ class SignalColumns:
             self._watch(block, stream, high, keys)
         for at, track, signal in self._over_rules:
             found[at] = of_episodes(self._context, block, track, signal)
+        for named in self._named.values():
+            found |= named.look(self._context, block, floor)
         block.signals = [found[at] for at in range(len(self._users))]
+
+    def place(self, row: int, name: str) -> int:
+        """The place of a track's signal that is computed here."""
+        return self._places[row, name]
 
     def _ranges(
         self, block: Block, stream: str, overs: Iterable[int | None], floor: int | None

@@ -173,6 +173,8 @@ class Tables:
     def note(self, counters: RuleCounters, signal: CompiledSignal, failures: Sequence[Failure]) -> None:
         """Count what samples have no value for a signal."""
         for failure in failures:
+            if signal.client is not None and signal.client != self.names[failure.client]:
+                continue
             if failure.reason is None:
                 counters.unknowns += failure.samples
             else:

@@ -62,6 +62,10 @@ class Signals:
         self, rule: str, signal: CompiledSignal, client: str, now: int, counters: RuleCounters
     ) -> Value | Unknown:
         """The signal's value at the tick `now`."""
+        if signal.client is not None:
+            client = signal.client
+            if not self._clients.knows(client, now):
+                return self._no_value(counters)
         if signal.rule is None:
             lane = self._buffer.lane(client, signal.stream)
         elif not self._starts.is_evaluated(signal.stream):
@@ -98,6 +102,7 @@ class Signals:
         self, rule: str, signal: CompiledSignal, client: str, now: int, counters: RuleCounters, *, at_most: int | None
     ) -> list[tuple[int, Value | Unknown]]:
         """Times and values of the signal's samples, newest first; none where the stream is stale."""
+        client = signal.client or client
         lane = self._buffer.lane(client, signal.stream)
         if lane is None or not self._is_fresh(client, signal.stream, now):
             return []

@@ -157,6 +157,8 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
     aggregate = draw(st.sampled_from((*_OF_A_SAMPLE, *_WINDOWED, "Last", "Age")))
     of_rule = bool(others) and draw(st.booleans())
     signal: dict[str, Any] = {"name": name}
+    if draw(st.integers(0, 3)) == 0:
+        signal["client"] = draw(st.sampled_from(("a", "b", "o", "nobody")))
     if of_rule:
         signal["rule"] = draw(st.sampled_from(others))
         aggregate = draw(st.sampled_from(("Active", "Count", "Age", aggregate)))
@@ -335,6 +337,9 @@ def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
         for signal in spec["signals"]:
             if signal.get("aggregate") == "Age":
                 signal.pop("where", None)
+    for signal in spec["signals"]:
+        if signal.get("aggregate") == "Age" and "client" in signal:
+            signal.pop("where", None)
     return spec
 
 

@@ -46,6 +46,9 @@ _SIGNALS: list[tuple[str, dict[str, Any]]] = [
     ("list", {"stream": "p", "value": "msg.q"}),
     ("number", {"stream": "o", "value": "item.v"}),
     ("number", {"stream": "o", "value": "item.v + before.v"}),
+    ("number", {"stream": "s", "value": "msg.v", "client": "c1"}),
+    ("number", {"stream": "o", "value": "item.v - msg.f", "over": "1s", "aggregate": "Min", "client": "c2"}),
+    ("text", {"stream": "p", "value": "msg.gear", "client": "c0", "where": "msg.on"}),
     ("number", {"stream": "s", "value": "msg.v - before.v", "over": "1s", "aggregate": "Max"}),
     ("number", {"stream": "p", "value": 'at(position, "yard").distance'}),
     ("number", {"stream": "p", "value": 'at(position, "lane").heading - at(positionBefore, "lane").along'}),
@@ -84,6 +87,7 @@ _DERIVED: list[dict[str, Any]] = [
 """Signals over what conditions see."""
 
 _OVER: list[tuple[dict[str, Any], str]] = [
+    ({"aggregate": "Count", "over": "2s", "samples": "Ends", "client": "c1"}, "over > 0"),
     ({"aggregate": "Active"}, "over"), ({"aggregate": "Active"}, "!over"),
     ({"aggregate": "Count", "over": "2s"}, "over > 1"), ({"aggregate": "Age"}, "over < 0.8"),
     ({"aggregate": "Last", "value": "msg.values.g0"}, "over > 1.5"),
