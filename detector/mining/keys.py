@@ -16,12 +16,13 @@ _LAYOUT = 1
 
 
 def rule_keys(detector: Detector, rules: Sequence[EventRule]) -> dict[str, str]:
-    """By rule, a digest of it, of the rules that it looks at, its models, the Detector and this version.
+    """By rule, a digest of it, of the rules that it looks at, its models, the Detector with its maps, and this version.
 
     The rules have the actions that run (see `mined_rule`).
     """
     named = {rule.name: rule for rule in rules}
     common = [_LAYOUT, version("wayside"), detector.name, detector.namespace, detector.spec.model_dump(mode="json")]
+    common += [_digest(Path(each.file)) for each in detector.spec.maps]
     keys = {}
     for rule in rules:
         seen = sorted(with_dependencies([rule.name], named))
