@@ -16,7 +16,9 @@ ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PYTHONDONTWRITEBYTECODE=1
 RUN python3 -m venv /opt/wayside
 COPY docker/requirements.txt docker/requirements-full.txt /source/docker/
 ARG REQUIREMENTS=requirements.txt
-RUN /opt/wayside/bin/pip install --no-compile --only-binary=:all: --require-hashes -r "/source/docker/${REQUIREMENTS}"
+# An index of packages of your own: --secret id=pip.conf,src=pip.conf. Without it pip finds no such file, and uses PyPI.
+RUN --mount=type=secret,id=pip.conf PIP_CONFIG_FILE=/run/secrets/pip.conf \
+    /opt/wayside/bin/pip install --no-compile --only-binary=:all: --require-hashes -r "/source/docker/${REQUIREMENTS}"
 COPY pyproject.toml README.md LICENSE /source/
 COPY wayside /source/wayside
 COPY detector /source/detector
@@ -24,10 +26,12 @@ COPY application_manager /source/application_manager
 # The builder of the wheel (setuptools) is in the requirements, so nothing is fetched here.
 RUN /opt/wayside/bin/pip install --no-compile --no-deps --no-build-isolation /source \
  && /opt/wayside/bin/pip uninstall --yes --quiet setuptools pip
-# Of pycrate's ASN.1 modules only those of ITS messages; all others, of mobile networks mostly, are 140 MB. The root of a
+# Of pycrate's ASN.1 modules only those of ITS messages; all others, of mobile networks mostly, are 140 MB. The wheel of
+# cel-expr-python contains its build tree, 16 MB that nothing imports. The root of a
 # container cannot be written to, so all is compiled here, else each start would do so: bytecode that is not compared
 # with its source bears no times.
 RUN find /opt/wayside/lib -path '*/pycrate_asn1dir/*.py' ! -name '__init__.py' ! -name 'ITS*.py' -delete \
+ && rm -rf /opt/wayside/lib/python3*/site-packages/bazel-project \
  && python3 -m compileall -q --invalidation-mode=unchecked-hash /opt/wayside/lib
 
 FROM ${BASE}

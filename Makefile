@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests that wait on other processes: three a core keep it busy.
 WAITING := $(BIN)/python -m pytest -n 6 --dist loadgroup
 
-.PHONY: help demo demo-cluster tutorial examples test unit process cluster compat e2e lint bench load mutants soak requirements wheels crds clean
+.PHONY: help demo demo-cluster tutorial examples test unit process cluster compat e2e lint bench load mutants soak requirements wheels image crds clean
 
 help: ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -107,6 +107,9 @@ requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by th
 
 wheels: $(BIN)/.installed-dev ## whether the images' packages are there as wheels for both architectures, and how large they are
 	@$(BIN)/python docker/wheels.py
+
+image: $(BIN)/.installed-dev ## builds the Dockerfile with buildah, as root and without Docker, and prints the compressed size
+	@$(BIN)/python docker/image.py
 
 clean: ## remove what was made here; the caches outside the tree stay
 	rm -rf $(VENV) out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache benchmarks/peers/*/target
