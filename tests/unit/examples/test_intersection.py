@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from detector.assembly import RuleIndex, inlets
 from detector.checking import findings
 from detector.engine.engine import Engine
+from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
 from examples.intersection.generator import RED, SECONDS, START_NS, messages, sent
 from tests.guides import ROOT
@@ -44,8 +45,8 @@ class Span(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def found() -> dict[str, list[Span]]:
-    """The episodes of each rule."""
+def events() -> list[Event]:
+    """The events of all rules."""
     objects = [document.object for document in DOCUMENTS]
     detector = next(each for each in objects if isinstance(each, Detector))
     rules = [each for each in objects if isinstance(each, EventRule)]
@@ -57,8 +58,13 @@ def found() -> dict[str, list[Span]]:
     arrivals = [
         Arrival(time, key.rpartition("/")[2], key, json.dumps(value).encode()) for time, key, value in messages()
     ]
-    events = engine.advance(arrivals, 0) + [event for step in engine.finish() for event in step]
-    spans: dict[str, list[Span]] = {rule.name: [] for rule in rules}
+    return engine.advance(arrivals, 0) + [event for step in engine.finish() for event in step]
+
+
+@pytest.fixture(scope="module")
+def found(events: list[Event]) -> dict[str, list[Span]]:
+    """The episodes of each rule."""
+    spans: dict[str, list[Span]] = {rule: [] for rule in TRUTHS}
     ends = {event.episode: event for event in events if event.end_time is not None}
     for event in events:
         if event.end_time is None:
@@ -190,13 +196,20 @@ def clients(condition: Callable[[User], Doubles], hold: int = 0) -> list[Span]:
 # The truths
 
 
-def near_miss() -> list[Span]:
-    def colliding(pair: Pair) -> Doubles:
-        a, b = np.abs(pair.v) ** 2, (pair.d * np.conj(pair.v)).real
-        c = np.abs(pair.d) ** 2 - 2.5**2
-        root = b * b - a * c
+def time_to_collision(pair: Pair) -> Doubles:
+    """The smaller root of |d + v t| = 2.5 m."""
+    a, b = np.abs(pair.v) ** 2, (pair.d * np.conj(pair.v)).real
+    c = np.abs(pair.d) ** 2 - 2.5**2
+    root = b * b - a * c
+    with np.errstate(all="ignore"):
         time = np.where(c <= 0, 0.0, np.where((root >= 0) & (b < 0), (-b - np.sqrt(root)) / a, np.inf))
-        return known(time < 2, pair.d.real, pair.v.real)
+    return np.where(np.isnan(pair.d.real + pair.v.real), np.nan, time)
+
+
+def near_miss(below: float = 2) -> list[Span]:
+    def colliding(pair: Pair) -> Doubles:
+        time = time_to_collision(pair)
+        return known(time < below, time)
 
     return pairs(colliding, 60, ordered=False)
 
@@ -343,6 +356,7 @@ def post_encroachment() -> list[Span]:
 
 TRUTHS: dict[str, Callable[[], list[Span]]] = {
     "near-miss": near_miss,
+    "least-time-to-collision": lambda: near_miss(4),
     "hard-braking": hard_braking,
     "standing": standing,
     "cut-in": cut_in,
@@ -370,6 +384,18 @@ def test_a_rule_finds_what_numpy_finds(rule: str, found: dict[str, list[Span]]) 
     assert [a.end for a, b in zip(found[rule], expected, strict=True) if b.end is not None] == [
         each.end for each in expected if each.end is not None
     ]
+
+
+def test_the_least_time_to_collision_of_an_episode_is_that_of_numpy(events: list[Event]) -> None:
+    ended = [each for each in events if each.rule == "least-time-to-collision" and each.end_time is not None]
+    assert ended
+    for event in ended:
+        a, b = (USERS[name] for name in event.subject.split("+"))
+        assert event.end_time is not None
+        first, last = (event.start_time - START_NS) // TICK, (event.end_time - START_NS) // TICK
+        times = time_to_collision(Pair(a, b))[first : last + 1]
+        assert event.values["least"] == pytest.approx(np.nanmin(times), abs=1e-9)
+        assert event.values["leastAt"] == pytest.approx((START_NS + (first + np.nanargmin(times)) * TICK) / 1e9)
 
 
 def test_each_rule_has_a_truth_and_at_most_25_lines() -> None:
