@@ -121,7 +121,7 @@ def run_mining(
     entries = _Entries(cache, work.keys)
     run.complete = not any(entries.left(content, failed_too=True) for content in jobs)
     if run.complete:
-        with (output / CACHE / "lock").open("w") as lock:
+        with (output / CACHE / "lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # two shares may be the last at once
             run.changed = _write(output, sources, seen, entries, work)
     return run

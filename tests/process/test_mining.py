@@ -159,7 +159,7 @@ def test_a_long_recording_is_cut_for_the_rules_for_which_that_is_exact(fleet: Pa
     (fleet / "long").mkdir()
     write_mcap(fleet / "long" / "drive.mcap", 7, 600.0, cars=2)
     said = mine(fleet, "cut", "--processes", "2", drives="long")
-    assert "long/drive.mcap: cut into 2 pieces, uncut for close (pairs)" in said
+    assert "long/drive.mcap: cut into 3 pieces, uncut for close (pairs)" in said
     assert "pieces" not in mine(fleet, "uncut", "--processes", "1", drives="long")
     assert files(fleet / "cut") == files(fleet / "uncut")
     ((episodes,),) = asked(fleet, "SELECT count(*) FROM 'cut/episodes/*/*.parquet'")
