@@ -9,6 +9,7 @@ from functools import cached_property
 from detector.engine.episodes.events import Event
 from detector.replay.replaying import Outcome
 from detector.results.episodes import Episode, episodes_of
+from detector.results.nearest import Near, nearest
 from detector.results.quality import Arrivals, StreamQuality
 from detector.results.series import Trace
 from detector.results.thresholds import Terms, terms_of
@@ -43,6 +44,11 @@ class Result:
     def episodes(self) -> list[Episode]:
         """The episodes, in order of their starts."""
         return episodes_of(self.recording, self.events, self.trace)
+
+    @cached_property
+    def nearest(self) -> list[Near]:
+        """The moments at which rules with a margin came nearest to an episode without one."""
+        return nearest(self.recording, self.rules, self.trace.subjects, self.episodes)
 
 
 def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -> Result:

@@ -14,9 +14,12 @@ from detector.replay.replaying import Outcome
 from detector.results.episodes import Episode, write_csv, write_parquet
 from detector.results.installed import check_package
 from detector.results.kinds import Kind
+from detector.results.nearest import Near, listed
+from detector.results.nearest import write_csv as write_nearest
 from detector.results.quality import Arrivals
 from detector.results.result import Result, result_of
 from detector.results.tracing import Tracer
+from wayside.times import format_time
 
 _NEEDED = {Kind.REPORT: "bokeh", Kind.MCAP: "foxglove", Kind.EPISODES: "pyarrow"}
 
@@ -66,6 +69,8 @@ def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Kind
     if Kind.EPISODES in kinds:
         write_csv(path("episodes.csv"), episodes)
         write_parquet(path("episodes.parquet"), episodes)
+        if near := _nearest(results):
+            write_nearest(path("nearest.csv"), near)
     for number, result in enumerate(results, start=1):
         suffix = f"-{number}" if len(results) > 1 else ""
         if Kind.MCAP in kinds:
@@ -104,6 +109,28 @@ def show_summary(console: Console, results: Sequence[Result]) -> None:
             f"{unknown} of {evaluations}" if unknown else "0",
             str(sum(each[2] for each in counts)),
         )
+    console.print(table)
+    if near := _nearest(results):
+        _show_nearest(console, near)
+
+
+def _nearest(results: Sequence[Result]) -> list[Near]:
+    """What nearly happened in all recordings, rule by rule."""
+    every = [each for result in results for each in result.nearest]
+    return [
+        each for rule in sorted({each.rule for each in every}) for each in listed(e for e in every if e.rule == rule)
+    ]
+
+
+def _show_nearest(console: Console, near: Sequence[Near]) -> None:
+    table = Table(
+        box=None, header_style="bold", pad_edge=False, title="nearest without an episode", title_justify="left"
+    )
+    for name in ("rule", "subject", "time"):
+        table.add_column(name, overflow="fold")
+    table.add_column("margin", justify="right")
+    for each in near:
+        table.add_row(each.rule, each.subject, format_time(each.time), f"{each.margin:.3g}")
     console.print(table)
 
 

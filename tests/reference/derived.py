@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tests.reference.aggregates import NOTHING, aggregated
+from tests.reference.margins import margin
 from tests.reference.scopes import Look
 from tests.reference.signals import evaluated, nanoseconds
 
@@ -30,6 +31,8 @@ class Evaluations:
         for signal in signals:
             name = signal["name"]
             here[name] = evaluated(signal["of"], variables, look.names) if "of" in signal else NOTHING
+            if "margin" in signal:
+                here[name] = margin(signal["margin"], signal["scales"], variables, look.names)
             if signal.get("over") == "Episode":
                 continue
             end = now - nanoseconds(signal.get("lag", "0s"))

@@ -40,7 +40,12 @@ class Rule:
     @property
     def derived(self) -> list[dict[str, Any]]:
         """The signals over what conditions see."""
-        return [each for each in self.spec.get("signals", []) if "of" in each or each.get("over") == "Episode"]
+        found = [each for each in self.spec.get("signals", []) if "of" in each or each.get("over") == "Episode"]
+        if "margin" not in self.spec:
+            return found
+        margin = {"name": "margin", "margin": self.spec["when"], "scales": self.spec["margin"]}
+        reading = [each for each in found if "margin" in each.get("of", "")]
+        return [*(each for each in found if each not in reading), margin, *reading]
 
     def in_progress(self, subject: Subject, client_timeout: int) -> bool:
         """Whether the subject has an episode, or is about to."""

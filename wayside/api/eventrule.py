@@ -270,6 +270,14 @@ class EventRuleSpec(Model):
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
     when: Expression = Field(description="CEL, boolean: the condition that starts an episode.")
+    margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(
+        default=None,
+        max_length=64,
+        description="Gives the rule the signal margin: by how much `when` holds, or fails to (negative). It is the "
+        "distance of each comparison to its threshold, the smaller for &&, the larger for ||, the negative for !. "
+        "Where `when` compares several quantities, each needs a scale here: by signal (or distance, closingSpeed), "
+        "the difference that counts as 1. Results list the ten largest margins without an episode.",
+    )
     until: Expression | None = Field(
         default=None,
         description="CEL, boolean: the condition that ends an open episode. Default: the negation of `when`.",
@@ -350,4 +358,7 @@ class EventRule(Kind):
     def semantics(self) -> dict[str, Any]:
         """The fields that decide which episodes there are; another value of any of them ends open episodes."""
         spec = self.spec.to_json()
-        return {field: spec.get(field) for field in ("scope", "each", "parameters", "signals", "when", "until", "for")}
+        fields = ("scope", "each", "parameters", "signals", "when", "until", "for")
+        return {field: spec.get(field) for field in fields} | (
+            {} if (m := spec.get("margin")) is None else {"margin": m}
+        )

@@ -257,6 +257,8 @@ class CompiledRule:
     """The places that its expressions name."""
     derived: tuple[CompiledDerived, ...] = ()
     """The signals over what conditions see, each after those that it reads."""
+    has_margin: bool = False
+    """Whether one of these is the margin of `when`."""
     on_sample: str | None = None
     """The stream with whose samples it is evaluated."""
     on_demand: bool = False

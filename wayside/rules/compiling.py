@@ -163,6 +163,7 @@ class _RuleCompiler:
             parameters=self.parameters,
             models=models,
             derived=derived,
+            has_margin=spec.margin is not None,
             on_sample=spec.evaluation.on_sample,
             on_demand=bool(spec.evaluation.on_demand),
             priority=spec.evaluation.priority,

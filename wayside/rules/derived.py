@@ -7,9 +7,10 @@ from typing import Protocol
 
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
-from wayside.api.eventrule import Signal
+from wayside.api.eventrule import Aggregate, Signal
 from wayside.expressions import Environment, Expression, Kind
 from wayside.rules.compiled import CompiledDerived
+from wayside.rules.margins import MARGIN, MarginError, margin_of
 
 
 class Compiling(Protocol):
@@ -38,6 +39,9 @@ def compile_derived(compiler: Compiling, environment: Environment) -> tuple[Comp
             continue
         places[signal.name] = (*at, "of")
         found[signal.name] = _compiled(compiler, at, signal, of)
+    if compiler.rule.spec.margin is not None and (of := _margin(compiler, environment)) is not None:
+        places[MARGIN] = ("spec", MARGIN)
+        found[MARGIN] = CompiledDerived(MARGIN, of, Aggregate.LAST, 0, 0)
     for name, derived in found.items():
         for text in () if derived.of is None else statistics_read(derived.of, found.values()):
             compiler.problem(places[name], text)
@@ -45,6 +49,20 @@ def compile_derived(compiler: Compiling, environment: Environment) -> tuple[Comp
     for name in [name for name in found if name not in ordered]:
         compiler.problem(places[name], f"{name} depends on itself: remove one of the signals that it reads")
     return tuple(found[name] for name in ordered)
+
+
+def _margin(compiler: Compiling, environment: Environment) -> Expression | None:
+    """The margin of `when`; None, and problems, where it can have none."""
+    spec = compiler.rule.spec
+    for index, signal in enumerate(spec.signals):
+        if signal.name == MARGIN:
+            compiler.problem(("spec", "signals", index, "name"), "the rule's margin has this name: choose another")
+            return None
+    try:
+        return compiler.condition(("spec", MARGIN), margin_of(spec), environment, Kind.DOUBLE)
+    except MarginError as error:
+        compiler.problem(error.path, str(error))
+        return None
 
 
 def statistics_read(expression: Expression, derived: Iterable[CompiledDerived]) -> Iterator[str]:

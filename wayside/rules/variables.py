@@ -104,7 +104,9 @@ def signal_names(spec: EventRuleSpec) -> tuple[str, ...]:
 
 def of_the_subject(spec: EventRuleSpec) -> frozenset[str]:
     """The signals that the rule's subject has as a whole: in a pairs scope, neither a nor b has them."""
-    return frozenset(signal.name for signal in spec.signals if signal.plugin is not None or signal.is_derived)
+    margin = ("margin",) if spec.margin is not None else ()
+    named = (signal.name for signal in spec.signals if signal.plugin is not None or signal.is_derived)
+    return frozenset((*named, *margin))
 
 
 def condition_environment(spec: EventRuleSpec) -> Environment:

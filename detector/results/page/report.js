@@ -316,6 +316,9 @@
         each.rate === null ? "" : `${short(Number(each.rate.toPrecision(4)))} Hz`,
         each.gap === null ? "" : `${span(each.gap)} at ${timeOfDay(each.gapAt)}, ${each.gapKey}`,
         each.unreadable ? `${each.unreadable}: ${each.lastUnreadable}` : 0, each.unnamed]), [3, 4, 5]);
+    if (data.nearest.length)
+      table("nearest", ["nearest without an episode", "subject", "at", "margin"],
+        data.nearest.map(([rule, subject, time, margin]) => [rule, subject, timeOfDay(time), short(Number(margin.toPrecision(4)))]), [3]);
     table("rules", ["rule", "episodes", "subjects", "evaluations", "unknown values", "errors"], data.rules.map((each) =>
       [each.name, each.episodes, each.subjects, ...[each.evaluations, each.unknowns, each.errors].map((n) => n.toLocaleString("en"))]), [1, 2, 3, 4, 5]);
     at("notes").replaceChildren(...data.notes.map((text) => element("li", { text })));

@@ -314,7 +314,16 @@ def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
         conditions = st.one_of(conditions, conditions, st.sampled_from(AT_A_PAIR))
     if fleet:
         conditions = st.one_of(st.sampled_from(_OF_A_FLEET), *([_conditions(known)] if known else []))
-    if draw(st.integers(0, 4)) == 0:
+    if not fleet and draw(st.integers(0, 5)) == 0:
+        one, other = draw(st.sampled_from(names)), draw(st.sampled_from(names))
+        scales = {name.rpartition(".")[2]: draw(st.sampled_from((1.0, 0.5, 3.0))) for name in (one, other)}
+        forms = [draw(st.sampled_from(_FORMS[:8])).format(name) for name in (one, other)]
+        spec |= {"when": draw(st.sampled_from(("({}) && ({})", "!(({}) || ({}))", "{1}"))).format(*forms)}
+        spec |= {"margin": scales}
+        spec["signals"].append({"name": "near", "of": "margin", "over": "2s", "aggregate": "Max"})
+        if draw(st.booleans()):
+            spec["until"] = "near < -1"
+    elif draw(st.integers(0, 4)) == 0:
         spec["each"] = {"as": "site", "of": [{"name": "n", "limit": 1.5}, {"name": "m", "limit": 0}]}
         alone = conditions
         conditions = st.builds(
@@ -322,9 +331,10 @@ def _rule(draw: st.DrawFn, others: tuple[str, ...]) -> dict[str, Any]:
             alone,
             st.sampled_from(["site.limit > 1", "site.name == 'm'", "site.limit >= 0"]),
         )
-    spec["when"] = draw(conditions)
-    if draw(st.booleans()):
-        spec["until"] = draw(conditions)
+    if "margin" not in spec:
+        spec["when"] = draw(conditions)
+        if draw(st.booleans()):
+            spec["until"] = draw(conditions)
     for field in ("for", "cooldown", "unknownTimeout"):
         if draw(st.booleans()):
             spec[field] = draw(st.sampled_from(DURATIONS))

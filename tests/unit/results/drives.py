@@ -59,6 +59,7 @@ spec:
     - {name: speed, stream: odom, value: msg.speed}
     - {name: fastest, stream: odom, value: msg.speed, over: 1s, aggregate: Max}
   when: fastest - speed > 1.5
+  margin: {}
 ---
 apiVersion: wayside.dev/v1alpha1
 kind: EventRule
@@ -67,7 +68,9 @@ spec:
   evaluation: {every: 200ms}
   scope:
     pairs: {position: {stream: odom, x: msg.x, y: msg.y}, within: 120}
-  signals: [{name: speed, stream: odom, value: msg.speed}]
+  signals:
+    - {name: speed, stream: odom, value: msg.speed}
+    - {name: nearest, of: distance, over: 2s, aggregate: Min}
   when: distance < 50 && a.speed > 0 && (at(a.position, "yard").distance >= 0 || at(b.position, "gate").across > 0)
   until: distance > 70
 ---

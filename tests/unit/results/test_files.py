@@ -112,6 +112,8 @@ def logged(results: Results, rule: str, subject: str, signal: str) -> dict[int, 
         ("harsh", "car1", "fastest - speed"),
         ("close", "car0+car1", "distance"),
         ("close", "car0+car1", "a.speed"),
+        ("close", "car0+car1", "nearest"),
+        ("harsh", "car1", "margin"),
         ("slow-one", "~fleet", "count"),
     ],
 )
@@ -157,6 +159,21 @@ def test_the_csv_file_has_the_rows_of_the_parquet_file(results: Results) -> None
         assert text["start_time"] == format_time(row["start_time"])
         assert (float(text["speed.max"]) if text["speed.max"] else None) == row["speed.max"]
         assert text["subjects"] == "+".join(row["subjects"])
+
+
+def test_what_nearly_happened_is_listed_by_its_margin_at_moments_without_an_episode(results: Results) -> None:
+    with (results.folder / "out/nearest.csv").open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    margins = [float(row["margin"]) for row in rows]
+    assert margins == sorted(margins, reverse=True)
+    assert {row["rule"] for row in rows} == {"harsh"}
+    assert 0 < len(rows) <= 10
+    assert [margin for *_, margin in results.report["nearest"]] == margins
+    for row in rows:
+        margin = dict(shown(results, "harsh", row["subject"], "margin"))
+        assert margin[parse_time(row["time"])] == float(row["margin"])
+        of_subject = [each for each in results.rows if (each["rule"], each["subject"]) == ("harsh", row["subject"])]
+        assert not any(each["onset_time"] <= parse_time(row["time"]) <= each["end_time"] for each in of_subject)
 
 
 def test_each_json_message_has_only_fields_of_its_schema(results: Results) -> None:

@@ -1,0 +1,98 @@
+"""What nearly happened: of rules with a margin, the moments at which they came nearest to an episode without one."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from detector.results.episodes import Episode
+from detector.results.series import SubjectTrace
+from wayside.rules import CompiledRule
+from wayside.times import format_time
+
+MOST = 10
+"""Of each rule, how many are listed."""
+
+_PROMINENCE = 1.0
+"""Two moments count apart where the margin falls by this between them: by one unit of the scale."""
+
+
+class Near(NamedTuple):
+    """One moment."""
+
+    recording: str
+    rule: str
+    subject: str
+    time: int
+    """Nanoseconds since the epoch."""
+    margin: float
+    """At most 0 where the condition did not hold; more where it did not hold for long enough."""
+
+
+def nearest(
+    recording: str, rules: Mapping[str, CompiledRule], subjects: Iterable[SubjectTrace], episodes: Iterable[Episode]
+) -> list[Near]:
+    """The nearest moments of each rule without an episode, those with the largest margin first."""
+    spans: dict[tuple[str, str], list[tuple[int, int | None]]] = {}
+    for episode in episodes:
+        spans.setdefault((episode.rule, episode.subject), []).append((episode.onset_time, episode.end_time))
+    found: dict[str, list[Near]] = {}
+    for trace in subjects:
+        rule = rules.get(trace.rule)
+        if rule is not None and rule.has_margin and "margin" in trace.signals:
+            series = trace.signals["margin"]
+            times, values = series.times.tolist(), series.values.tolist()
+            for time, margin in _peaks(times, values, spans.get((trace.rule, trace.subject), ())):
+                found.setdefault(trace.rule, []).append(Near(recording, trace.rule, trace.subject, time, margin))
+    return [near for rule in sorted(found) for near in listed(found[rule])]
+
+
+def listed(moments: Iterable[Near]) -> list[Near]:
+    """The nearest of these, in order."""
+    return sorted(moments, key=lambda each: (-each.margin, each.time, each.subject))[:MOST]
+
+
+def _peaks(
+    times: Sequence[int], values: Sequence[float], spans: Sequence[tuple[int, int | None]]
+) -> Iterator[tuple[int, float]]:
+    """Where the margin is largest between episodes, unknowns and falls; not on the way into an episode or out of it."""
+    stretch: list[tuple[int, float]] = []
+    after = False
+    for time, value in zip(times, values, strict=True):
+        inside = any(begin <= time and (end is None or time <= end) for begin, end in spans)
+        if inside or value != value:  # noqa: PLR0124  NaN alone differs
+            yield from _of_stretch(stretch, after, inside)
+            stretch, after = [], inside
+        else:
+            stretch.append((time, value))
+    yield from _of_stretch(stretch, after, False)
+
+
+def _of_stretch(stretch: Sequence[tuple[int, float]], after: bool, before: bool) -> Iterator[tuple[int, float]]:
+    """The peaks of values without a break; `after` and `before`: an episode comes before it, or after it."""
+    if not stretch:
+        return
+    best = low = stretch[0]
+    rising = not after
+    for each in stretch:
+        if rising:
+            best = each if each[1] > best[1] else best
+            if each[1] < best[1] - _PROMINENCE:
+                yield best
+                rising, low = False, each
+        else:
+            low = each if each[1] < low[1] else low
+            if each[1] > low[1] + _PROMINENCE:
+                rising, best = True, each
+    if rising and not before:
+        yield best
+
+
+def write_csv(path: Path, moments: Sequence[Near]) -> None:
+    """Write them as CSV, with times as RFC 3339."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(Near._fields)
+        writer.writerows([each._replace(time=format_time(each.time)) for each in moments])  # type: ignore[arg-type]
