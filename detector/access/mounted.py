@@ -54,10 +54,10 @@ def tls_files(access: Access, field: str) -> TlsFiles | None:
             _file(tls.key, f"{field}.tls.key"),
             tls.verify_name,
         )
-    if access.tls_secret is None:
+    if access.tls_secret_name is None:
         return None
-    at = f"{field}.tlsSecret"
-    folder = _secret(access.tls_secret, at)
+    at = f"{field}.tlsSecretName"
+    folder = _secret(access.tls_secret_name, at)
     own = (folder / "tls.crt").exists()
     return TlsFiles(
         _file(folder / "ca.crt", at),
@@ -80,10 +80,10 @@ def login(access: Access, field: str) -> Login | None:
                 f"{field}.credentials.passwordVariable: the environment variable {variable} is not set: set it"
             )
         return Login(given.username, password)
-    if access.credentials_secret is None:
+    if access.credentials_secret_name is None:
         return None
-    at = f"{field}.credentialsSecret"
-    folder = _secret(access.credentials_secret, at)
+    at = f"{field}.credentialsSecretName"
+    folder = _secret(access.credentials_secret_name, at)
     return Login(_text(folder / "username", at), _text(folder / "password", at))
 
 
@@ -96,8 +96,8 @@ def database_uri(database: Database, field: str) -> str:
     """The connection string of a database; `field` is where `database` stands. Raises AccessError."""
     if database.uri_file is not None:
         return _text(Path(database.uri_file), f"{field}.uriFile")
-    if database.uri_secret is not None:
-        return secret_text(database.uri_secret, "uri", f"{field}.uriSecret")
+    if database.uri_secret_name is not None:
+        return secret_text(database.uri_secret_name, "uri", f"{field}.uriSecretName")
     variable = database.uri_variable or ""
     uri = os.environ.get(variable)
     if uri is None:

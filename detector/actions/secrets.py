@@ -1,7 +1,7 @@
 """Which Secrets a rule may use: not those with which the detector itself enters networks and databases.
 
 Who writes rules can have what a Secret holds sent anywhere. So a Secret that the Detector names for its own use is no
-rule's, unless the Detector gives it to rules as well, by `pod.secrets`.
+rule's, unless the Detector gives it to rules as well, by `pod.secretNames`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 from wayside.api import Detector, EventRule
 from wayside.rules import RuleProblem
 
-_OWN = frozenset({"tlsSecret", "credentialsSecret", "uriSecret"})
+_OWN = frozenset({"tlsSecretName", "credentialsSecretName", "uriSecretName"})
 """Fields of a Detector, and of the parameters of its sources, that name a Secret."""
 
-_OF_RULES = _OWN | {"secret", "urlSecret"}
+_OF_RULES = _OWN | {"secretKeyRef", "urlSecretKeyRef"}
 """Fields of an action that do, by name or as name and key."""
 
 Place = tuple[str | int, ...]
@@ -24,7 +24,7 @@ Place = tuple[str | int, ...]
 def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
     """The places at which a rule names a Secret of the detector's own."""
     pod = detector.spec.pod
-    given = set() if pod is None else {*pod.secrets}
+    given = set() if pod is None else {*pod.secret_names}
     own = {name for _, name in _named(detector.spec.to_json(), _OWN, ())} - given
     if not own:
         return
@@ -35,7 +35,7 @@ def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem
                     place,
                     (
                         f"the Secret {name} holds the network access of the Detector itself: name another one, "
-                        "or share it with rules in spec.pod.secrets"
+                        "or share it with rules in spec.pod.secretNames"
                     ),
                 )
 

@@ -99,7 +99,7 @@ class MqttSource(Source[MqttParameters]):
 
     @property
     def _port(self) -> int:
-        encrypted = self.parameters.tls is not None or self.parameters.tls_secret is not None
+        encrypted = self.parameters.tls is not None or self.parameters.tls_secret_name is not None
         return self.parameters.port or (8883 if encrypted else 1883)
 
     def _client(self) -> Client:

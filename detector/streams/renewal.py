@@ -84,7 +84,7 @@ class Renewal:
     def start(self) -> None:
         """Start watching the files, if there are any that can change."""
         config = self._config
-        if any((config.tls, config.tls_secret, config.credentials, config.credentials_secret)):
+        if any((config.tls, config.tls_secret_name, config.credentials, config.credentials_secret_name)):
             self._thread.start()
 
     def stop(self) -> None:

@@ -200,7 +200,7 @@ def wait_for_pods(api: Api, component: str, count: int) -> None:
 def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_that_it_answers(
     helm: Helm, there: Api, bare: ControlPlane, tmp_path: Path
 ) -> None:
-    mine = {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"], "metrics": {"tlsSecret": "metrics"}}
+    mine = {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"], "metrics": {"tlsSecretName": "metrics"}}
     install(helm, there, {"manager": mine, "logFormat": "json"})
     container = there.get("Deployment", f"{RELEASE}-manager")["spec"]["template"]["spec"]["containers"][0]
     metrics, webhook = free_ports(2)

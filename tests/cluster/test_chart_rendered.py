@@ -273,7 +273,7 @@ def test_detectors_are_pulled_like_the_manager_and_found_by_what_the_manager_lab
     values: Values = {
         "image": {"repository": "registry.test/wayside", "tag": "7", "pullPolicy": "Always"},
         "imagePullSecrets": [{"name": "registry"}],
-        "manager": {"namespaces": ["north"], "detectors": {"metrics": {"tlsSecret": "metrics"}}},
+        "manager": {"namespaces": ["north"], "detectors": {"metrics": {"tlsSecretName": "metrics"}}},
         "detectors": [DETECTOR | {"namespace": "north", "service": {"ports": [7447], "type": "NodePort"}}],
         "monitoring": {"podMonitor": {"enabled": True}},
     }

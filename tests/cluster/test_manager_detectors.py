@@ -210,7 +210,7 @@ def test_the_pod_passes_the_restricted_standard(
     paths = {"state": {"path": "/state"}, "recordings": {"path": "/data/recordings"}}
     volumes = [{"name": "data", "persistentVolumeClaim": {"claimName": "town"}}]
     mounts = [{"name": "data", "mountPath": "/data"}]
-    pod = {"volumes": volumes, "volumeMounts": mounts, "secrets": ["pager"]}
+    pod = {"volumes": volumes, "volumeMounts": mounts, "secretNames": ["pager"]}
     api.create(detector(mode="Standalone", pod=pod, **paths))
     api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
 

@@ -222,8 +222,8 @@ WRONG: list[tuple[str, str, Changes, str]] = [
     (
         "Detector",
         "TLS given twice",
-        {"spec.zenoh.tls": {"ca": "ca.crt"}, "spec.zenoh.tlsSecret": "zenoh"},
-        r"spec\.zenoh\.tlsSecret: Forbidden: give tls or tlsSecret, not both",
+        {"spec.zenoh.tls": {"ca": "ca.crt"}, "spec.zenoh.tlsSecretName": "zenoh"},
+        r"spec\.zenoh\.tlsSecretName: Forbidden: give tls or tlsSecretName, not both",
     ),
     (
         "Detector",

@@ -38,7 +38,7 @@ def image_values(image: str) -> dict[str, Any]:
 
 def values(namespace: str, image: str, detector: Mapping[str, Any]) -> dict[str, Any]:
     """The manager of this namespace, the router, and a Detector `town` that connects to it; `detector`: its spec."""
-    reached = {"mode": "client", "connect": [f"tls/{ROUTER}:7447"], "tlsSecret": "town-tls"}
+    reached = {"mode": "client", "connect": [f"tls/{ROUTER}:7447"], "tlsSecretName": "town-tls"}
     return {
         "image": image_values(image),
         "manager": {"namespaces": [namespace]},

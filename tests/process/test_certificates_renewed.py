@@ -39,7 +39,7 @@ def at() -> str:
 @contextmanager
 def network(arrivals: Arrivals, *streams: Any, **config: Any) -> Iterator[Network]:
     running = Network(
-        Zenoh.model_validate({"tlsSecret": "own", **config}),
+        Zenoh.model_validate({"tlsSecretName": "own", **config}),
         streams or [stream()],
         arrivals.putter,
         look_every=LOOK_EVERY,

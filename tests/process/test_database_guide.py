@@ -76,8 +76,8 @@ def test_what_is_wrong_in_an_action_is_said_with_its_place(tmp_path: Path, field
 @pytest.mark.parametrize(
     ("database", "said"),
     [
-        ({}, "uriSecret, uriVariable and uriFile"),
-        ({"uriVariable": "A", "uriFile": "b"}, "uriSecret, uriVariable and uriFile"),
+        ({}, "uriSecretName, uriVariable and uriFile"),
+        ({"uriVariable": "A", "uriFile": "b"}, "uriSecretName, uriVariable and uriFile"),
         ({"uriVariable": "A", "writeConcern": "Two"}, "writeConcern"),
     ],
 )

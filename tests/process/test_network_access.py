@@ -120,8 +120,8 @@ def test_a_peer_listens_with_tls_and_asks_for_certificates(
     (tmp_path / "certs").mkdir()
     for source, name in ((authority.ca, "ca.crt"), (certificate, "tls.crt"), (key, "tls.key")):
         (tmp_path / "certs" / name).write_bytes(source.read_bytes())
-    with network(arrivals, mode="peer", listen=[at], tlsSecret="certs"):
-        client = Zenoh.model_validate({"mode": "client", "connect": [at], "tlsSecret": "certs"})
+    with network(arrivals, mode="peer", listen=[at], tlsSecretName="certs"):
+        client = Zenoh.model_validate({"mode": "client", "connect": [at], "tlsSecretName": "certs"})
         with open_session(client) as vehicle:
             assert flows(vehicle, arrivals)
         without = Zenoh.model_validate({"mode": "client", "connect": [at], "tls": {"ca": str(authority.ca)}})
@@ -264,7 +264,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
     ("given", "problem"),
     [
         ({"tls": {"ca": "missing.crt"}}, "spec.zenoh.tls.ca: cannot read missing.crt: No such file"),
-        ({"tlsSecret": "absent"}, "spec.zenoh.tlsSecret: the Secret absent is not mounted at"),
+        ({"tlsSecretName": "absent"}, "spec.zenoh.tlsSecretName: the Secret absent is not mounted at"),
         (
             {"credentials": {"username": "u", "passwordVariable": "WAYSIDE_UNSET"}},
             "spec.zenoh.credentials.passwordVariable: the environment variable WAYSIDE_UNSET is not set",
@@ -285,7 +285,7 @@ def test_what_is_not_there_is_told_with_its_field(given: dict[str, Any], problem
     ("given", "problem"),
     [
         ({"tls": {"certificate": "a"}}, "give both certificate and key, or neither"),
-        ({"tls": {}, "tlsSecret": "a"}, "give tls or tlsSecret"),
+        ({"tls": {}, "tlsSecretName": "a"}, "give tls or tlsSecretName"),
         ({"listen": ["tls/0.0.0.0:7447"]}, "needs a certificate"),
         ({"credentials": {"username": "u"}}, "give exactly one of passwordVariable and passwordFile"),
         ({"credentials": {"username": "u", "password": "secret"}}, "password"),
@@ -301,12 +301,12 @@ def test_a_secret_is_a_folder_and_a_password_is_never_shown(tmp_path: Path, monk
     folder = tmp_path / "login"
     folder.mkdir()
     (folder / "username").write_text("detector\n")
-    access = Access.model_validate({"credentialsSecret": "login", "tlsSecret": "login"})
+    access = Access.model_validate({"credentialsSecretName": "login", "tlsSecretName": "login"})
     with pytest.raises(AccessError, match=r"cannot read .*password"):
         login(access, "spec.zenoh")
     (folder / "password").write_text("sesame\n")
     found = login(access, "spec.zenoh")
     assert found == Login("detector", "sesame")
     assert "sesame" not in repr(found)
-    with pytest.raises(AccessError, match=r"spec\.zenoh\.tlsSecret: cannot read .*ca\.crt"):
+    with pytest.raises(AccessError, match=r"spec\.zenoh\.tlsSecretName: cannot read .*ca\.crt"):
         tls_files(access, "spec.zenoh")

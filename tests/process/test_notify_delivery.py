@@ -320,9 +320,9 @@ def test_a_secret_that_is_mounted_late_is_waited_for(
     there: Endpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
-    desk = a_desk({"http": {"urlSecret": {"name": "hook", "key": "url"}}, "events": ["Started"]})
+    desk = a_desk({"http": {"urlSecretKeyRef": {"name": "hook", "key": "url"}}, "events": ["Started"]})
     desk.run(an_episode())
-    assert "urlSecret: the Secret hook is not mounted" in desk.outcome("e1", OutcomeState.RUNNING).message
+    assert "urlSecretKeyRef: the Secret hook is not mounted" in desk.outcome("e1", OutcomeState.RUNNING).message
     (tmp_path / "hook.new").mkdir()
     (tmp_path / "hook.new" / "url").write_text(f"{there.url}/T0K3N\n")
     (tmp_path / "hook.new").rename(tmp_path / "hook")

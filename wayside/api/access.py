@@ -68,12 +68,17 @@ class Credentials(Model):
         return self
 
 
-_TLS_ONCE = "give tls or tlsSecret, not both"
-_CREDENTIALS_ONCE = "give credentials or credentialsSecret, not both"
+_TLS_ONCE = "give tls or tlsSecretName, not both"
+_CREDENTIALS_ONCE = "give credentials or credentialsSecretName, not both"
 
 ACCESS_VALIDATIONS = (
-    ("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE, ".tlsSecret", "Forbidden"),
-    ("!(has(self.credentials) && has(self.credentialsSecret))", _CREDENTIALS_ONCE, ".credentialsSecret", "Forbidden"),
+    ("!(has(self.tls) && has(self.tlsSecretName))", _TLS_ONCE, ".tlsSecretName", "Forbidden"),
+    (
+        "!(has(self.credentials) && has(self.credentialsSecretName))",
+        _CREDENTIALS_ONCE,
+        ".credentialsSecretName",
+        "Forbidden",
+    ),
 )
 """For the CRD: what `Access` checks."""
 
@@ -82,20 +87,20 @@ class Access(Model):
     """TLS and credentials, each by files or by a Secret."""
 
     tls: Tls | None = Field(default=None, description="TLS certificates from files.")
-    tls_secret: ObjectName | None = Field(
+    tls_secret_name: ObjectName | None = Field(
         default=None,
         description="A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and "
         "tls.key.",
     )
     credentials: Credentials | None = Field(default=None, description="A username, and the source of its password.")
-    credentials_secret: ObjectName | None = Field(
+    credentials_secret_name: ObjectName | None = Field(
         default=None, description="A Secret with the keys username and password."
     )
 
     @model_validator(mode="after")
     def _given_once(self) -> Access:
-        if self.tls is not None and self.tls_secret is not None:
+        if self.tls is not None and self.tls_secret_name is not None:
             raise ValueError(_TLS_ONCE)
-        if self.credentials is not None and self.credentials_secret is not None:
+        if self.credentials is not None and self.credentials_secret_name is not None:
             raise ValueError(_CREDENTIALS_ONCE)
         return self

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from wayside.api.access import FilePath, Variable
 from wayside.api.base import Model, ObjectName, PositiveQuantity, validations
 
-_ONE = "give exactly one of uriSecret, uriVariable and uriFile"
+_ONE = "give exactly one of uriSecretName, uriVariable and uriFile"
 
 
 class WriteConcern(StrEnum):
@@ -48,10 +48,10 @@ class Database(Model):
     """A MongoDB server or replica set, with the storage beside it."""
 
     model_config = validations(
-        ("[has(self.uriSecret), has(self.uriVariable), has(self.uriFile)].filter(given, given).size() == 1", _ONE)
+        ("[has(self.uriSecretName), has(self.uriVariable), has(self.uriFile)].filter(given, given).size() == 1", _ONE)
     )
 
-    uri_secret: ObjectName | None = Field(
+    uri_secret_name: ObjectName | None = Field(
         default=None,
         description="A Secret whose key `uri` contains the connection string, mongodb://… with credentials.",
     )
@@ -77,6 +77,6 @@ class Database(Model):
 
     @model_validator(mode="after")
     def _one_place(self) -> Database:
-        if [self.uri_secret, self.uri_variable, self.uri_file].count(None) != 2:
+        if [self.uri_secret_name, self.uri_variable, self.uri_file].count(None) != 2:
             raise ValueError(_ONE)
         return self

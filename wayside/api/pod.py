@@ -335,7 +335,7 @@ class DetectorPod(Model):
         "the database files. A folder that is on none of them gets a volume that is removed with the pod.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["mountPath"]},
     )
-    secrets: list[ObjectName] = Field(
+    secret_names: list[ObjectName] = Field(
         default_factory=list,
         max_length=32,
         description="The Secrets that rules may use. A Secret that the Detector itself refers to is available to "
@@ -353,7 +353,7 @@ class DetectorPod(Model):
         for field, names in (
             ("volumes", volumes),
             ("volumeMounts", paths),
-            ("secrets", self.secrets),
+            ("secretNames", self.secret_names),
             ("env", variables),
             ("imagePullSecrets", keys),
         ):

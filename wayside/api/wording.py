@@ -20,7 +20,7 @@ _PATTERNS = {
     r"^[A-Za-z_][A-Za-z0-9_]*$": "letters, digits and _, not beginning with a digit",
     r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$": "package/msg/Type, e.g. geometry_msgs/msg/PoseStamped",
     r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$": "like https://host:port/path, without # and without a user and password "
-    "before the host (give credentialsSecret)",
+    "before the host (give credentialsSecretName)",
     r"^[^/*$#?]+(/[^/*$#?]+)*$": "a Zenoh key without wildcards, e.g. city/alerts",
     r"^WAYSIDE_[A-Z0-9_]+$": "a name that begins with WAYSIDE_, in capitals: rules cannot use other variables",
     r"^([-a-z0-9.]{1,253}/)?[A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?$": "a label's key, e.g. site or example.com/site",

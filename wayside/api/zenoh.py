@@ -17,7 +17,7 @@ _ENCRYPTED = ("tls/", "quic/")
 
 _NO_CLIENT = "liveliness does not capture the client: write ${client:*} in place of its name"
 
-_NO_CERTIFICATE = "a TLS endpoint in listen needs a certificate: set tls.certificate and tls.key, or tlsSecret"
+_NO_CERTIFICATE = "a TLS endpoint in listen needs a certificate: set tls.certificate and tls.key, or tlsSecretName"
 
 
 class ZenohMode(StrEnum):
@@ -35,7 +35,7 @@ class Zenoh(Access):
         *ACCESS_VALIDATIONS,
         (
             "!has(self.listen) || !self.listen.exists(e, e.startsWith('tls/') || e.startsWith('quic/')) || "
-            "has(self.tlsSecret) || (has(self.tls) && has(self.tls.certificate))",
+            "has(self.tlsSecretName) || (has(self.tls) && has(self.tls.certificate))",
             _NO_CERTIFICATE,
             ".listen",
         ),
@@ -82,6 +82,6 @@ class Zenoh(Access):
     @model_validator(mode="after")
     def _has_certificate(self) -> Zenoh:
         listens = any(endpoint.startswith(_ENCRYPTED) for endpoint in self.listen)
-        if listens and self.tls_secret is None and (self.tls is None or self.tls.certificate is None):
+        if listens and self.tls_secret_name is None and (self.tls is None or self.tls.certificate is None):
             raise ValueError(_NO_CERTIFICATE)
         return self

@@ -37,7 +37,7 @@ KINDS = (
 METRICS, METRICS_PORT = "metrics", 9100
 _SECRETS_FOLDER = "/etc/wayside/secrets"  # where the detector looks for them
 _METRICS_FOLDER = "/etc/wayside/metrics-certificates"  # not among the Secrets that rules may use
-_SECRET_FIELDS = frozenset({"tlsSecret", "credentialsSecret", "uriSecret"})
+_SECRET_FIELDS = frozenset({"tlsSecretName", "credentialsSecretName", "uriSecretName"})
 _AS_GIVEN = frozenset(OF_ITS_OWN_POD) - {"securityContext"}
 _SCRATCH_SIZE = "256Mi"
 
@@ -86,7 +86,7 @@ def deployment_to_try(detector: Detector, defaults: PodDefaults) -> Manifest:
 def secrets_of(detector: Detector) -> list[str]:
     """The Secrets that its pod mounts: those that the Detector names, and those that its rules may use."""
     pod = detector.spec.pod or DetectorPod()
-    return sorted({*_named(detector.spec.to_json()), *pod.secrets})
+    return sorted({*_named(detector.spec.to_json()), *pod.secret_names})
 
 
 def _named(value: Any) -> Iterator[str]:

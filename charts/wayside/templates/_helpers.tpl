@@ -66,7 +66,7 @@ app.kubernetes.io/part-of: wayside
 {{- define "wayside.probes" -}}
 {{- range $name, $path := dict "startup" "/healthz" "readiness" "/readyz" "liveness" "/healthz" }}
 {{ $name }}Probe:
-  httpGet: {path: {{ $path }}, port: metrics{{ if $.Values.manager.metrics.tlsSecret }}, scheme: HTTPS{{ end }}}
+  httpGet: {path: {{ $path }}, port: metrics{{ if $.Values.manager.metrics.tlsSecretName }}, scheme: HTTPS{{ end }}}
   {{- with index $.Values.manager.probes $name }}
   {{- toYaml . | nindent 2 }}
   {{- end }}

@@ -53,8 +53,8 @@ def read_headers(access: HttpAccess, field: str) -> Headers:
 
 
 def _value(header: HttpHeader, at: str) -> str:
-    if header.secret is not None:
-        return secret_text(header.secret.name, header.secret.key, f"{at}.secret")
+    if header.secret_key_ref is not None:
+        return secret_text(header.secret_key_ref.name, header.secret_key_ref.key, f"{at}.secretKeyRef")
     if header.variable is not None:
         value = os.environ.get(header.variable)
         if value is None:

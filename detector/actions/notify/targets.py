@@ -98,10 +98,10 @@ class HttpTarget:
         return self._poster.post(url, headers, body, give_up)
 
     def _url(self) -> str:
-        secret = self._http.url_secret
+        secret = self._http.url_secret_key_ref
         if secret is None:
             return self._http.url or ""
-        at = f"{self._field}.urlSecret"
+        at = f"{self._field}.urlSecretKeyRef"
         url = secret_text(secret.name, secret.key, at).strip()
         if not url.startswith(("http://", "https://")):
             raise AccessError(f"{at}: the content of the Secret {secret.name} is not a URL: write https://… there")

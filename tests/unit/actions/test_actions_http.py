@@ -165,8 +165,8 @@ def test_a_renewed_secret_is_used_from_then_on(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
     (tmp_path / "hook").mkdir()
     token = tmp_path / "hook" / "token"
-    one = client(headers=[{"name": "Authorization", "secret": {"name": "hook", "key": "token"}}])
-    with pytest.raises(HttpError, match=r"^spec\.actions\[0\]\.notify\.http\.headers\[0\]\.secret: cannot read "):
+    one = client(headers=[{"name": "Authorization", "secretKeyRef": {"name": "hook", "key": "token"}}])
+    with pytest.raises(HttpError, match=r"^spec\.actions\[0\]\.notify\.http\.headers\[0\]\.secretKeyRef: cannot read "):
         send(one, "http://localhost:1")
     with endpoint() as there:
         for value in ("Bearer first\n", "Bearer second"):
@@ -182,7 +182,7 @@ def test_a_variable_and_credentials_become_headers(tmp_path: Path, monkeypatch: 
     (tmp_path / "login" / "username").write_text("ann")
     (tmp_path / "login" / "password").write_text("pass\n")
     with endpoint() as there:
-        send(client(headers=[{"name": "X-Key", "variable": "WAYSIDE_KEY"}], credentialsSecret="login"), there.url)
+        send(client(headers=[{"name": "X-Key", "variable": "WAYSIDE_KEY"}], credentialsSecretName="login"), there.url)
     assert there.requests[0].headers["x-key"] == "k-1"
     assert there.requests[0].headers["authorization"] == "Basic YW5uOnBhc3M="
 
@@ -234,7 +234,7 @@ def test_retry_after_is_understood_in_both_forms(text: str, seconds: float) -> N
         ({"name": "X", "value": "a\r\nY: b"}, "pattern"),
         ({"name": "X Y", "value": "a"}, "pattern"),
         ({"name": "Content-Length", "value": "1"}, "is set by the detector"),
-        ({"name": "X", "secret": {"name": "s", "key": "../other/key"}}, "pattern"),
+        ({"name": "X", "secretKeyRef": {"name": "s", "key": "../other/key"}}, "pattern"),
     ],
 )
 def test_headers_that_cannot_be_are_refused(header: dict[str, Any], told: str) -> None:

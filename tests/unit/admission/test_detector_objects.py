@@ -60,7 +60,11 @@ def test_each_folder_is_in_a_volume_that_lasts_where_a_claim_is_given() -> None:
     given = detector(
         state={"path": "/var/lib/wayside"},
         recordings={"path": "/data/recordings"},
-        database={"uriSecret": "mongo", "spool": {"path": "/data/spool"}, "files": {"path": "/var/lib/wayside/files"}},
+        database={
+            "uriSecretName": "mongo",
+            "spool": {"path": "/data/spool"},
+            "files": {"path": "/var/lib/wayside/files"},
+        },
         pod={
             "volumes": [
                 {"name": "data", "persistentVolumeClaim": {"claimName": "town"}},
@@ -87,12 +91,12 @@ def test_a_folder_beside_one_whose_name_it_begins_with_has_a_volume_of_its_own()
 
 
 def test_the_secrets_are_those_that_the_detector_names_and_those_that_rules_may_use() -> None:
-    mqtt = {"name": "broker", "plugin": "mqtt", "parameters": {"url": "mqtts://b", "credentialsSecret": "broker"}}
+    mqtt = {"name": "broker", "plugin": "mqtt", "parameters": {"url": "mqtts://b", "credentialsSecretName": "broker"}}
     given = detector(
-        zenoh={"connect": ["tls/zenoh:7447"], "tlsSecret": "zenoh"},
+        zenoh={"connect": ["tls/zenoh:7447"], "tlsSecretName": "zenoh"},
         sources=[mqtt],
-        database={"uriSecret": "mongo"},
-        pod={"secrets": ["pager", "mongo"]},
+        database={"uriSecretName": "mongo"},
+        pod={"secretNames": ["pager", "mongo"]},
     )
     assert secrets_of(given) == ["broker", "mongo", "pager", "zenoh"]
 

@@ -92,8 +92,8 @@ specs = st.fixed_dictionaries(
 detectors = st.sampled_from(
     [
         detector(),
-        detector(zenoh={"connect": ["tls/zenoh:7447"], "tlsSecret": "zenoh"}),
-        detector(state={"path": "/state"}, pod={**ON_A_CLAIM, "secrets": ["pager"]}),
+        detector(zenoh={"connect": ["tls/zenoh:7447"], "tlsSecretName": "zenoh"}),
+        detector(state={"path": "/state"}, pod={**ON_A_CLAIM, "secretNames": ["pager"]}),
     ]
 )
 
@@ -179,8 +179,12 @@ def test_it_holds_for_its_pod_with_a_token_of_its_own_under_the_restricted_stand
 
 
 def test_its_folders_secrets_and_resources_are_as_of_a_standalone_detectors_pod() -> None:
-    pod_says = {"image": "own:2", "secrets": ["pager"], "resources": {"limits": {"memory": "2Gi"}}}
-    given_one = {"state": {"path": "/state"}, "pod": pod_says, "zenoh": {"connect": ["tls/z:7447"], "tlsSecret": "z"}}
+    pod_says = {"image": "own:2", "secretNames": ["pager"], "resources": {"limits": {"memory": "2Gi"}}}
+    given_one = {
+        "state": {"path": "/state"},
+        "pod": pod_says,
+        "zenoh": {"connect": ["tls/z:7447"], "tlsSecretName": "z"},
+    }
     mine = sidecar(injected(pod(), detector(**given_one)))
     *_, deployment = detector_objects(detector(**given_one, mode="Standalone", serviceAccountNames=None), DEFAULTS)
     (own,) = deployment["spec"]["template"]["spec"]["containers"]

@@ -73,7 +73,7 @@ def test_an_expression_that_is_too_large_to_read_is_refused() -> None:
         Drive(a_detector(), a_rule("deep", when="(" * 300 + "true" + ")" * 300))
 
 
-OWN = {"zenoh": {"mode": "client", "connect": ["tls/zenoh:7447"], "tlsSecret": "own"}}
+OWN = {"zenoh": {"mode": "client", "connect": ["tls/zenoh:7447"], "tlsSecretName": "own"}}
 
 
 KEY = {"name": "own", "key": "tls.key"}
@@ -83,10 +83,10 @@ URL = "https://e.org/"
 @pytest.mark.parametrize(
     ("http", "place"),
     [
-        ({"url": URL, "headers": [{"name": "X", "secret": KEY}]}, "headers[0].secret.name"),
-        ({"urlSecret": KEY}, "urlSecret.name"),
-        ({"url": URL, "credentialsSecret": "own"}, "credentialsSecret"),
-        ({"url": URL, "tlsSecret": "own"}, "tlsSecret"),
+        ({"url": URL, "headers": [{"name": "X", "secretKeyRef": KEY}]}, "headers[0].secretKeyRef.name"),
+        ({"urlSecretKeyRef": KEY}, "urlSecretKeyRef.name"),
+        ({"url": URL, "credentialsSecretName": "own"}, "credentialsSecretName"),
+        ({"url": URL, "tlsSecretName": "own"}, "tlsSecretName"),
     ],
 )
 def test_a_rule_cannot_have_the_detectors_own_secret_sent_anywhere(http: dict[str, Any], place: str) -> None:
@@ -95,7 +95,7 @@ def test_a_rule_cannot_have_the_detectors_own_secret_sent_anywhere(http: dict[st
     assert str(problem).startswith(
         f"spec.actions[0].notify.http.{place}: the Secret own holds the network access of the Detector"
     )
-    assert [*secret_problems(rule, a_detector(**OWN, mode="Standalone", pod={"secrets": ["own"]}))] == []
+    assert [*secret_problems(rule, a_detector(**OWN, mode="Standalone", pod={"secretNames": ["own"]}))] == []
     assert [*secret_problems(rule, a_detector())] == []
     detector = a_detector(**OWN)
     evaluated, (refusal,) = RuleIndex().compile([rule], detector, inlets(detector).fields)

@@ -16,8 +16,8 @@ from wayside.api.base import Model, ObjectName, PositiveDuration, validations
 _VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
 _TOKEN = r"^[A-Za-z0-9!#$%&'*+.^_`|~-]+$"  # noqa: S105  RFC 9110, section 5.6.2: what a header's name is made of
 _OURS = ("host", "content-length", "content-type", "transfer-encoding", "connection", "expect", "te", "upgrade")
-TLS_ONCE = "give tls or tlsSecret, not both"
-_VALUE_ONCE = "give exactly one of value, variable and secret"
+TLS_ONCE = "give tls or tlsSecretName, not both"
+_VALUE_ONCE = "give exactly one of value, variable and secretKeyRef"
 
 
 HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$")]
@@ -37,7 +37,7 @@ class HttpHeader(Model):
     """A header of each request, with its value or the source of its value."""
 
     model_config = validations(
-        ("[has(self.value), has(self.variable), has(self.secret)].filter(given, given).size() == 1", _VALUE_ONCE)
+        ("[has(self.value), has(self.variable), has(self.secretKeyRef)].filter(given, given).size() == 1", _VALUE_ONCE)
     )
 
     name: str = Field(
@@ -53,11 +53,11 @@ class HttpHeader(Model):
         description="The environment variable of the detector that contains the value. Its name must begin with "
         "WAYSIDE_.",
     )
-    secret: SecretKey | None = Field(default=None, description="The Secret key that contains the value.")
+    secret_key_ref: SecretKey | None = Field(default=None, description="The Secret key that contains the value.")
 
     @model_validator(mode="after")
     def _coherent(self) -> HttpHeader:
-        if sum(given is not None for given in (self.value, self.variable, self.secret)) != 1:
+        if sum(given is not None for given in (self.value, self.variable, self.secret_key_ref)) != 1:
             raise ValueError(_VALUE_ONCE)
         if self.name.lower() in _OURS or self.name.lower().startswith("ce-"):
             raise ValueError(f"the header {self.name} is set by the detector: remove it")
@@ -67,7 +67,7 @@ class HttpHeader(Model):
 class HttpAccess(Model):
     """Access to an HTTP endpoint. Its certificate is always verified; redirects are never followed."""
 
-    model_config = validations(("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE, ".tlsSecret", "Forbidden"))
+    model_config = validations(("!(has(self.tls) && has(self.tlsSecretName))", TLS_ONCE, ".tlsSecretName", "Forbidden"))
 
     headers: list[HttpHeader] = Field(
         default_factory=list,
@@ -80,18 +80,18 @@ class HttpAccess(Model):
         description="The total timeout of one attempt, from name resolution to the end of the response.",
     )
     tls: Tls | None = Field(default=None, description="TLS certificates from files.")
-    tls_secret: ObjectName | None = Field(
+    tls_secret_name: ObjectName | None = Field(
         default=None,
         description="A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and "
         "tls.key.",
     )
-    credentials_secret: ObjectName | None = Field(
+    credentials_secret_name: ObjectName | None = Field(
         default=None, description="A Secret with the keys username and password, for HTTP Basic authentication."
     )
 
     @model_validator(mode="after")
     def _given_once(self) -> HttpAccess:
-        if self.tls is not None and self.tls_secret is not None:
+        if self.tls is not None and self.tls_secret_name is not None:
             raise ValueError(TLS_ONCE)
         names = [header.name.lower() for header in self.headers]
         if len(set(names)) < len(names):
@@ -101,4 +101,6 @@ class HttpAccess(Model):
     @property
     def access(self) -> Access:
         """The same as an `Access`, as used for all networks."""
-        return Access(tls=self.tls, tls_secret=self.tls_secret, credentials_secret=self.credentials_secret)
+        return Access(
+            tls=self.tls, tls_secret_name=self.tls_secret_name, credentials_secret_name=self.credentials_secret_name
+        )

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from wayside.api.actions.http import HttpAccess, HttpUrl, SecretKey
 from wayside.api.base import Duration, Identifier, JsonValue, Model, PositiveDuration, validations
 
-_TLS_ONCE = "give tls or tlsSecret, not both"
-_URL_ONCE = "give exactly one of url and urlSecret"
+_TLS_ONCE = "give tls or tlsSecretName, not both"
+_URL_ONCE = "give exactly one of url and urlSecretKeyRef"
 _TARGETS = ("http", "alertmanager", "zenoh")
 _ONE_TARGET = "give exactly one of http, alertmanager and zenoh"
 _ALERTS = "an Alertmanager groups alerts itself and receives all starts and ends: remove grouping and events"
@@ -40,12 +40,12 @@ class NotifyHttp(HttpAccess):
     """An endpoint that receives CloudEvents by POST."""
 
     model_config = validations(
-        ("!(has(self.tls) && has(self.tlsSecret))", _TLS_ONCE, ".tlsSecret", "Forbidden"),
-        ("has(self.url) != has(self.urlSecret)", _URL_ONCE),
+        ("!(has(self.tls) && has(self.tlsSecretName))", _TLS_ONCE, ".tlsSecretName", "Forbidden"),
+        ("has(self.url) != has(self.urlSecretKeyRef)", _URL_ONCE),
     )
 
     url: HttpUrl | None = Field(default=None, description="The URL of the endpoint, e.g. https://events.example/city.")
-    url_secret: SecretKey | None = Field(
+    url_secret_key_ref: SecretKey | None = Field(
         default=None, description="The Secret key that contains the URL, if the URL itself grants access."
     )
     mode: ContentMode = Field(
@@ -56,7 +56,7 @@ class NotifyHttp(HttpAccess):
 
     @model_validator(mode="after")
     def _one_url(self) -> NotifyHttp:
-        if (self.url is None) == (self.url_secret is None):
+        if (self.url is None) == (self.url_secret_key_ref is None):
             raise ValueError(_URL_ONCE)
         return self
 

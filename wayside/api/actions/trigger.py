@@ -160,7 +160,7 @@ class TriggerHttp(HttpAccess):
     """Requests to an HTTP endpoint, at the start and the end of the episode."""
 
     model_config = validations(
-        ("!(has(self.tls) && has(self.tlsSecret))", TLS_ONCE, ".tlsSecret", "Forbidden"),
+        ("!(has(self.tls) && has(self.tlsSecretName))", TLS_ONCE, ".tlsSecretName", "Forbidden"),
         ("has(self.start) || has(self.stop)", _CALL),
     )
 
