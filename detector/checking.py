@@ -65,7 +65,7 @@ def findings(documents: Sequence[Document]) -> Findings:
         problems.append(rules[0].problem((), missing, MISSING_DETECTOR.name))
     wrong = {
         detector.name: dependency_problems(
-            [rule for rule in _objects(rules) if detector.spec.rules.matches(rule.metadata.labels)]
+            [rule for rule in _objects(rules) if detector.spec.rule_selector.matches(rule.metadata.labels)]
         )
         for _, detector, _ in detectors
     }
@@ -129,10 +129,10 @@ def _rule_problems(
 ) -> Iterator[Problem]:
     rule = document.object
     assert isinstance(rule, EventRule)  # noqa: S101  the caller picked it
-    selecting = [each for each in detectors if each[1].spec.rules.matches(rule.metadata.labels)]
+    selecting = [each for each in detectors if each[1].spec.rule_selector.matches(rule.metadata.labels)]
     if detectors and not selecting:
         names = ", ".join(detector.name for _, detector, _ in detectors)
-        unselected = f"no Detector selects the rule: compare spec.rules of {names}"
+        unselected = f"no Detector selects the rule: compare spec.ruleSelector of {names}"
         yield document.problem(("metadata", "labels"), unselected, RULE_NOT_SELECTED.name)
     for of_detector, detector, entries in selecting:
         try:

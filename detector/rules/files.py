@@ -98,7 +98,7 @@ def _left_out(documents: dict[str, Document], chosen: dict[str, Document], detec
             )
             yield str(document.problem(("metadata", "namespace"), f"the EventRule {name!r} is not evaluated: {why}"))
         else:
-            selected = f"the Detector {detector.name!r} selects by labels: {detector.spec.rules}"
+            selected = f"the Detector {detector.name!r} selects by labels: {detector.spec.rule_selector}"
             why = f"{selected}: correct metadata.labels"
             yield str(document.problem(("metadata", "labels"), f"the EventRule {name!r} is not evaluated: {why}"))
 

@@ -26,7 +26,7 @@ def select(detector: Detector, rules: Iterable[EventRule]) -> RuleSet:
     chosen = [
         rule
         for rule in rules
-        if rule.namespace == detector.namespace and detector.spec.rules.matches(rule.metadata.labels)
+        if rule.namespace == detector.namespace and detector.spec.rule_selector.matches(rule.metadata.labels)
     ]
     return RuleSet(detector, tuple(sorted(chosen, key=lambda rule: rule.name)))
 

@@ -213,7 +213,7 @@ def detector(endpoint: str, **spec: Any) -> Object:
     full = {
         "zenoh": {"mode": "peer", "listen": [endpoint]},
         "streams": [pose],
-        "rules": {"matchLabels": {"site": HOLDER}},
+        "ruleSelector": {"matchLabels": {"site": HOLDER}},
         "clientTimeout": "10m",
         **spec,
     }

@@ -65,7 +65,7 @@ DETECTOR: Object = {
             {"name": "signals", "key": "rsu/signals", "client": "rsu-1", "encoding": "json", "staleAfter": "Never"},
         ],
         "buffer": {"duration": "10s", "bytes": "5e8"},
-        "rules": {"matchLabels": {"site": "intersection-a"}},
+        "ruleSelector": {"matchLabels": {"site": "intersection-a"}},
     },
 }
 

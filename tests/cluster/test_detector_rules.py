@@ -21,7 +21,7 @@ WITHOUT_SITE = {"key": "site", "operator": "DoesNotExist"}
 
 def detector(**spec: Any) -> Object:
     stream = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json"}
-    full = {"streams": [stream], "rules": {"matchLabels": SITE}, **spec}
+    full = {"streams": [stream], "ruleSelector": {"matchLabels": SITE}, **spec}
     return {"apiVersion": API_VERSION, "kind": "Detector", "metadata": {"name": "intersection-a"}, "spec": full}
 
 
@@ -87,7 +87,7 @@ def test_each_change_is_followed(api: Api, following: Following) -> None:
     following.wait_rules("a", "b")
     api.delete("EventRule", "a")
     following.wait_rules("b")
-    api.patch("Detector", "intersection-a", {"spec": {"rules": {"matchExpressions": [WITHOUT_SITE]}}})
+    api.patch("Detector", "intersection-a", {"spec": {"ruleSelector": {"matchExpressions": [WITHOUT_SITE]}}})
     following.wait_rules()
     api.patch("Detector", "intersection-a", {"spec": {"clientTimeout": "7s"}})
     following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the Detector is the changed one")

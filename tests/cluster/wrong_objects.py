@@ -253,8 +253,8 @@ WRONG: list[tuple[str, str, Changes, str]] = [
     (
         "Detector",
         "a selector without its values",
-        {"spec.rules.matchExpressions": [{"key": "site", "operator": "In"}]},
-        r"spec\.rules\.matchExpressions\[0\].*: .*operators In and NotIn need values",
+        {"spec.ruleSelector.matchExpressions": [{"key": "site", "operator": "In"}]},
+        r"spec\.ruleSelector\.matchExpressions\[0\].*: .*operators In and NotIn need values",
     ),
     ("Detector", "an unknown clock", {"spec.clock": "Sun"}, r'spec\.clock: Unsupported value: "Sun".*"Wall", "Data"'),
     ("ApplicationTemplate", "no manifests", {"spec.manifests": []}, r"spec\.manifests: .*at least 1 items"),

@@ -37,7 +37,7 @@ def test_the_rule_is_tested_in_three_lines(site: Path, monkeypatch: pytest.Monke
 
 def test_a_rule_that_the_detector_does_not_select_is_no_silent_success(tmp_path: Path) -> None:
     picky = tmp_path / "detector.yaml"
-    picky.write_text(DETECTOR.read_text() + "  rules: {matchLabels: {site: x}}\n")
+    picky.write_text(DETECTOR.read_text() + "  ruleSelector: {matchLabels: {site: x}}\n")
     with pytest.raises(RefusedError, match="stop-and-go"):
         run(RULES, picky, DRIVE)
 

@@ -205,7 +205,7 @@ class DetectorSpec(Model):
     database: Database | None = Field(
         default=None, description="The MongoDB database of database actions. Required by rules that use them."
     )
-    rules: LabelSelector = Field(
+    rule_selector: LabelSelector = Field(
         default=LabelSelector(),
         description="Selects the EventRules of the namespace to evaluate, by their labels. Default: every rule.",
     )

@@ -27,7 +27,7 @@ from wayside.rules import (
 
 def selects(detector: Detector, rule: EventRule) -> bool:
     """Whether the detector evaluates the rule, which is in its namespace."""
-    return detector.spec.rules.matches(rule.metadata.labels)
+    return detector.spec.rule_selector.matches(rule.metadata.labels)
 
 
 def selecting(rule: EventRule, detectors: Sequence[Detector]) -> list[Detector]:
@@ -116,7 +116,9 @@ def _not_selected(rule: EventRule, detectors: Sequence[Detector], invalid: Seque
 
 
 def _remedies(detectors: Sequence[Detector], invalid: Sequence[str]) -> Iterator[str]:
-    wanted = [f"{each.name} selects {each.spec.rules}" for each in sorted(detectors, key=lambda each: each.name)]
+    wanted = [
+        f"{each.name} selects {each.spec.rule_selector}" for each in sorted(detectors, key=lambda each: each.name)
+    ]
     if wanted:
         yield f"correct metadata.labels: {'; '.join(wanted)}"
     yield from (f"correct Detector {name}, whose status shows what is wrong with it" for name in sorted(invalid))

@@ -102,7 +102,7 @@ def test_the_secrets_are_those_that_the_detector_names_and_those_that_rules_may_
 
 
 def test_what_the_detector_follows_by_itself_does_not_change_the_pod() -> None:
-    changed = detector(clientTimeout="7s", rules={"matchLabels": {"a": "b"}}, buffer={"bytes": "1Gi"})
+    changed = detector(clientTimeout="7s", ruleSelector={"matchLabels": {"a": "b"}}, buffer={"bytes": "1Gi"})
     assert detector_objects(changed, DEFAULTS) == detector_objects(detector(), DEFAULTS)
 
 

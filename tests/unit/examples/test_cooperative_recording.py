@@ -208,7 +208,7 @@ def test_a_recording_is_the_same_drive_and_opens_as_a_rosbag(tmp_path: Path) -> 
 
 def test_the_rule_compiles_against_the_detector_and_the_detector_selects_it() -> None:
     detector, rule = only(Detector, "town"), only(EventRule, "lidar-vehicles-close")
-    assert detector.spec.rules.matches(rule.metadata.labels)
+    assert detector.spec.rule_selector.matches(rule.metadata.labels)
     compiled = compile_rule(rule, detector)
     assert [deploy.template for deploy in compiled.deploys] == ["scene-recorder", "scene-fusion"]
 

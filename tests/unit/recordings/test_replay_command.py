@@ -246,7 +246,10 @@ IGNORING = {"wayside.dev/ignore-findings": "classification-incidence, old-sample
         ([a_detector(a_stream("speed", encoding="cdr", type="nobody/msg/Nothing"))], "invalid-detector"),
         ([a_detector(a_stream("speed")), a_rule("r", when="v > 1")], "invalid-rule"),
         ([a_rule("r", **FAST)], "missing-detector"),
-        ([a_detector(a_stream("speed"), rules={"matchLabels": {"a": "b"}}), a_rule("r", **FAST)], "rule-not-selected"),
+        (
+            [a_detector(a_stream("speed"), ruleSelector={"matchLabels": {"a": "b"}}), a_rule("r", **FAST)],
+            "rule-not-selected",
+        ),
         (
             [
                 a_detector(a_stream("speed"), clients=[{"name": "car", "parameters": {"fats": {"limit": 1}}}]),

@@ -57,7 +57,7 @@ def test_one_folder_may_hold_everything(write: Write, tmp_path: Path) -> None:
 
 
 def test_a_rule_that_the_detector_does_not_select_is_left_out_and_said(write: Write) -> None:
-    selecting = detector(rules={"matchLabels": {"site": "a"}})
+    selecting = detector(ruleSelector={"matchLabels": {"site": "a"}})
     loaded = load_rules(write("d.yaml", selecting), [write("r.yaml", rule("in", site="a"), rule("out", site="b"))])
     assert [each.name for each in loaded.rule_set.rules] == ["in"]
     [warning] = loaded.warnings

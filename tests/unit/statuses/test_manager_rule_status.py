@@ -41,7 +41,7 @@ def detector(name: str = "det", stream: str = "pose", site: str = "a", **more: A
         {
             "kind": "Detector",
             "metadata": {"name": name, "namespace": "site"},
-            "spec": {"streams": streams, "rules": {"matchLabels": {"site": site}}},
+            "spec": {"streams": streams, "ruleSelector": {"matchLabels": {"site": site}}},
         }
     )
 

@@ -34,7 +34,7 @@ def counting(name: str, of: str) -> EventRule:
 
 def detector(name: str = "det", stream: str = "pose", site: str = "a", **more: Any) -> Detector:
     streams = [{"name": stream, "key": "v/${client:*}/pose", "encoding": "json"}]
-    spec = {"streams": streams, "rules": {"matchLabels": {"site": site}}, **more}
+    spec = {"streams": streams, "ruleSelector": {"matchLabels": {"site": site}}, **more}
     return Detector.model_validate({"kind": "Detector", "metadata": {"name": name, "namespace": "site"}, "spec": spec})
 
 
