@@ -383,8 +383,8 @@ def test_a_definition_of_the_recording_that_lacks_a_part_is_told(tmp_path: Path)
 
 
 def test_the_documentation_s_examples_are_streams_that_run() -> None:
-    examples = [yaml.safe_load(example) for example in yaml_blocks(guide("encodings"))]
-    streams = [example for example in examples if "streams" in example]
+    blocks = [document for block in yaml_blocks(guide("encodings")) for document in yaml.safe_load_all(block)]
+    streams = [each for each in blocks if "streams" in each]
     assert len(streams) >= 2
     for example in streams:
         entries = inlets(a_detector(*example.pop("streams"), **example))
