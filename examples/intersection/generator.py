@@ -65,8 +65,6 @@ ROAD_USERS = (
 
 RED = ((8.8, 12.0), (38.0, 49.0))
 """When the light for eastbound traffic is red, in seconds."""
-LIGHT = {"x": -8.0, "y": -11.0, "yaw": 0.0, "speed": 0.0}
-"""Where it stands."""
 
 
 class Sent(NamedTuple):
@@ -88,12 +86,7 @@ def sent(seed: int = SEED) -> list[Sent]:
     for begin, end in RED:
         red |= (light >= begin) & (light < end)
     phase = np.where(red, "red", "green").tolist()
-    still = {axis: [value] * len(light) for axis, value in LIGHT.items()}
-    return [
-        *(_driven(each, rng) for each in ROAD_USERS),
-        Sent("light-east", "state", light, still),
-        Sent("light-east", "phase", light, {"phase": phase}),
-    ]
+    return [*(_driven(each, rng) for each in ROAD_USERS), Sent("light-east", "phase", light, {"phase": phase})]
 
 
 def messages(seed: int = SEED) -> Iterator[tuple[int, str, dict[str, Any]]]:

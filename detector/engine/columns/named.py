@@ -41,9 +41,11 @@ class NamedSignals:
             assert self.columns is not None  # noqa: S101  all signals were placed
             own.present = known[None, :]
             self.columns.look(own, floor)
+        # Which ticks without clients are in a block depends on the cut.
+        read = np.full(len(known), bool(block.clients)) if block.present is None else block.present.any(axis=0)
         found: dict[int, Column] = {}
         for at, track, name in self._places:
-            track.counters.unknowns += int((~known).sum())
+            track.counters.unknowns += int((~known & read).sum())
             column = Column(np.zeros(len(known)), np.zeros(len(known), np.uint8), None)
             if own is not None and self.columns is not None:
                 column = own.signals[self.columns.place(track.row, name)]

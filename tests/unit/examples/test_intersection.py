@@ -20,6 +20,9 @@ from detector.checking import findings
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
+from detector.results.episodes import episodes_of
+from detector.results.nearest import nearest
+from detector.results.tracing import Tracer
 from examples.intersection.generator import RED, SECONDS, START_NS, messages, sent
 from tests.guides import ROOT
 from wayside.api import Detector, EventRule
@@ -45,7 +48,13 @@ class Span(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def events() -> list[Event]:
+def tracer() -> Tracer:
+    """Sees what the rules see."""
+    return Tracer()
+
+
+@pytest.fixture(scope="module")
+def events(tracer: Tracer) -> list[Event]:
     """The events of all rules."""
     objects = [document.object for document in DOCUMENTS]
     detector = next(each for each in objects if isinstance(each, Detector))
@@ -54,7 +63,9 @@ def events() -> list[Event]:
     compiled, refused = RuleIndex().compile(rules, detector, entries.fields, entries.places)
     assert refused == []
     engine = Engine(detector, holder="h", decoders=entries.decoders, read_key=entries.read_key, start=START_NS)
+    engine.instruments.observer = tracer
     engine.set_rules(compiled)
+    tracer.attend(engine)
     arrivals = [
         Arrival(time, key.rpartition("/")[2], key, json.dumps(value).encode()) for time, key, value in messages()
     ]
@@ -214,15 +225,18 @@ def near_miss(below: float = 2) -> list[Span]:
     return pairs(colliding, 60, ordered=False)
 
 
+def acceleration(user: User) -> Doubles:
+    """Over half a second, in m/s²."""
+
+    def rate(window: slice) -> float:
+        return float(np.ptp(user.ticks[window]) and np.diff(user.speed[window]).sum() / np.ptp(user.ticks[window])) * 10
+
+    return user.over(5, rate, least=2)
+
+
 def hard_braking() -> list[Span]:
     def braking(user: User) -> Doubles:
-        def rate(window: slice) -> float:
-            return (
-                float(np.ptp(user.ticks[window]) and np.diff(user.speed[window]).sum() / np.ptp(user.ticks[window]))
-                * 10
-            )
-
-        rates = user.over(5, rate, least=2)
+        rates = acceleration(user)
         return known(rates < -5, rates)
 
     return clients(braking)
@@ -277,8 +291,7 @@ def stop_line() -> list[Span]:
 def red_light() -> list[Span]:
     ticks = np.arange(TICKS) / 10
     red = np.any([(ticks >= begin - 0.01) & (ticks < end - 0.01) for begin, end in RED], axis=0)
-    rows = {f"{name}+light-east": true(red, _crossed(user)) for name, user in USERS.items() if name != "light-east"}
-    return spans(rows)
+    return clients(lambda user: true(red, _crossed(user)))
 
 
 def _count(flag: Callable[[User], Doubles]) -> list[Span]:
@@ -396,6 +409,21 @@ def test_the_least_time_to_collision_of_an_episode_is_that_of_numpy(events: list
         times = time_to_collision(Pair(a, b))[first : last + 1]
         assert event.values["least"] == pytest.approx(np.nanmin(times), abs=1e-9)
         assert event.values["leastAt"] == pytest.approx((START_NS + (first + np.nanargmin(times)) * TICK) / 1e9)
+
+
+def test_the_nearest_that_did_not_happen_are_those_of_numpy(events: list[Event], tracer: Tracer) -> None:
+    trace = tracer.trace()
+    rules = {name: run.rule for name, run in tracer.engine.rules.items()} if tracer.engine is not None else {}
+    moments = nearest("", rules, trace.subjects, episodes_of("", events, trace))
+    braked = {event.subject for event in events if event.rule == "hard-braking"}
+    expected = {name: -5 - np.nanmin(acceleration(user)) for name, user in USERS.items() if name not in braked}
+    found: dict[str, float] = {}
+    for moment in moments:
+        found.setdefault(moment.subject, moment.margin)
+    never = [name for name in found if name not in braked]
+    assert never == sorted(expected, key=lambda name: -expected[name])[: len(never)]
+    assert never
+    assert [found[name] for name in never] == pytest.approx([expected[name] for name in never])
 
 
 def test_each_rule_has_a_truth_and_at_most_25_lines() -> None:
