@@ -61,7 +61,7 @@ def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
         ({"metadata": {"who": "${nobody}"}}, "nobody"),
         ({"metadata": {"who": "${client"}}, "who"),
         ({"database": "a/b"}, "database"),
-        ({"files": {"above": "0"}}, "size above zero"),
+        ({"files": {"above": "0"}}, "quantity above zero"),
         ({"streams": ["odometri"]}, "odometry"),
         ({"before": "1h"}, "reach back further"),
     ],
