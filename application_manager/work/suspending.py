@@ -1,7 +1,7 @@
-"""Taking an instance's workloads to zero, and back to what they were, whenever the manager may be killed in between.
+"""Scales an instance's workloads to zero and back, even if the manager is killed in between.
 
-What they had is written into the instance's status before any of them is touched, and removed from it only once all of
-them are back. So the status shows at any time what is left to do; a look at the objects shows what is done.
+Their replica counts are written into the instance's status before any workload changes, and removed only when all have
+been restored. So the status always shows the remaining work, and the objects show the finished work.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def write_dataset(
     _write_episodes(new / EPISODES, recordings, rules, dict(sorted(kinds.items())), with_clips)
     for name, (columns, rows) in _tables(recordings).items():
         _write_table(new / f"{name}.parquet", columns, rows)
-    # The old episodes go at once: what is there is then never a mixture of two runs.
+    # Remove all old episodes first, so that the folder never mixes two runs.
     shutil.rmtree(folder / EPISODES, ignore_errors=True)
     for path in sorted(new.iterdir()):
         path.replace(folder / path.name)

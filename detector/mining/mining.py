@@ -1,7 +1,7 @@
-"""A whole run: what is left to do is done by the workers, then the dataset is written from all that is kept.
+"""A whole run: the workers mine the recordings that have no result yet, then the dataset is written from all results.
 
-Content, rules and version alone decide what is left. So a run may be killed and begun again, and several runs may share
-the work in one folder: each writes what it does, and the one that finds everything done writes the dataset.
+A result is identified by content, rules and version. So a run may be killed and restarted, and several runs may share
+the work in one folder: each writes its own results, and the run that finds all of them writes the dataset.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def run_mining(
     record: bool = False,
     share: Share | None = None,
 ) -> Run:
-    """Mine what is left of the recordings, and write the dataset.
+    """Mine the recordings that have no result yet, and write the dataset.
 
     Args:
         sources: the recordings, in the order in which the dataset has them.

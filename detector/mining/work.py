@@ -95,7 +95,7 @@ def mine(job: Job) -> bytes:
 
 @cache
 def tuned() -> None:
-    """Tune this process once: what is there then is taken for what stays."""
+    """Tune this process once; the objects that exist then are treated as permanent."""
     tune_garbage_collection()
 
 

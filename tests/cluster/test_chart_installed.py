@@ -143,7 +143,7 @@ def test_what_an_install_made_goes_as_well_where_no_upgrade_came_between(helm: H
 
 
 def test_an_upgrade_of_the_crds_changes_no_stored_object(helm: Helm, there: Api, tmp_path: Path) -> None:
-    """So nothing that runs is applied anew: the same spec gives the same manifests."""
+    """The same spec gives the same manifests, so no running application is applied again."""
     older = tmp_path / "older"
     older.mkdir()
     for file in CRDS.glob("*.yaml"):

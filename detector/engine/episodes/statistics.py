@@ -155,7 +155,7 @@ class Statistics:
         return {"until": self.until, "signals": {name: each.to_document() for name, each in self._of.items()}}
 
     def restore(self, document: Mapping[str, Any]) -> None:
-        """Go on from what `to_document` made; what is missing or malformed begins anew."""
+        """Go on from what `to_document` made; missing or malformed statistics restart."""
         try:
             until = int(document["until"])
             restored = {name: _statistic(each) for name, each in document["signals"].items()}

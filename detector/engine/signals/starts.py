@@ -1,4 +1,4 @@
-"""The episodes of rules as other rules see them: each start and end is a sample, and what is open is known.
+"""The episodes of rules as other rules see them: each start and end is a sample, and open episodes are known.
 
 A start is kept for each of the episode's clients; that of an episode of the whole fleet, which names none, for
 everybody. Starts live in a buffer of their own, with a cap of its own: they are no data of a client, so they neither
