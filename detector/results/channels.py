@@ -5,6 +5,7 @@ Each rule and subject has a channel of JSON with a schema; besides there are the
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
@@ -96,10 +97,10 @@ def _messages(
 
 
 def _plain(series: Series, times: Integers) -> list[float | bool | str | None]:
-    """The values at these times as JSON has them; None: unknown."""
+    """The values at these times as JSON has them; None: unknown or infinite, which JSON cannot express."""
     values = series.at(times).tolist()
     if series.kind is Kind.NUMBER:
-        return [None if value != value else value for value in values]  # noqa: PLR0124  NaN alone differs
+        return [value if math.isfinite(value) else None for value in values]
     return [series.plain(value) for value in values]
 
 

@@ -119,7 +119,11 @@ def data_of(result: Result) -> dict[str, Any]:
         ],
         "deedCount": len(deeds),
         "demands": _demands(deeds, table),
-        "nearest": [[each.rule, each.subject, table.seconds(each.time), each.margin] for each in result.nearest],
+        "nearest": [
+            [each.rule, each.subject, table.seconds(each.time), each.margin]
+            for each in result.nearest
+            if math.isfinite(each.margin)
+        ],
         "streams": [
             {
                 "stream": each.stream, "key": each.key, "encoding": each.encoding, "samples": each.samples,
@@ -164,7 +168,7 @@ class _Table:
             place = self._places[digest] = len(self.entries)
             short = thinned(series, self._begin, self._end, self._buckets, self._exact[digest])
             used = [*short.texts] if short.kind is Kind.TEXT else None
-            values = [None if value != value else value for value in short.values.tolist()]  # noqa: PLR0124
+            values = [value if math.isfinite(value) else None for value in short.values.tolist()]
             if short.kind is not Kind.NUMBER:
                 values = [None if value is None else int(value) for value in values]
             entry: dict[str, Any] = {"kind": short.kind.value, "t": self.times(short.times), "v": values}
@@ -245,7 +249,8 @@ def _subject(
 def _values(episode: Episode) -> dict[str, Any]:
     """Those that the page lists."""
     shown = (".start", ".max")
-    return {name: value for name, value in episode.values.items() if value is not None and name.endswith(shown)}
+    values = ((name, value) for name, value in episode.values.items() if name.endswith(shown) and value is not None)
+    return {name: value for name, value in values if not isinstance(value, float) or math.isfinite(value)}
 
 
 def _series_of(result: Result, subject: SubjectTrace) -> dict[str, Series]:

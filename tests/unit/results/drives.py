@@ -71,6 +71,7 @@ spec:
   signals:
     - {name: speed, stream: odom, value: msg.speed}
     - {name: nearest, of: distance, over: 2s, aggregate: Min}
+    - {name: contact, of: "timeToCollision(distance - 5.0, closingSpeed)"}
   when: distance < 50 && a.speed > 0 && (at(a.position, "yard").distance >= 0 || at(b.position, "gate").across > 0)
   until: distance > 70
 ---
