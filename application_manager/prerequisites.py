@@ -43,13 +43,13 @@ async def selectable(client: Client, resources: Mapping[KindKey, Resource], name
     """
     namespace = next(iter(sorted(namespaces)), None)
     try:
-        await until_answered(partial(client.list, resources[TASK], namespace, fields="spec.template=none"))
+        await until_answered(partial(client.list, resources[TASK], namespace, fields="spec.templateName=none"))
     except ApiError as error:
         if error.code != 400:
             raise
         raise ConfigurationError(
-            f"ApplicationTasks cannot be selected by spec.template ({error.message}), so no application would ever be "
-            "released: run kubectl apply -f crds/ on Kubernetes 1.31 or newer"
+            f"ApplicationTasks cannot be selected by spec.templateName ({error.message}), so no application would ever "
+            "be released: run kubectl apply -f crds/ on Kubernetes 1.31 or newer"
         ) from None
 
 

@@ -82,7 +82,7 @@ def start(api: Api) -> Object:
             manifests=[made],
         )
     )
-    api.apply(_object("ApplicationTask", template=NAME, parameters={"number": 0}))
+    api.apply(_object("ApplicationTask", templateName=NAME, parameters={"number": 0}))
     apply_manager(api, WAYSIDE_IMAGE)
     wait_available(api, "application-manager")
     api.wait_for("Deployment", NAME, lambda _: True, timeout=PATIENCE, what="the application is made")

@@ -37,7 +37,7 @@ PARTS = ("application_manager", "benchmarks", "tests", "wayside")
 CASES: dict[str, dict[str, Any]] = {
     "without limits": {},
     "with a limit": {"maxInstances": 100_000},
-    "with a fallback": {"lifecycle": {"readyTimeout": "60s", "fallback": {"template": "lite"}}},
+    "with a fallback": {"lifecycle": {"readyTimeout": "60s", "fallback": {"templateName": "lite"}}},
 }
 REPEATS = 5  # reconciles of each instance in a round
 

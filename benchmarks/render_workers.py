@@ -31,7 +31,7 @@ TARGET = 1e-3  # s that the way through a worker may add
 
 def instance(number: int) -> ApplicationInstance:
     """One of as many as there are numbers."""
-    spec = ApplicationInstanceSpec(template="app", key=f"r{number}", parameters={"region": f"r{number}"})
+    spec = ApplicationInstanceSpec(template_name="app", key=f"r{number}", parameters={"region": f"r{number}"})
     return ApplicationInstance(metadata=Metadata(name=f"app-{number}", namespace="site"), spec=spec)
 
 

@@ -81,7 +81,7 @@ def _commands(folder: Path) -> dict[str, Command]:
         "apiVersion": "wayside.dev/v1alpha1",
         "kind": "ApplicationTask",
         "metadata": {"name": "wanted"},
-        "spec": {"template": "scene-recorder", "parameters": {"vehicles": ["car1", "car2"]}},
+        "spec": {"templateName": "scene-recorder", "parameters": {"vehicles": ["car1", "car2"]}},
     }
     (folder / "task.yaml").write_text(yaml.safe_dump(task))
     cluster = {"name": "none", "cluster": {"server": f"http://127.0.0.1:{free_port()}"}}

@@ -81,7 +81,7 @@ def task(namespace: str, region: str) -> dict[str, Any]:
         "apiVersion": API_VERSION,
         "kind": "ApplicationTask",
         "metadata": {"name": region, "namespace": namespace},
-        "spec": {"template": "app", "parameters": {"region": region}},
+        "spec": {"templateName": "app", "parameters": {"region": region}},
     }
 
 
@@ -109,7 +109,7 @@ class Raw:
             "apiVersion": API_VERSION,
             "kind": "ApplicationInstance",
             "metadata": {"name": instance_name("app", region), "namespace": self.namespace},
-            "spec": {"template": "app", "key": region, "parameters": {"region": region}},
+            "spec": {"templateName": "app", "key": region, "parameters": {"region": region}},
         }
 
 

@@ -56,7 +56,7 @@ def a_rule(name: str = "r", **spec: Any) -> EventRule:
 
 
 def a_deploy(name: str, template: str = "app", **fields: Any) -> dict[str, Any]:
-    return {"name": name, "deploy": {"template": template, **fields}}
+    return {"name": name, "deploy": {"templateName": template, **fields}}
 
 
 def arrival(seconds: float, client: str, value: Any, stream: str = "speed") -> Arrival:

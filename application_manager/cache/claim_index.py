@@ -106,11 +106,11 @@ class ClaimIndex:
         """Note that a task's claim is being worked out: until then, a task that had one keeps it."""
         touched = set() if before is not None and before.task.metadata.uid == task.metadata.uid else self._drop(name)
         self._file(name, task)
-        self._pending.setdefault((name[0], task.spec.template), set()).add(name)
+        self._pending.setdefault((name[0], task.spec.template_name), set()).add(name)
         return touched
 
     def _file(self, name: Name, task: ApplicationTask) -> None:
-        of = (name[0], task.spec.template)
+        of = (name[0], task.spec.template_name)
         self._templates[name] = of
         self._by_template.setdefault(of, {})[name] = task
 

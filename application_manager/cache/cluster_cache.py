@@ -154,7 +154,7 @@ class ClusterCache:
             for name, entry in self.store.all(INSTANCE)
             if name[0] == template[0]
             and isinstance(entry.model, ApplicationInstance)
-            and entry.model.spec.template == template[1]
+            and entry.model.spec.template_name == template[1]
         ]
 
     def decide(self, name: Name, now: float) -> Decided:
@@ -187,7 +187,7 @@ class ClusterCache:
         entry, before = self.store.get(TASK, name), self.claims.claim(name)
         if entry is None:
             return set()
-        touched = self.claims.note(name, entry, self.template((name[0], entry.raw["spec"].get("template", ""))))
+        touched = self.claims.note(name, entry, self.template((name[0], entry.raw["spec"].get("templateName", ""))))
         after = self.claims.claim(name)
         if before is None or after is None or before.task.metadata.uid != entry.uid:
             return touched
@@ -207,7 +207,7 @@ class ClusterCache:
     def is_unsettled(self, instance: Name) -> bool:
         """Whether claims of tasks that were there at the beginning, and may demand the instance, are not known yet."""
         known = self.instance(instance)
-        return known is not None and self.claims.unsettled((instance[0], known.spec.template))
+        return known is not None and self.claims.unsettled((instance[0], known.spec.template_name))
 
     def note_limits(self, template: Name) -> None:
         """Note how many instances a template may have now, and what it falls back to, should it be there."""

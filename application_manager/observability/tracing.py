@@ -204,6 +204,6 @@ def _about(task: ApplicationTask) -> dict[str, Attribute]:
     return {
         "k8s.namespace.name": task.namespace,
         "wayside.task": task.name,
-        "wayside.template": task.spec.template,
+        "wayside.template": task.spec.template_name,
         "wayside.operation": task.spec.operation.value,
     }

@@ -103,7 +103,7 @@ class Router:
             self.look_at(name)
             self.configuration(name)
             if isinstance(entry.model, ApplicationInstance):
-                self.template((name[0], entry.model.spec.template))
+                self.template((name[0], entry.model.spec.template_name))
         elif kind in _RULES:
             self._rules(name[0])
         elif kind == POD and _is_a_workloads(raw):
@@ -161,7 +161,7 @@ class Router:
     def _instance(self, name: Name, old: Entry | None, entry: Entry) -> None:
         self.look_at(name)
         if (old is None or old.uid != entry.uid) and isinstance(entry.model, ApplicationInstance):
-            self.template((name[0], entry.model.spec.template))
+            self.template((name[0], entry.model.spec.template_name))
 
     def _child(self, raw: Object, old: Entry | None, entry: Entry) -> None:
         if kind_of(raw) == POD:

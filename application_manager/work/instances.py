@@ -293,7 +293,7 @@ class InstanceWork:
 
     async def _list_tasks(self, name: Name) -> None:
         instance = self.cache.instance(name)
-        fields = f"spec.template={instance.spec.template}" if instance is not None else ""
+        fields = f"spec.templateName={instance.spec.template_name}" if instance is not None else ""
         async for page, _ in self.client.pages(self.tasks, name[0], fields=fields):
             for raw in page:
                 self.observe(raw)
@@ -303,7 +303,7 @@ class InstanceWork:
         instance = self.cache.instance(name)
         if instance is None:
             return False
-        if self.cache.claims.pending((name[0], instance.spec.template)):
+        if self.cache.claims.pending((name[0], instance.spec.template_name)):
             self.again(name, time.time() + _LOOK_AGAIN)  # one of the tasks that were listed may demand it
             return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)

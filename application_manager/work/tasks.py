@@ -75,7 +75,7 @@ class TaskWork:
         if task is None or known is None or task.metadata.deletion_timestamp is not None:
             return
         verdict, service = known
-        if verdict.reason == Refused.TEMPLATE_NOT_FOUND and await self._has_template(name[0], task.spec.template):
+        if verdict.reason == Refused.TEMPLATE_NOT_FOUND and await self._has_template(name[0], task.spec.template_name):
             return  # the watch of templates was behind that of tasks; the template's event enqueues the task again
         await self._write(name, task, verdict, service)
 

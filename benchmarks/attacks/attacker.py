@@ -65,7 +65,7 @@ class Attacker:
         while True:
             turn += 1
             items = [f"{turn}-{index}" for index in range(2000)]
-            spec = {"template": f"bomb{number}", "parameters": {"l": items, "s": TEXT}}
+            spec = {"templateName": f"bomb{number}", "parameters": {"l": items, "s": TEXT}}
             made = {**task(self._namespace, f"bomb{number}-{turn}"), "spec": spec}
             with contextlib.suppress(ApiError):
                 raw = await self._client.create(TASKS, made)

@@ -38,7 +38,7 @@ def _tasks(result: Result) -> Iterator[Deed]:
         if event is None:
             continue
         parameters = ", ".join(f"{name}={json.dumps(value)}" for name, value in spec.parameters.items())
-        about = f"{spec.template}: {parameters}" if parameters else spec.template
+        about = f"{spec.template_name}: {parameters}" if parameters else spec.template_name
         end = None if spec.end_time is None else parse_time(spec.end_time)
         begin = parse_time(event.start_time)
         yield Deed(event.rule, event.action, event.subject, str(spec.operation).lower(), about, begin, end)

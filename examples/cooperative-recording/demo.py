@@ -178,10 +178,10 @@ class Timeline:
         for name, task in sorted(tasks.items()):
             if name not in self._tasks:
                 self._tasks.add(name)
-                self._line("task", "cyan", f"for {_subject(task)}: {task.spec.template} ({name})")
+                self._line("task", "cyan", f"for {_subject(task)}: {task.spec.template_name} ({name})")
             if task.spec.end_time is not None and name not in self._ended:
                 self._ended.add(name)
-                self._line("task", "cyan", f"for {_subject(task)}: {task.spec.template} has ended")
+                self._line("task", "cyan", f"for {_subject(task)}: {task.spec.template_name} has ended")
         for change in self._foresight.look(tasks, time.time()):
             detail = f": {change.detail}" if change.detail else ""
             self._line("instance", "green", f"{change.instance} [bold]{change.what}[/]{detail}")

@@ -98,7 +98,7 @@ def _instance(
             labels={MANAGED_BY_LABEL: MANAGED_BY},
             annotations={LINGER_ANNOTATION: str(template.spec.lifecycle.linger)},
         ),
-        spec=ApplicationInstanceSpec(template=decision.template, key=decision.key, parameters=parameters),
+        spec=ApplicationInstanceSpec(template_name=decision.template, key=decision.key, parameters=parameters),
         status=ApplicationInstanceStatus(
             release_time=None if decision.release_time is None else format_seconds(decision.release_time)
         ),

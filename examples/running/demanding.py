@@ -49,7 +49,7 @@ def running_at(folder: Path, history: Iterable[tuple[float, ApplicationTask]], a
     found = {}
     for name, decision in outcome.instances.items():
         spec = ApplicationInstanceSpec(
-            template=decision.template, key=decision.key, parameters=decision.parameters or {},
+            template_name=decision.template, key=decision.key, parameters=decision.parameters or {},
             suspended=bool(decision.suspended),
         )  # fmt: skip
         instance = ApplicationInstance(metadata=Metadata(name=name), spec=spec)

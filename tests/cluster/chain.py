@@ -231,7 +231,7 @@ def cdr_stream() -> Object:
 
 
 def rule(name: str = "close", *, position: str = "msg", **spec: Any) -> Object:
-    deploy = {"template": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}}
+    deploy = {"templateName": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}}
     full = {
         "scope": {
             "pairs": {
@@ -253,7 +253,7 @@ def rule(name: str = "close", *, position: str = "msg", **spec: Any) -> Object:
 def recording(**parameters: Any) -> list[Object]:
     """The rule's actions, with more parameters for the template."""
     given = {"vehicles": "${[a.client, b.client]}", **parameters}
-    return [{"name": "record", "deploy": {"template": "recorder", "parameters": given}}]
+    return [{"name": "record", "deploy": {"templateName": "recorder", "parameters": given}}]
 
 
 def template(*, linger: str = "1s", after: str = "10m") -> Object:

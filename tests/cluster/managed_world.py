@@ -103,7 +103,7 @@ def differences(
         if name in refused:
             expected |= {key for key, raw in objects.items() if name in raw["metadata"]["labels"].values()}
         else:
-            expected |= yield from _objects(instance, templates.get(instance.spec.template), objects)
+            expected |= yield from _objects(instance, templates.get(instance.spec.template_name), objects)
     for name in outcome.instances.keys() - instances.keys():
         yield f"{name}: should exist"
     for leaked in objects.keys() - expected:
@@ -213,7 +213,7 @@ def config(data: Mapping[str, str], name: str = "${instance.name}-config") -> Ob
 
 def task(name: str, *, of: str = "app", holder: str | None = None, **parameters: Any) -> Object:
     """A task for a region, by default that of its own name."""
-    spec: Object = {"template": of, "parameters": {"region": name} | parameters}
+    spec: Object = {"templateName": of, "parameters": {"region": name} | parameters}
     if holder is not None:
         spec["requester"] = {"holder": holder}
     return {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask", "metadata": {"name": name}, "spec": spec}

@@ -40,7 +40,7 @@ EVENT_RULE: Object = {
         "actions": [
             {
                 "name": "record",
-                "deploy": {"template": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}},
+                "deploy": {"templateName": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}},
             }
         ],
     },
@@ -97,7 +97,7 @@ APPLICATION_TASK: Object = {
     "kind": "ApplicationTask",
     "metadata": {"name": "lidar-vehicles-close-abcdefghijklmnop"},
     "spec": {
-        "template": "scene-fusion",
+        "templateName": "scene-fusion",
         "priority": 3,
         "parameters": {"region": "north", "sources": ["car1", "car2"], "rateHz": 20},
         "requester": {"detector": "intersection-a", "holder": "intersection-a", "subjects": ["car1", "car2"]},
@@ -118,7 +118,7 @@ APPLICATION_INSTANCE: Object = {
     "apiVersion": "wayside.dev/v1alpha1",
     "kind": "ApplicationInstance",
     "metadata": {"name": "scene-fusion-abcdefgh"},
-    "spec": {"template": "scene-fusion", "key": "north", "parameters": {"region": "north", "sources": ["car1"]}},
+    "spec": {"templateName": "scene-fusion", "key": "north", "parameters": {"region": "north", "sources": ["car1"]}},
 }
 
 VALID: dict[str, Object] = {

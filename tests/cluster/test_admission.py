@@ -111,7 +111,7 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
         rule("large"),
         {
             "actions": [
-                {"name": "a", "deploy": {"template": "app", "parameters": {"x": "y" * 40_000, "z": "y" * 30_000}}}
+                {"name": "a", "deploy": {"templateName": "app", "parameters": {"x": "y" * 40_000, "z": "y" * 30_000}}}
             ]
         },
         ["spec.actions[0].deploy.parameters", "exceeds the limit of 65536; the largest value is x: shorten it"],

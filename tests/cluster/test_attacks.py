@@ -203,10 +203,10 @@ def action(**spec: Any) -> Object:
 
 
 FREE: dict[tuple[str, str], Object] = {
-    ("ApplicationInstance", "parameters{}"): {"template": "good", "parameters": {"region": "x", "v": LARGE}},
-    ("ApplicationTask", "parameters{}"): {"template": "good", "parameters": {"region": "x", "v": LARGE}},
+    ("ApplicationInstance", "parameters{}"): {"templateName": "good", "parameters": {"region": "x", "v": LARGE}},
+    ("ApplicationTask", "parameters{}"): {"templateName": "good", "parameters": {"region": "x", "v": LARGE}},
     ("ApplicationTask", "event.values{}"): {
-        "template": "good",
+        "templateName": "good",
         "parameters": {"region": "v"},
         "event": {
             "id": "0",
@@ -259,7 +259,7 @@ FREE: dict[tuple[str, str], Object] = {
     ("EventRule", "signals[].plugin.parameters{}"): {
         "signals": [{"name": "s", "plugin": {"name": "p", "parameters": LARGE}}]
     },
-    ("EventRule", "actions[].deploy.parameters{}"): action(deploy={"template": "good", "parameters": {"v": LARGE}}),
+    ("EventRule", "actions[].deploy.parameters{}"): action(deploy={"templateName": "good", "parameters": {"v": LARGE}}),
     ("EventRule", "actions[].record.metadata{}"): action(record={"metadata": {"v": LARGE}}),
     ("EventRule", "actions[].trigger.ros2.start.request{}"): action(trigger={"ros2": {"start": STARTED["ros2"]}}),
     ("EventRule", "actions[].trigger.ros2.stop.request{}"): action(
@@ -332,7 +332,7 @@ def test_bombs_in_a_rule_delay_nobody(api: Api, attacked: Process) -> None:
         nested = f"{nested}.map(x, {nested})"
     for index, bomb in enumerate((loops, nested)):
         rule = {"scope": {"client": {}}, "when": f"size([{bomb}]) > 0"}
-        rule |= action(deploy={"template": "good", "parameters": {"region": f"${{{bomb}}}"}})
+        rule |= action(deploy={"templateName": "good", "parameters": {"region": f"${{{bomb}}}"}})
         manifest = {"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": {"name": f"bomb-{index}"}}
         if not refused(api, manifest | {"spec": rule}):
             api.wait_for("EventRule", f"bomb-{index}", lambda raw: bool(raw.get("status")), what="it is judged")

@@ -53,7 +53,7 @@ def test_a_rule_that_cannot_be_read_is_told_and_the_others_are_listed(
 ) -> None:
     api.create(rule("battery", RARE))
     broken = rule("broken", RARE)
-    broken["spec"]["actions"] = [{"name": "a", "deploy": {"template": "t", "parameters": {"not-an-identifier": 1}}}]
+    broken["spec"]["actions"] = [{"name": "a", "deploy": {"templateName": "t", "parameters": {"not-an-identifier": 1}}}]
     api.create(broken)
     answer = catalog(control_plane.kubeconfig, namespace, "--only", "incidence=Rare", "--format", "json")
     assert answer.returncode == 0, answer.stderr

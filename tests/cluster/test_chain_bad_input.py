@@ -197,7 +197,7 @@ def test_detector_check_tells_where_each_rule_is_wrong(tmp_path: Path) -> None:
 
 
 def test_a_rule_for_a_template_that_is_not_there_says_so_on_its_task(chain: Chain) -> None:
-    missing = [{"name": "record", "deploy": {"template": "recordr", "parameters": {}}}]
+    missing = [{"name": "record", "deploy": {"templateName": "recordr", "parameters": {}}}]
     chain.apply(rule(), of_vans(missing), detector(chain.endpoint))
     running = chain.start(rules=2)
     with Vehicles(chain.endpoint) as vehicles, unharmed(chain, vehicles, running):

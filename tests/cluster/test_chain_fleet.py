@@ -59,7 +59,7 @@ def seen_at_a_site() -> Object:
         signals=[{"name": axis, "stream": "pose", "value": f"msg.{axis}"} for axis in ("x", "y")],
         when="size(members) > 0",
         until="size(members) == 0",
-        actions=[{"name": "fuse", "deploy": {"template": "fusion", "follow": True, "parameters": parameters}}],
+        actions=[{"name": "fuse", "deploy": {"templateName": "fusion", "follow": True, "parameters": parameters}}],
     )
 
 

@@ -326,7 +326,7 @@ TASK: Object = {
     "apiVersion": "wayside.dev/v1alpha1",
     "kind": "ApplicationTask",
     "metadata": {"name": "a"},
-    "spec": {"template": "a"},
+    "spec": {"templateName": "a"},
 }
 
 

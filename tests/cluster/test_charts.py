@@ -50,7 +50,7 @@ def template(name: str, helm: Mapping[str, Any]) -> Object:
 
 
 def demand(name: str, of: str, *sources: str) -> Object:
-    spec = {"template": of, "parameters": {"sources": [*sources]}}
+    spec = {"templateName": of, "parameters": {"sources": [*sources]}}
     return {**task(name, of=of), "spec": spec}
 
 

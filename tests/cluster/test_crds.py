@@ -126,23 +126,23 @@ class TestApplicationTask:
                 api.replace(changed(ended, {"spec.endTime": value}))
 
     def test_a_persons_task_needs_only_a_template(self, api: Api) -> None:
-        stored = api.create(changed(APPLICATION_TASK, {"spec": {"template": "scene-fusion"}}))
+        stored = api.create(changed(APPLICATION_TASK, {"spec": {"templateName": "scene-fusion"}}))
         assert stored["spec"]["priority"] == 0
 
     @pytest.mark.parametrize(
         ("selector", "found"),
         [
-            ("spec.template=scene-fusion", ["one", "two"]),
-            ("spec.template=other", ["three"]),
+            ("spec.templateName=scene-fusion", ["one", "two"]),
+            ("spec.templateName=other", ["three"]),
             ("spec.requester.detector=intersection-a", ["one"]),
             ("status.instance=scene-fusion-abcdefgh", ["two"]),
-            ("spec.template=scene-fusion,status.instance!=scene-fusion-abcdefgh", ["one"]),
+            ("spec.templateName=scene-fusion,status.instance!=scene-fusion-abcdefgh", ["one"]),
         ],
     )
     def test_its_selectable_fields_work_in_a_selector(self, selector: str, found: list[str], api: Api) -> None:
         api.create(changed(APPLICATION_TASK, {"metadata.name": "one"}))
         api.create(changed(APPLICATION_TASK, {"metadata.name": "two", "spec.requester.detector": "other"}))
-        api.create(changed(APPLICATION_TASK, {"metadata.name": "three", "spec": {"template": "other"}}))
+        api.create(changed(APPLICATION_TASK, {"metadata.name": "three", "spec": {"templateName": "other"}}))
         status = {"status": {"instance": "scene-fusion-abcdefgh"}}
         api.patch("ApplicationTask", "two", status, subresource="status")
         assert sorted(each["metadata"]["name"] for each in api.list("ApplicationTask", fields=selector)) == sorted(

@@ -157,7 +157,7 @@ def test_what_cannot_be_changed_is_made_anew_under_the_same_name(api: Api, names
     after = api.wait_for(
         "ApplicationTask",
         wanted.name,
-        lambda task: task["spec"]["template"] == "other-recorder",
+        lambda task: task["spec"]["templateName"] == "other-recorder",
         what="the task is for the new template",
     )
     assert after["metadata"]["uid"] != before["metadata"]["uid"]
@@ -265,7 +265,7 @@ def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: s
         "apiVersion": "wayside.dev/v1alpha1",
         "kind": "ApplicationTask",
         "metadata": {"name": "mine", "labels": {"wayside.dev/holder": HOLDER}},
-        "spec": {"template": "scene-recorder"},
+        "spec": {"templateName": "scene-recorder"},
     }
     before = [api.create(each) for each in (usurped, disguised, persons)]
     other = demand(namespace, "car3+car4")

@@ -114,7 +114,7 @@ def test_a_task_is_as_its_application_is_now(api: Api, wait_judged: Judge) -> No
     broken = wait_judged("ApplicationTask", "north", "InProgress")
     assert (condition(broken, "Applied")["status"], condition(broken, "Ready")["status"]) == ("True", "False")
     assert broken["status"]["readyTime"] == ready["status"]["readyTime"]
-    api.create({**task("refused"), "spec": {"template": "app", "parameters": {"region": 7}}})
+    api.create({**task("refused"), "spec": {"templateName": "app", "parameters": {"region": 7}}})
     refused = wait_judged("ApplicationTask", "refused", "Failed")
     assert condition(refused, "Ready")["reason"] == "InvalidParameters"
 

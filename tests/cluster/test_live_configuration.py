@@ -50,7 +50,7 @@ def template() -> Any:
 
 
 def vehicle(name: str) -> Object:
-    return {**task(name, of="fusion"), "spec": {"template": "fusion", "parameters": {"sources": [name]}}}
+    return {**task(name, of="fusion"), "spec": {"templateName": "fusion", "parameters": {"sources": [name]}}}
 
 
 def sources_in(content: str) -> list[str]:

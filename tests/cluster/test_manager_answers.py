@@ -123,7 +123,7 @@ def test_explain_knows_who_has_no_place_and_what_stands_in_for_whom(
 ) -> None:
     start_manager(processes, namespace, "--max-instances", "2")
     instead = instance_name("lite", "north")
-    in_time = {"linger": "1s", "readyTimeout": "1s", "fallback": {"template": "lite"}}
+    in_time = {"linger": "1s", "readyTimeout": "1s", "fallback": {"templateName": "lite"}}
     api.create(template("lite"))
     api.create(template(lifecycle=in_time))
     api.create(task("north"))

@@ -64,14 +64,14 @@ def changed(container: Object) -> Object:
 @pytest.mark.parametrize(
     ("spec", "reason", "parts"),
     [
-        ({"template": "nowhere"}, "TemplateNotFound", ["spec.template", "'nowhere'", "create it"]),
+        ({"templateName": "nowhere"}, "TemplateNotFound", ["spec.templateName", "'nowhere'", "create it"]),
         (
-            {"template": "good", "parameters": {"region": 7}},
+            {"templateName": "good", "parameters": {"region": 7}},
             "InvalidParameters",
             ["spec.parameters.region: 7", "not of type string", "give a value of type string"],
         ),
         (
-            {"template": "good", "parameters": {"region": "x" * 35_000, "more": "x" * 35_000}},
+            {"templateName": "good", "parameters": {"region": "x" * 35_000, "more": "x" * 35_000}},
             "InvalidParameters",
             ["spec.parameters: takes", "65536"],
         ),

@@ -46,7 +46,7 @@ def detector(**spec: Any) -> Object:
 
 
 def close_vehicles() -> Object:
-    deploy = {"template": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}}
+    deploy = {"templateName": "recorder", "parameters": {"vehicles": "${[a.client, b.client]}"}}
     return {
         "apiVersion": "wayside.dev/v1alpha1",
         "kind": "EventRule",

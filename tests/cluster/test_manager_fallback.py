@@ -69,7 +69,7 @@ def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
 ) -> None:
     manager = start_manager(processes, namespace)
     api.create(template("lite", lifecycle={"linger": "0s"}))
-    api.create(template(lifecycle={**IN_TIME, "fallback": {"template": "lite"}}))
+    api.create(template(lifecycle={**IN_TIME, "fallback": {"templateName": "lite"}}))
     api.create(task("north"))
     fallen = wait_accepted(api, "north", "FallenBack")
     assert fallen["status"]["instance"] == LITE
@@ -105,7 +105,7 @@ def test_a_fallback_that_cannot_serve_is_told_and_used_once_it_can(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     start_manager(processes, namespace)
-    api.create(template(lifecycle={**IN_TIME, "fallback": {"template": "lite"}}))
+    api.create(template(lifecycle={**IN_TIME, "fallback": {"templateName": "lite"}}))
     api.create(task("north"))
     failed = wait_accepted(api, "north", "FallbackFailed")
     assert "there is no ApplicationTemplate 'lite': create it" in failed["status"]["message"]

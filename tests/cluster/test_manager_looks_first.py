@@ -85,7 +85,7 @@ def lingering(api: Api) -> list[Object]:
             "apiVersion": API_VERSION,
             "kind": "ApplicationInstance",
             "metadata": {"name": NORTH, "labels": managed},
-            "spec": {"template": "app", "key": "north", "parameters": {"region": "north"}},
+            "spec": {"templateName": "app", "key": "north", "parameters": {"region": "north"}},
         }
     )
     return [made, api.patch("ApplicationInstance", NORTH, {"status": LINGERING}, subresource="status")]

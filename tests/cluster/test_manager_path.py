@@ -100,7 +100,7 @@ def test_the_last_value_can_go_while_a_demand_without_values_stays(api: Api, man
     given = {"sources": ["car1"]}
     api.create({**template(), "spec": {"manifests": [deployment()], **optional}})
     for task_name, parameters in (("with", given), ("without", {})):
-        spec = {"template": "app", "parameters": parameters}
+        spec = {"templateName": "app", "parameters": parameters}
         api.create({**task(task_name), "spec": spec})
     api.wait_for(
         "ApplicationInstance",
@@ -154,7 +154,7 @@ def test_a_persons_instance_is_made_but_never_released(api: Api, manager: Proces
             "apiVersion": "wayside.dev/v1alpha1",
             "kind": "ApplicationInstance",
             "metadata": {"name": "trial"},
-            "spec": {"template": "app", "key": "trial", "parameters": {"region": "trial"}},
+            "spec": {"templateName": "app", "key": "trial", "parameters": {"region": "trial"}},
         }
     )
     api.wait_for("Deployment", "trial", lambda _: True, what="the Deployment exists")
@@ -172,7 +172,7 @@ def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
     api.create(template())
     api.wait_for("ApplicationTemplate", "app", lambda raw: bool(condition(raw, "Accepted")), what="it is known")
     api.create(task("north"))
-    api.create({**task("wrong"), "spec": {"template": "nowhere"}})
+    api.create({**task("wrong"), "spec": {"templateName": "nowhere"}})
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
 
     def told() -> list[tuple[str, str, str]]:

@@ -119,7 +119,7 @@ def test_what_is_done_for_several_tasks_at_once_is_linked(chain: Chain, receiver
     deployment = shared["spec"]["manifests"][0]
     deployment["metadata"]["labels"] = labels
     deployment["spec"]["selector"]["matchLabels"] = deployment["spec"]["template"]["metadata"]["labels"] = labels
-    deploy = {"template": "fusion", "parameters": {"vehicles": "${[a.client, b.client]}"}}
+    deploy = {"templateName": "fusion", "parameters": {"vehicles": "${[a.client, b.client]}"}}
     chain.apply(shared, rule(actions=[{"name": "fuse", "deploy": deploy}]))
     chain.start()
     with Vehicles(chain.endpoint) as vehicles:
@@ -147,20 +147,20 @@ def test_a_refusal_and_what_never_became_ready_are_failures_of_their_traces(
     bears = {"wayside.dev/traceparent": f"00-{7:032x}-{7:016x}-01"}
     one = {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask"}
     waits = {**one, "metadata": {"name": "waits", "annotations": bears}}
-    api.create({**waits, "spec": {"template": "recorder", "parameters": {"vehicles": ["a", "b"]}}})
+    api.create({**waits, "spec": {"templateName": "recorder", "parameters": {"vehicles": ["a", "b"]}}})
     wait_spans(receiver, "apply")
     end(api, "waits")
     unready = wait_spans(receiver, "ready")["ready"]
     assert unready.error is not None
     assert unready.error.startswith("NotReady: ")
     wrong = {**one, "metadata": {"name": "wrong", "annotations": bears}}
-    api.create({**wrong, "spec": {"template": "recorder", "parameters": {"vehicles": "a"}}})
+    api.create({**wrong, "spec": {"templateName": "recorder", "parameters": {"vehicles": "a"}}})
     refused = wait_spans(receiver, "refused")["refused"]
     assert refused.error is not None
     assert refused.error.startswith("InvalidParameters: ")
     assert (unready.trace, refused.trace, refused.parent) == (f"{7:032x}", f"{7:032x}", f"{7:016x}")
     unread = {**one, "metadata": {"name": "unread", "annotations": {"wayside.dev/traceparent": "no trace"}}}
-    api.create({**unread, "spec": {"template": "recorder", "parameters": {"vehicles": ["c", "d"]}}})
+    api.create({**unread, "spec": {"templateName": "recorder", "parameters": {"vehicles": ["c", "d"]}}})
     api.wait_for("ApplicationTask", "unread", lambda raw: raw.get("status", {}).get("phase") == "Active", what="served")
     assert not [each for each in receiver.spans() if each.attributes.get("wayside.task") == "unread"]
 

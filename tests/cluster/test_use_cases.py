@@ -144,7 +144,7 @@ def running(api: Api) -> dict[str, Running]:
         there = [each for each in objects if each is not None]
         replicas = [each["spec"]["replicas"] for each in there if each["kind"] == "Deployment"]
         suspended = condition(instance, "Suspended").get("status") == "True" and not any(replicas)
-        found[f"{spec['template']}/{spec.get('key', '')}"] = consists_of(there, suspended=suspended)
+        found[f"{spec['templateName']}/{spec.get('key', '')}"] = consists_of(there, suspended=suspended)
     return found
 
 

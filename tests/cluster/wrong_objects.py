@@ -116,8 +116,8 @@ WRONG: list[tuple[str, str, Changes, str]] = [
     (
         "EventRule",
         "a template's name that is too long",
-        {"spec.actions.0.deploy.template": "x" * 41},
-        r"spec\.actions\[0\]\.deploy\.template: Too long: may not be (more|longer) than 40",
+        {"spec.actions.0.deploy.templateName": "x" * 41},
+        r"spec\.actions\[0\]\.deploy\.templateName: Too long: may not be (more|longer) than 40",
     ),
     (
         "EventRule",
@@ -310,12 +310,12 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         {"spec.lifecycle.linger": "30"},
         r"spec\.lifecycle\.linger: .*should match",
     ),
-    ("ApplicationTask", "no template", {"spec.template": ABSENT}, r"spec\.template: Required value"),
+    ("ApplicationTask", "no template", {"spec.templateName": ABSENT}, r"spec\.templateName: Required value"),
     (
         "ApplicationTask",
         "a template's name that is none",
-        {"spec.template": "Scene Fusion"},
-        r"spec\.template: .*should match",
+        {"spec.templateName": "Scene Fusion"},
+        r"spec\.templateName: .*should match",
     ),
     (
         "ApplicationTask",
@@ -350,7 +350,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
     ),
     ("ApplicationTask", "parameters as a list", {"spec.parameters": []}, r"spec\.parameters: .*must be of type object"),
     ("ApplicationTask", "an unknown field", {"spec.templat": "x"}, r'unknown field "spec\.templat"'),
-    ("ApplicationInstance", "no template", {"spec.template": ABSENT}, r"spec\.template: Required value"),
+    ("ApplicationInstance", "no template", {"spec.templateName": ABSENT}, r"spec\.templateName: Required value"),
     ("ApplicationInstance", "a key as number", {"spec.key": 3}, r"spec\.key: .*must be of type string"),
     ("ApplicationInstance", "a name that is too long", {"metadata.name": "x" * 64}, r"metadata\.name: .*63"),
 ]
@@ -370,8 +370,8 @@ UPDATES: list[tuple[str, Changes, str]] = [
     ),
     (
         "ApplicationTask",
-        {"spec.template": "other"},
-        r"spec\.template: Forbidden: is immutable; only parameters and endTime can change",
+        {"spec.templateName": "other"},
+        r"spec\.templateName: Forbidden: is immutable; only parameters and endTime can change",
     ),
     (
         "ApplicationTask",
@@ -420,8 +420,8 @@ UPDATES: list[tuple[str, Changes, str]] = [
     ),
     (
         "ApplicationInstance",
-        {"spec.template": "other"},
-        r"spec\.template: Forbidden: is immutable: delete this instance",
+        {"spec.templateName": "other"},
+        r"spec\.templateName: Forbidden: is immutable: delete this instance",
     ),
     ("ApplicationInstance", {"spec.key": "south"}, r"spec\.key: Forbidden: is immutable: delete this instance"),
     ("ApplicationInstance", {"spec.key": ABSENT}, r"spec\.key: Forbidden: is immutable: delete this instance"),

@@ -19,7 +19,7 @@ from tests.helm.wayside_chart import CHART, Helm
 RULE = {
     "signals": [{"name": "speed", "stream": "speed", "value": "msg.value"}],
     "when": "speed > 30",
-    "actions": [{"name": "watch", "deploy": {"template": "watch"}}],
+    "actions": [{"name": "watch", "deploy": {"templateName": "watch"}}],
 }
 
 

@@ -53,7 +53,7 @@ def resources(image: str) -> list[Object]:
             signals=[{"name": "speed", "stream": "speed", "value": "msg.value"}],
             evaluation={"every": "100ms"},
             when="speed > 30",
-            actions=[{"name": "deploy", "deploy": {"template": "app"}}],
+            actions=[{"name": "deploy", "deploy": {"templateName": "app"}}],
         ),
         ours(
             "ApplicationTemplate",

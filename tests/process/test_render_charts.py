@@ -36,7 +36,7 @@ def task(source: str) -> dict[str, Any]:
         "apiVersion": "wayside.dev/v1alpha1",
         "kind": "ApplicationTask",
         "metadata": {"name": source},
-        "spec": {"template": "app", "parameters": {"sources": [source]}},
+        "spec": {"templateName": "app", "parameters": {"sources": [source]}},
     }
 
 

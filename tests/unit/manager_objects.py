@@ -48,7 +48,7 @@ def task(
 ) -> ApplicationTask:
     """`accepted_condition`: status, reason and transition time of the condition Accepted."""
     spec: dict[str, Any] = {
-        "template": of, "operation": operation, "priority": priority, "parameters": parameters or {},
+        "templateName": of, "operation": operation, "priority": priority, "parameters": parameters or {},
     }  # fmt: skip
     if holder:
         spec["requester"] = {"holder": holder}
@@ -91,7 +91,7 @@ def instance(
             "labels": {} if by_person else {"app.kubernetes.io/managed-by": "wayside"},
             "annotations": annotations or {},
         },
-        "spec": {"template": of, "key": key, "parameters": parameters or {}, "suspended": suspended},
+        "spec": {"templateName": of, "key": key, "parameters": parameters or {}, "suspended": suspended},
     }
     if release_at is not None:
         raw["status"] = {"releaseTime": format_seconds(release_at)}

@@ -27,7 +27,7 @@ _IMMUTABLE = "is immutable: delete this instance and create another"
 class ApplicationInstanceSpec(Model):
     """The template, and the values that result from merging the demands."""
 
-    template: TemplateName = Field(
+    template_name: TemplateName = Field(
         description="The name of the ApplicationTemplate, in the same namespace. Immutable.",
         json_schema_extra=immutable(_IMMUTABLE),
     )
@@ -151,7 +151,7 @@ class ApplicationInstance(Kind):
     plural: ClassVar[str] = "applicationinstances"
     short_name: ClassVar[str] = "appinst"
     printer_columns: ClassVar[list[dict[str, str]]] = [
-        {"name": "Template", "type": "string", "jsonPath": ".spec.template"},
+        {"name": "Template", "type": "string", "jsonPath": ".spec.templateName"},
         {"name": "Key", "type": "string", "jsonPath": ".spec.key"},
         {"name": "Demands", "type": "integer", "jsonPath": ".status.demands.count"},
         {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},

@@ -77,7 +77,7 @@ class TaskEvent(Model):
 class ApplicationTaskSpec(Model):
     """One demand on an application, and its cause."""
 
-    template: TemplateName = Field(
+    template_name: TemplateName = Field(
         description="The name of the ApplicationTemplate, in the same namespace. Immutable.",
         json_schema_extra=immutable(_IMMUTABLE),
     )
@@ -153,7 +153,7 @@ class ApplicationTask(Kind):
     plural: ClassVar[str] = "applicationtasks"
     short_name: ClassVar[str] = "apptask"
     printer_columns: ClassVar[list[dict[str, str]]] = [
-        {"name": "Template", "type": "string", "jsonPath": ".spec.template"},
+        {"name": "Template", "type": "string", "jsonPath": ".spec.templateName"},
         {"name": "Operation", "type": "string", "jsonPath": ".spec.operation"},
         {"name": "Rule", "type": "string", "jsonPath": ".spec.event.rule"},
         {"name": "Subject", "type": "string", "jsonPath": ".spec.event.subject"},
@@ -164,7 +164,7 @@ class ApplicationTask(Kind):
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": ".status.message"},
     ]
-    selectable_fields: ClassVar[list[str]] = [".spec.template", ".spec.requester.detector", ".status.instance"]
+    selectable_fields: ClassVar[list[str]] = [".spec.templateName", ".spec.requester.detector", ".status.instance"]
     # CEL does not see event.values, whose items may be of any type.
     object_validations: ClassVar[list[JsonDict]] = [
         validation(

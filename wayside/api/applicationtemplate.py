@@ -50,7 +50,7 @@ class OnDetectorLoss(Model):
 class FallbackTemplate(Model):
     """The template that replaces an application which does not become ready."""
 
-    template: TemplateName = Field(description="The name of another ApplicationTemplate, in the same namespace.")
+    template_name: TemplateName = Field(description="The name of another ApplicationTemplate, in the same namespace.")
 
 
 FALLBACK_WITHOUT_TIMEOUT = (
@@ -245,9 +245,9 @@ class ApplicationTemplate(Kind):
         ),
         validation(
             "!has(self.spec.lifecycle) || !has(self.spec.lifecycle.fallback)"
-            " || self.spec.lifecycle.fallback.template != self.metadata.name",
+            " || self.spec.lifecycle.fallback.templateName != self.metadata.name",
             "is this template itself: name another",
-            ".spec.lifecycle.fallback.template",
+            ".spec.lifecycle.fallback.templateName",
         ),
     ]
 

@@ -234,7 +234,14 @@ class _RuleCompiler:
         }
         source = canonical(deploy.parameters)
         return CompiledDeploy(
-            action, deploy.template, deploy.priority, source, parameters, deploy.follow, one_by_one, deploy.operation
+            action,
+            deploy.template_name,
+            deploy.priority,
+            source,
+            parameters,
+            deploy.follow,
+            one_by_one,
+            deploy.operation,
         )
 
     def template(

@@ -73,7 +73,7 @@ class Claim:
     @property
     def template(self) -> str:
         """The instance's template."""
-        return self.fallback or self.task.spec.template
+        return self.fallback or self.task.spec.template_name
 
     @property
     def operation(self) -> Operation:
@@ -92,13 +92,13 @@ class InvalidTemplate:
 def claim(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Refusal:
     """What the task requests of its template, None where there is no such template."""
     if isinstance(template, InvalidTemplate):
-        message = f"spec.template: ApplicationTemplate {template.name} is not valid: {template.problem}"
+        message = f"spec.templateName: ApplicationTemplate {template.name} is not valid: {template.problem}"
         return Refusal(Refused.TEMPLATE_INVALID, f"{message}; correct the template")
     if template is None:
         return Refusal(
             Refused.TEMPLATE_NOT_FOUND,
-            f"spec.template: there is no ApplicationTemplate {task.spec.template!r} in namespace {task.namespace}: "
-            "create it, or correct the rule that emitted this task",
+            f"spec.templateName: there is no ApplicationTemplate {task.spec.template_name!r} in namespace "
+            f"{task.namespace}: create it, or correct the rule that emitted this task",
         )
     declared = template.spec.parameters
     deploys = task.spec.operation is Operation.DEPLOY

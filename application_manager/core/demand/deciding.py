@@ -112,7 +112,7 @@ def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_ma
 
 def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float) -> Fallback | None:
     """What the tasks of an instance turn to while it is not ready in time; None where they do not."""
-    of = instance.spec.template
+    of = instance.spec.template_name
     if not overdue(instance, indexes.template(of), now)[0]:
         return None
     return _decide_one(instance.name, of, indexes.claims(instance.name, of), indexes, now).fallback
@@ -127,7 +127,7 @@ def _template_of(
     name: str, instance: ApplicationInstance | None, claims: list[Claim], indexes: Indexes, now: float
 ) -> str:
     if instance is not None:
-        return instance.spec.template
+        return instance.spec.template_name
     if claims:
         return claims[0].template
     named = (each for each in indexes.fallback_templates() if name == each or name.startswith(f"{each}-"))
@@ -246,4 +246,4 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     verdicts = {each.task.name: refused for each in claims}
     spec = instance.spec
     paused = byhand.is_paused(instance)
-    return Decision(instance.name, spec.template, spec.key, None, (), verdicts, None, None, paused)
+    return Decision(instance.name, spec.template_name, spec.key, None, (), verdicts, None, None, paused)

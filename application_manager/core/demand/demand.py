@@ -73,7 +73,7 @@ def demand(
     claims: list[Claim] = []
     by_name = {each.name: each for each in templates}
     for task in {each.name: each for each in tasks}.values():
-        claimed = claim_or_verdict(by_name.get(task.spec.template), task)
+        claimed = claim_or_verdict(by_name.get(task.spec.template_name), task)
         if isinstance(claimed, Claim):
             claims.append(claimed)
         else:
@@ -155,7 +155,7 @@ class _Snapshot:
 
     def fallbacks(self, template: str, now: float) -> list[Fallback]:
         if template not in self._fallbacks:
-            of = [each for each in self._instances.values() if self._falls_to(each.spec.template) == template]
+            of = [each for each in self._instances.values() if self._falls_to(each.spec.template_name) == template]
             turned = (fallback_claims(each, self, now) for each in of)
             self._fallbacks[template] = [each for each in turned if each is not None]
         return self._fallbacks[template]

@@ -25,7 +25,7 @@ def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) 
             return existing
         return existing.model_copy(update={"spec": existing.spec.model_copy(update={"suspended": suspended})})
     spec = ApplicationInstanceSpec(
-        template=decision.template,
+        template_name=decision.template,
         key=decision.key,
         parameters=dict(decision.parameters or {}),
         suspended=suspended,
@@ -76,10 +76,10 @@ EXPRESSION_LIMIT = "ExpressionLimit"
 
 def without_template(wanted: ApplicationInstance, template: TemplateState) -> Aspect | None:
     """Why the instance has no objects, where that is for want of a template, as the condition Applied has it."""
-    of = wanted.spec.template
+    of = wanted.spec.template_name
     if template is None:
         message = (
-            f"spec.template: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create it; "
+            f"spec.templateName: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create it; "
             "until then what runs stays as it is"
         )
         return Aspect("Applied", False, "TemplateNotFound", message)

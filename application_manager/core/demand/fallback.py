@@ -61,7 +61,7 @@ def fallback_of(template: ApplicationTemplate | InvalidTemplate | None) -> str |
     """The template that this one falls back to, if it does."""
     if not isinstance(template, ApplicationTemplate) or template.spec.lifecycle.fallback is None:
         return None
-    return template.spec.lifecycle.fallback.template
+    return template.spec.lifecycle.fallback.template_name
 
 
 def overdue(

@@ -31,17 +31,17 @@ def deploy_remarks(
     known, others = {each.name: each for each in templates}, set(invalid)
     found: list[Finding] = []
     for index, action in enumerate(rule.spec.actions):
-        if action.deploy is None or action.deploy.template in others:
+        if action.deploy is None or action.deploy.template_name in others:
             continue
         where = f"spec.actions[{index}].deploy"
-        template = known.get(action.deploy.template)
+        template = known.get(action.deploy.template_name)
         if template is None:
-            close = difflib.get_close_matches(action.deploy.template, [*known, *others], n=1)
+            close = difflib.get_close_matches(action.deploy.template_name, [*known, *others], n=1)
             remedy = f"did you mean {close[0]}?" if close else "create it, or tasks of this rule are refused"
             missing = (
-                f"there is no ApplicationTemplate {action.deploy.template} in namespace {rule.namespace}: {remedy}"
+                f"there is no ApplicationTemplate {action.deploy.template_name} in namespace {rule.namespace}: {remedy}"
             )
-            found.append(Finding(UNKNOWN_TEMPLATE.name, f"{where}.template: {missing}", rule.name))
+            found.append(Finding(UNKNOWN_TEMPLATE.name, f"{where}.templateName: {missing}", rule.name))
         else:
             for each in _of_parameters(action.deploy, template, f"{where}.parameters"):
                 found.append(Finding(DEPLOY_PARAMETERS.name, each, rule.name))

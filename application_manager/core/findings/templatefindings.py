@@ -128,7 +128,7 @@ def _rendered(template: ApplicationTemplate, renderer: Renderer, example: Exampl
         {
             "kind": "ApplicationInstance",
             "metadata": Metadata(name=claims.instance_name(template.name, key), namespace=template.namespace),
-            "spec": {"template": template.name, "key": key, "parameters": dict(example.given)},
+            "spec": {"templateName": template.name, "key": key, "parameters": dict(example.given)},
         }
     )
     try:

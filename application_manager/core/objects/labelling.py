@@ -30,7 +30,7 @@ def labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
     own = {
         MANAGED_BY_LABEL: MANAGED_BY,
         INSTANCE_LABEL: instance.name,
-        TEMPLATE_LABEL: instance.spec.template,
+        TEMPLATE_LABEL: instance.spec.template_name,
     }
     _label_pods(manifest, instance)
     return {

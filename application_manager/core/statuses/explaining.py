@@ -74,7 +74,7 @@ def serving(found: Found, task: ApplicationTask, now: float) -> str | None:
 
     `now` is in seconds since 1970.
     """
-    template = next((each for each in found.templates if each.name == task.spec.template), None)
+    template = next((each for each in found.templates if each.name == task.spec.template_name), None)
     claimed: str | None = getattr(claim(template, task), "instance", None)
     if claimed is not None and template_of_all(claimed) is not None:
         return None
@@ -119,11 +119,11 @@ def explain(found: Found, *, task: str | None, instance: str | None, now: float)
     subject = next((each for each in found.tasks if each.name == task), None)
     existing = next((each for each in found.instances if each.name == instance), None)
     of = (
-        subject.spec.template
+        subject.spec.template_name
         if subject
         else decision.template
         if decision
-        else existing.spec.template
+        else existing.spec.template_name
         if existing
         else ""
     )
@@ -210,7 +210,7 @@ def _instance(
     status = existing.status if existing else None
     return ExplainedInstance(
         name=name,
-        template=decision.template if decision else existing.spec.template if existing else None,
+        template=decision.template if decision else existing.spec.template_name if existing else None,
         exists=existing is not None,
         managed=existing is None or is_managed(existing),
         key=decision.key if decision else existing.spec.key if existing else None,

@@ -54,7 +54,7 @@ def differences(demand: Demand, stored: StoredTask) -> list[str]:
     spec = stored.task.spec
     event = spec.event
     pairs: dict[str, tuple[Any, Any]] = {
-        "template": (demand.template, spec.template),
+        "templateName": (demand.template, spec.template_name),
         "operation": (demand.operation, spec.operation),
         "priority": (demand.priority, spec.priority),
         "requester.detector": (demand.detector, spec.requester.detector),

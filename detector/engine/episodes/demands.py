@@ -108,7 +108,7 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
             annotations={RULE_DIGEST_ANNOTATION: demand.rule_digest} if demand.rule_digest else {},
         ),
         spec=ApplicationTaskSpec(
-            template=demand.template,
+            template_name=demand.template,
             operation=demand.operation,
             priority=demand.priority,
             parameters=plain(demand.parameters),
@@ -139,7 +139,7 @@ def from_task(task: ApplicationTask) -> Demand | None:
     return Demand(
         rule=event.rule,
         action=event.action,
-        template=spec.template,
+        template=spec.template_name,
         priority=spec.priority,
         parameters=spec.parameters,
         detector=spec.requester.detector,

@@ -92,7 +92,7 @@ def test_an_ended_demand_says_when() -> None:
 
 
 def test_a_persons_task_is_no_demand() -> None:
-    task = {"metadata": {"name": "mine"}, "spec": {"template": "scene-recorder"}}
+    task = {"metadata": {"name": "mine"}, "spec": {"templateName": "scene-recorder"}}
     assert from_task(ApplicationTask.model_validate(task | {"kind": "ApplicationTask"})) is None
 
 

@@ -65,8 +65,8 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         ("  when: a\n  whem: b", "f.yaml:6:9: spec.whem: unknown field", ["did you mean when?"]),
         ("  when: a\n  colour: b", "f.yaml:6:11: spec.colour: unknown field", ["check its spelling"]),
         (
-            "  when: a\n  actions:\n  - {name: x, deploy: {template: t, operations: Suspend}}",
-            "f.yaml:7:49: spec.actions[0].deploy.operations: unknown field",
+            "  when: a\n  actions:\n  - {name: x, deploy: {templateName: t, operations: Suspend}}",
+            "f.yaml:7:53: spec.actions[0].deploy.operations: unknown field",
             ["did you mean operation?"],
         ),
         ("  when: a\n  for: 2", "f.yaml:6:8: spec.for: must be a string, but is 2", []),

@@ -145,7 +145,7 @@ def test_kinds_have_their_short_names_status_and_selectable_fields() -> None:
         assert spec_of(kind)["scope"] == "Namespaced"
     (task,) = spec_of("applicationtasks")["versions"]
     assert {field["jsonPath"] for field in task["selectableFields"]} == {
-        ".spec.template",
+        ".spec.templateName",
         ".spec.requester.detector",
         ".status.instance",
     }

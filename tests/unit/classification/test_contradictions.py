@@ -50,9 +50,9 @@ def act(*actions: dict[str, Any]) -> list[dict[str, Any]]:
     return [{"name": f"a{index}", **action} for index, action in enumerate(actions)]
 
 
-DEPLOY = {"deploy": {"template": "app"}}
-RECONFIGURE = {"deploy": {"template": "app", "operation": "Reconfigure"}}
-SUSPEND = {"deploy": {"template": "app", "operation": "Suspend"}}
+DEPLOY = {"deploy": {"templateName": "app"}}
+RECONFIGURE = {"deploy": {"templateName": "app", "operation": "Reconfigure"}}
+SUSPEND = {"deploy": {"templateName": "app", "operation": "Suspend"}}
 RECORD = {"record": {"streams": ["speed"]}}
 DATABASE = {"database": {"streams": ["speed"]}}
 DRY = {"database": {"streams": ["speed"], "dryRun": True}}
@@ -287,7 +287,7 @@ spec:
       - Notification
   signals: [{name: v, stream: speed, value: msg.v}]
   when: v > 20
-  actions: [{name: start, deploy: {template: app}}]
+  actions: [{name: start, deploy: {templateName: app}}]
 """
 
 

@@ -27,7 +27,7 @@ TEMPLATE: dict[str, Any] = {
 
 
 def task(name: str, **spec: Any) -> dict[str, Any]:
-    spec = {"template": "fusion", **spec}
+    spec = {"templateName": "fusion", **spec}
     return {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask", "metadata": {"name": name}, "spec": spec}
 
 
@@ -67,7 +67,7 @@ def test_merged_instances_and_their_manifests_are_printed(render: Any) -> None:
     instance, deployment = yaml.safe_load_all(result.stdout)
     assert instance["kind"] == "ApplicationInstance"
     merged = {"region": "n", "sources": ["x", "y"]}
-    assert instance["spec"] == {"template": "fusion", "key": "n", "parameters": merged, "suspended": False}
+    assert instance["spec"] == {"templateName": "fusion", "key": "n", "parameters": merged, "suspended": False}
     assert deployment["kind"] == "Deployment"
     assert deployment["metadata"]["name"] == instance["metadata"]["name"]
 
@@ -77,7 +77,7 @@ def test_refusals_go_to_stderr_and_the_rest_is_printed(render: Any) -> None:
         TEMPLATE,
         task("good", parameters={"region": "n"}),
         task("bad", parameters={"region": 1}),
-        task("x", template="y"),
+        task("x", templateName="y"),
     )
     assert result.exit_code == 1
     assert len(list(yaml.safe_load_all(result.stdout))) == 2

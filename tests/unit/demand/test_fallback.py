@@ -30,7 +30,7 @@ FULL: dict[str, Any] = {
         "sources": {"type": "array", "items": "string", "merge": "Union"},
     },
     "key": "${parameters.region}",
-    "lifecycle": {"readyTimeout": "60s", "fallback": {"template": "lite"}},
+    "lifecycle": {"readyTimeout": "60s", "fallback": {"templateName": "lite"}},
 }
 LITE: dict[str, Any] = {"parameters": {"region": {"type": "string", "required": True}}, "key": "${parameters.region}"}
 NORTH, LITE_NORTH = instance_name("app", "north"), instance_name("lite", "north")
@@ -205,7 +205,7 @@ def test_a_fallback_waits_for_a_place_like_all_others() -> None:
 
 
 def test_two_that_fall_back_to_each_other_hand_nothing_on() -> None:
-    lite = {**LITE, "lifecycle": {"readyTimeout": "60s", "fallback": {"template": "app"}}}
+    lite = {**LITE, "lifecycle": {"readyTimeout": "60s", "fallback": {"templateName": "app"}}}
     templates = [template(**FULL), template("lite", **lite)]
     other = runs("lite", Ready=("False", 100), TimedOut=("True", 40))
     outcome = of(wants(), task("b", {"region": "north"}, of="lite"), templates=templates, instances=[late(), other])
@@ -217,7 +217,7 @@ def test_two_that_fall_back_to_each_other_hand_nothing_on() -> None:
 
 def test_a_fallback_without_a_timeout_is_refused() -> None:
     with pytest.raises(ValidationError, match="fallback needs readyTimeout"):
-        template(**{**FULL, "lifecycle": {"fallback": {"template": "lite"}}})
+        template(**{**FULL, "lifecycle": {"fallback": {"templateName": "lite"}}})
 
 
 # --- Laws

@@ -262,7 +262,7 @@ class Site:
         raise AssertionError("it never comes to rest")
 
     def check_limits(self) -> None:
-        counts = Counter(each.spec.template for each in self.instances.values())
+        counts = Counter(each.spec.template_name for each in self.instances.values())
         for name, count in self.own.items():
             assert count is None or counts[name] <= count
         assert self.total is None or counts.total() <= self.total
@@ -304,9 +304,9 @@ def test_a_higher_priority_never_waits_while_a_lower_one_runs(before: Any, drawn
     site.check_limits()
     highest: dict[tuple[str, str], int] = {}
     for each in live:
-        name = (each.spec.template, instance_name(each.spec.template, str(each.spec.parameters["region"])))
+        name = (each.spec.template_name, instance_name(each.spec.template_name, str(each.spec.parameters["region"])))
         highest[name] = max(each.spec.priority, highest.get(name, each.spec.priority))
-    counts = Counter(each.spec.template for each in site.instances.values())
+    counts = Counter(each.spec.template_name for each in site.instances.values())
     for (own, name), priority in highest.items():
         if name in site.instances:
             continue
@@ -324,7 +324,7 @@ def test_it_comes_to_rest_and_a_demand_that_goes_restores_what_was(drawn: Any, m
     site, live = Site(bounds), tasks_of(drawn)
     site.settle(live)
     before = set(site.instances)
-    known = {(each.spec.template, each.spec.parameters["region"]) for each in live}
+    known = {(each.spec.template_name, each.spec.parameters["region"]) for each in live}
     later = [(own, region, priority, 3600) for own, region, priority, _ in more if (own, region) not in known]
     extra = tasks_of(later, "x")  # they want applications of their own
     site.settle([*live, *extra])
@@ -341,7 +341,7 @@ def test_from_nothing_the_first_in_order_run(drawn: Any, bounds: Any, seconds: i
     expected: dict[str, str] = {}
     ordered = sorted(live, key=lambda each: (-each.spec.priority, each.metadata.creation_timestamp, each.name))
     for each in ordered:
-        own = each.spec.template
+        own = each.spec.template_name
         name = instance_name(own, str(each.spec.parameters["region"]))
         counts = Counter(expected.values())
         full = counts[own] >= (site.own[own] or 99) or counts.total() >= (site.total or 99)

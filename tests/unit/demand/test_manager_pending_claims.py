@@ -26,7 +26,7 @@ def template(key: str = "${parameters.region}", **parameter: Any) -> Application
 
 
 def task(region: str = "north", *, ended: bool = False) -> ApplicationTask:
-    spec: dict[str, Any] = {"template": "app", "parameters": {"region": region}}
+    spec: dict[str, Any] = {"templateName": "app", "parameters": {"region": region}}
     if ended:
         spec["endTime"] = "2026-01-01T00:00:00Z"
     return ApplicationTask.model_validate(

@@ -32,7 +32,7 @@ LATE = {"type": "Ready", "status": "False", "reason": "NotReady", "lastTransitio
 
 def of(name: str, limit: int | None = None, *, falls_back: bool = False) -> ApplicationTemplate:
     """A template; the first may fall back to the second."""
-    other = {"readyTimeout": "60s", "fallback": {"template": TEMPLATES[1]}} if falls_back else {}
+    other = {"readyTimeout": "60s", "fallback": {"templateName": TEMPLATES[1]}} if falls_back else {}
     return template(name, **SPEC, lifecycle={"linger": "30s", **other}, **({"maxInstances": limit} if limit else {}))
 
 

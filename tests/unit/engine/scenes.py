@@ -234,7 +234,7 @@ def _a_random_spec(random: Random, number: int, kind: str) -> dict[str, Any]:
             spec["until"] = _fleet_condition(random, names, each)
         if random.random() < 0.3:
             sources = {"sources": "${members.map(m, m.client)}"}
-            spec["actions"] = [{"name": "d", "deploy": {"template": "t", "parameters": sources, "follow": True}}]
+            spec["actions"] = [{"name": "d", "deploy": {"templateName": "t", "parameters": sources, "follow": True}}]
         for field, values in (("for", ("200ms", "1s")), ("cooldown", ("500ms",)), ("unknownTimeout", ("300ms", "1s"))):
             if random.random() < 0.3:
                 spec[field] = random.choice(values)
@@ -258,7 +258,7 @@ def _a_random_spec(random: Random, number: int, kind: str) -> dict[str, Any]:
         spec["scope"] = {"client": {"where": random.choice(where)}}
     if random.random() < 0.4:
         parameters = {"x": "${g0}", "c": "${client}"}
-        deploy = {"template": "t", "parameters": parameters, **random.choice([{}, {"follow": True}])}
+        deploy = {"templateName": "t", "parameters": parameters, **random.choice([{}, {"follow": True}])}
         spec["actions"] = [{"name": "d", "deploy": deploy}]
     return spec
 

@@ -158,7 +158,7 @@ def tasks_of(rule: Any, arrivals: list[Any], cut: int) -> dict[str, Any]:
 
 
 def test_a_replay_writes_tasks_that_begin_and_end_within_one_call() -> None:
-    follow = {"name": "f", "deploy": {"template": "app", "follow": True, "parameters": {"v": "${speed}"}}}
+    follow = {"name": "f", "deploy": {"templateName": "app", "follow": True, "parameters": {"v": "${speed}"}}}
     rule = speeding(actions=[a_deploy("a"), follow], evaluation=OFTEN)
     arrivals = [
         speed(second + part / 10 + late, value, client)

@@ -203,7 +203,7 @@ def test_the_task_of_an_episode_within_the_last_lateness_is_there(tmp_path: Path
         signals=[V],
         when="v > 10",
         evaluation={"every": "100ms"},
-        actions=[{"name": "start", "deploy": {"template": "app"}}],
+        actions=[{"name": "start", "deploy": {"templateName": "app"}}],
     )
     recorded = [line(step, "car", "speed", v=value) for step, value in SENT]
     (task,) = replayed(tmp_path, detector_of(LATE), [rule], recorded).tasks.values()

@@ -60,8 +60,8 @@ def test_a_list_shows_what_is_gone_but_nothing_that_is_newer_than_itself() -> No
 def test_an_object_that_is_no_model_is_kept_with_the_reason() -> None:
     kind = ("wayside.dev/v1alpha1", "ApplicationTask")
     store = Store([kind])
-    task = {**raw(1), "apiVersion": kind[0], "kind": kind[1], "spec": {"template": 7}}
+    task = {**raw(1), "apiVersion": kind[0], "kind": kind[1], "spec": {"templateName": 7}}
     entry = store.put(task)
     assert entry is not None
     assert entry.model is None
-    assert "spec.template" in entry.problem
+    assert "spec.templateName" in entry.problem

@@ -64,7 +64,7 @@ def test_a_stamp_that_reads_a_member_of_a_number_is_explained(desk: Desk) -> Non
 
 
 def test_an_error_of_a_parameter_names_the_client(desk: Desk) -> None:
-    deploy = {"name": "go", "deploy": {"template": "app", "parameters": {"vehicle": "${v.q}"}}}
+    deploy = {"name": "go", "deploy": {"templateName": "app", "parameters": {"vehicle": "${v.q}"}}}
     desk.write(a_detector(a_stream("speed")), a_rule("r", **FAST, actions=[deploy]))
     ran = desk.replay(desk.drive("drive.jsonl", (0.5, {"v": 30}), (2.0, {"v": 30})))
     assert "action go of car: vehicle, line 1, column 3: `v.q`: `v` is 30.0, which has no field `q`" in ran.said

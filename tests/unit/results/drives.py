@@ -48,7 +48,7 @@ spec:
   until: speed < 18
   actions:
     - name: watch
-      deploy: {template: speed-watch, parameters: {vehicle: '${client}'}}
+      deploy: {templateName: speed-watch, parameters: {vehicle: '${client}'}}
 ---
 apiVersion: wayside.dev/v1alpha1
 kind: EventRule

@@ -143,7 +143,7 @@ def test_starts_keep_nobody_alive_and_are_forgotten_with_the_client() -> None:
 
 def test_a_restored_episode_is_active_and_a_past_start() -> None:
     detector = a_detector()
-    rule = braking(actions=[{"name": "go", "deploy": {"template": "app"}}])
+    rule = braking(actions=[{"name": "go", "deploy": {"templateName": "app"}}])
     first = Drive(detector, rule)
     first.take(*speeds("0"), until=1)
     top = a_rule("top", signals=[over("braking", "since", aggregate="Age")], when="since == 9.0", until="false")

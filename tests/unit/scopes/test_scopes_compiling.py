@@ -94,7 +94,7 @@ def test_what_the_schema_forbids_is_refused(spec: dict[str, Any], part: str) -> 
 
 def test_the_closing_speed_needs_more_than_a_second_of_positions() -> None:
     detector = a_detector(a_stream("pose", buffer={"duration": "1s"}))
-    asking = {"name": "x", "deploy": {"template": "t", "parameters": {"v": "${closingSpeed}"}}}
+    asking = {"name": "x", "deploy": {"templateName": "t", "parameters": {"v": "${closingSpeed}"}}}
     for spec in (
         {**in_pairs(), "when": "closingSpeed > 1"},
         in_pairs(where="closingSpeed > 1"),

@@ -192,14 +192,14 @@ def test_what_fails_for_the_baseline_is_a_problem() -> None:
 
 
 def deploying(of: str = "app", operation: str = "Deploy", **parameters: Any) -> EventRule:
-    deploy = {"template": of, "operation": operation, "parameters": parameters}
+    deploy = {"templateName": of, "operation": operation, "parameters": parameters}
     return rule(actions=[{"name": "run", "deploy": deploy}])
 
 
 @pytest.mark.parametrize(
     ("asked", "parts"),
     [
-        (deploying("ap", region="x"), ["spec.actions[0].deploy.template: there is no", "mean app?"]),
+        (deploying("ap", region="x"), ["spec.actions[0].deploy.templateName: there is no", "mean app?"]),
         (deploying("other", region="x"), ["create it, or tasks of this rule are refused"]),
         (deploying(regoin="x", region="${client}"), ["deploy.parameters.regoin", "did you mean region?"]),
         (deploying(regoin="${client}", region="x"), ["deploy.parameters.regoin", "did you mean region?"]),

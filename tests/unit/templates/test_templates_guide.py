@@ -47,11 +47,11 @@ def test_the_rule_reconfigures_and_suspends() -> None:
     drive = Drive(DETECTOR, RULE)
     drive.take(arrival(0.5, "car1", {"mbit": 3}, "uplink"), until=1)
     emitted = [to_task(each) for each in drive.engine.demands().values()]
-    assert {each.spec.template: each.spec.operation for each in emitted} == {
+    assert {each.spec.template_name: each.spec.operation for each in emitted} == {
         "scene-fusion": "Reconfigure",
         "map-builder": "Suspend",
     }
-    fusion = [each for each in emitted if each.spec.template == "scene-fusion"]
+    fusion = [each for each in emitted if each.spec.template_name == "scene-fusion"]
     assert instance("thin-network")["rateHz"] == 20
     assert instance("thin-network", and_tasks=fusion)["rateHz"] == 2
     drive.take(arrival(11.5, "car1", {"mbit": 30}, "uplink"), until=12)

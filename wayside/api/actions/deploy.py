@@ -12,7 +12,9 @@ from wayside.api.operation import MEANING, Operation
 class Deploy(Model):
     """Deploys, reconfigures or suspends an application while the episode lasts."""
 
-    template: TemplateName = Field(description="The name of the ApplicationTemplate, in the namespace of the rule.")
+    template_name: TemplateName = Field(
+        description="The name of the ApplicationTemplate, in the namespace of the rule."
+    )
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
     priority: int = Field(
         default=0,
