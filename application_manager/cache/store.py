@@ -130,7 +130,7 @@ class Store:
 
 def _was_served(raw: Object) -> bool:
     """Whether the task has, or had, an instance: without the task, that would be released."""
-    return bool((raw.get("status") or {}).get("instance"))
+    return bool((raw.get("status") or {}).get("instanceName"))
 
 
 def kind_of(raw: Object) -> KindKey:

@@ -68,7 +68,7 @@ class TaskTraces:
         context = _context(task)
         if context is None:
             return
-        about = {**_about(task), "wayside.instance": new.instance or ""}
+        about = {**_about(task), "wayside.instance": new.instance_name or ""}
         now = time.time_ns()
         for each in changed(old.conditions, new.conditions):
             if each.type == "Accepted" and each.status == "False":
@@ -164,7 +164,7 @@ class TaskTraces:
         if known is not None and known.applied:
             start = known.applied
         parent = known.reconcile if known is not None and known.reconcile is not None else context
-        about = {**_about(task), "wayside.instance": status.instance or ""}
+        about = {**_about(task), "wayside.instance": status.instance_name or ""}
         self._emit(Span("ready", min(start, now), now, parent=parent, attributes=about, error=failure))
 
     def _emit(self, span: Span) -> TraceContext:

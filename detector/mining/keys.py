@@ -50,7 +50,7 @@ def with_dependencies(names: Iterable[str], rules: Mapping[str, EventRule]) -> s
         name = left.pop()
         if name in rules and name not in found:
             found.add(name)
-            left += [signal.rule for signal in rules[name].spec.signals if signal.rule is not None]
+            left += [signal.rule_name for signal in rules[name].spec.signals if signal.rule_name is not None]
     return found
 
 

@@ -154,7 +154,9 @@ def _has_come(found: Object, phase: str, text: str | None = None) -> bool:
 def _counts(instance: Object, tasks: Objects) -> bool:
     """Whether the instance's status counts the tasks that are live."""
     name = instance["metadata"]["name"]
-    live = [each for each in tasks if each.get("status", {}).get("instance") == name and "endTime" not in each["spec"]]
+    live = [
+        each for each in tasks if each.get("status", {}).get("instanceName") == name and "endTime" not in each["spec"]
+    ]
     return bool(instance["status"]["demands"]["count"] == len(live))
 
 

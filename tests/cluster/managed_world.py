@@ -171,8 +171,8 @@ def _tasks(tasks: list[ApplicationTask], outcome: Outcome) -> Iterator[str]:
             yield f"task {task.name}: has no status"
             continue
         should = task_status(task, verdict, None, time.time())
-        if task.status.instance != should.instance:
-            yield f"task {task.name}: instance {task.status.instance}, not {should.instance}"
+        if task.status.instance_name != should.instance_name:
+            yield f"task {task.name}: instance {task.status.instance_name}, not {should.instance_name}"
         if verdict.standing is not Standing.COUNTS and task.status.phase != should.phase:
             yield f"task {task.name}: phase {task.status.phase}, not {should.phase}"
         said = {each.type: (each.status, each.reason) for each in task.status.conditions}

@@ -100,7 +100,7 @@ APPLICATION_TASK: Object = {
         "templateName": "scene-fusion",
         "priority": 3,
         "parameters": {"region": "north", "sources": ["car1", "car2"], "rateHz": 20},
-        "requester": {"detector": "intersection-a", "holder": "intersection-a", "subjects": ["car1", "car2"]},
+        "requester": {"detectorName": "intersection-a", "holder": "intersection-a", "subjects": ["car1", "car2"]},
         "event": {
             "id": "0123456789abcdef",
             "rule": "lidar-vehicles-close",

@@ -134,16 +134,16 @@ class TestApplicationTask:
         [
             ("spec.templateName=scene-fusion", ["one", "two"]),
             ("spec.templateName=other", ["three"]),
-            ("spec.requester.detector=intersection-a", ["one"]),
-            ("status.instance=scene-fusion-abcdefgh", ["two"]),
-            ("spec.templateName=scene-fusion,status.instance!=scene-fusion-abcdefgh", ["one"]),
+            ("spec.requester.detectorName=intersection-a", ["one"]),
+            ("status.instanceName=scene-fusion-abcdefgh", ["two"]),
+            ("spec.templateName=scene-fusion,status.instanceName!=scene-fusion-abcdefgh", ["one"]),
         ],
     )
     def test_its_selectable_fields_work_in_a_selector(self, selector: str, found: list[str], api: Api) -> None:
         api.create(changed(APPLICATION_TASK, {"metadata.name": "one"}))
-        api.create(changed(APPLICATION_TASK, {"metadata.name": "two", "spec.requester.detector": "other"}))
+        api.create(changed(APPLICATION_TASK, {"metadata.name": "two", "spec.requester.detectorName": "other"}))
         api.create(changed(APPLICATION_TASK, {"metadata.name": "three", "spec": {"templateName": "other"}}))
-        status = {"status": {"instance": "scene-fusion-abcdefgh"}}
+        status = {"status": {"instanceName": "scene-fusion-abcdefgh"}}
         api.patch("ApplicationTask", "two", status, subresource="status")
         assert sorted(each["metadata"]["name"] for each in api.list("ApplicationTask", fields=selector)) == sorted(
             found

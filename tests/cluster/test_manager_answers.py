@@ -26,7 +26,7 @@ def emitted(name: str, **parameters: Any) -> Object:
     times = dict.fromkeys(("onsetTime", "startTime"), "2026-01-02T03:04:05Z")
     event = {"id": "e", "rule": "scene", "action": "fuse", "subject": "car1", "values": {"distance": 7}, **times}
     made["spec"]["event"] = event
-    made["spec"]["requester"]["detector"] = "town"
+    made["spec"]["requester"]["detectorName"] = "town"
     return made
 
 
@@ -128,7 +128,7 @@ def test_explain_knows_who_has_no_place_and_what_stands_in_for_whom(
     api.create(template(lifecycle=in_time))
     api.create(task("north"))
     api.wait_for(
-        "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("instance") == instead, what="served"
+        "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("instanceName") == instead, what="served"
     )
     api.create(task("south", of="lite"))
     api.wait_for("ApplicationTask", "south", lambda raw: raw.get("status", {}).get("phase") == "Waiting", what="waits")

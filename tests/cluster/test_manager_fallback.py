@@ -72,7 +72,7 @@ def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
     api.create(template(lifecycle={**IN_TIME, "fallback": {"templateName": "lite"}}))
     api.create(task("north"))
     fallen = wait_accepted(api, "north", "FallenBack")
-    assert fallen["status"]["instance"] == LITE
+    assert fallen["status"]["instanceName"] == LITE
     assert f"instance {FULL} is not ready: instance {LITE} of template lite serves" in fallen["status"]["message"]
     become_ready(api, LITE)
     api.wait_for("ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="the fallback serves")
@@ -92,7 +92,7 @@ def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
     become_ready(api, FULL)
     manager.kill9()
     manager.start()
-    assert wait_accepted(api, "north", "Accepted")["status"]["instance"] == FULL
+    assert wait_accepted(api, "north", "Accepted")["status"]["instanceName"] == FULL
     wait_accepted(api, "second", "Accepted")
     api.wait_gone("ApplicationInstance", LITE)
     wait_settled(api)
@@ -109,7 +109,7 @@ def test_a_fallback_that_cannot_serve_is_told_and_used_once_it_can(
     api.create(task("north"))
     failed = wait_accepted(api, "north", "FallbackFailed")
     assert "there is no ApplicationTemplate 'lite': create it" in failed["status"]["message"]
-    assert failed["status"]["instance"] == FULL
+    assert failed["status"]["instanceName"] == FULL
     api.create(template("lite"))
-    assert wait_accepted(api, "north", "FallenBack")["status"]["instance"] == LITE
+    assert wait_accepted(api, "north", "FallenBack")["status"]["instanceName"] == LITE
     wait_settled(api)

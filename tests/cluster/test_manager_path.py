@@ -71,7 +71,7 @@ def test_when_the_demand_ends_the_instance_lingers_and_goes_with_all_that_is_its
         what="the task is finished",
     )
     assert condition(ended, "Finished")["reason"] == "Ended"
-    assert ended["status"]["instance"] == NORTH
+    assert ended["status"]["instanceName"] == NORTH
     wait_settled(api)
 
 
@@ -108,7 +108,9 @@ def test_the_last_value_can_go_while_a_demand_without_values_stays(api: Api, man
         lambda raw: raw["spec"].get("parameters") == {"sources": ["car1"]},
         what="it is there",
     )
-    api.wait_for("ApplicationTask", "without", lambda raw: raw.get("status", {}).get("instance") == name, what="both")
+    api.wait_for(
+        "ApplicationTask", "without", lambda raw: raw.get("status", {}).get("instanceName") == name, what="both"
+    )
     end(api, "with")
     api.wait_for("ApplicationInstance", name, lambda raw: not raw["spec"].get("parameters"), what="the value is gone")
     wait_settled(api)

@@ -374,7 +374,7 @@ def test_in_a_pod_it_holds_for_this_pod_alone_and_needs_its_rights_and_no_more(
             api.wait_list("ApplicationTask", lambda found: bool(found) and not live(found), what="the task has ended")
         assert status_of(tmp_path, endpoint) == [holder]
         assert task["spec"]["requester"]["holder"] == holder
-        assert task["spec"]["requester"]["detector"] == HOLDER
+        assert task["spec"]["requester"]["detectorName"] == HOLDER
         lease = api.get("Lease", f"wayside-{holder}")
         assert [each["uid"] for each in lease["metadata"]["ownerReferences"]] == [uid]
         api.wait_for(

@@ -125,7 +125,7 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     )
     holder = f"{DETECTOR}.car"
     assert task["spec"]["requester"]["holder"] == holder
-    application = task["status"]["instance"]
+    application = task["status"]["instanceName"]
     wait_available(api, application)
     running = api.get("Pod", "car")
     assert sidecar_of(running)["restartCount"] == 0

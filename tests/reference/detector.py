@@ -108,7 +108,7 @@ class Reference:
         self.keep_starts = keep_starts
         signals = [signal for spec in rules.values() for signal in spec.get("signals", [])]
         over_rules = [
-            (of_rule(signal), nanoseconds(signal.get("over", "0s"))) for signal in signals if "rule" in signal
+            (of_rule(signal), nanoseconds(signal.get("over", "0s"))) for signal in signals if "ruleName" in signal
         ]
         self._keep = {
             which: max([keep_starts, *(over for named, over in over_rules if named == which)])
@@ -292,7 +292,7 @@ def _in_order(rules: dict[str, dict[str, Any]]) -> list[str]:
             name
             for name, spec in rules.items()
             if name not in ordered
-            and all(signal.get("rule", name) in {*ordered, name} for signal in spec.get("signals", []))
+            and all(signal.get("ruleName", name) in {*ordered, name} for signal in spec.get("signals", []))
         )
     return ordered
 

@@ -44,7 +44,7 @@ def _says(spec: dict[str, Any], word: str) -> bool:
 def looks(spec: dict[str, Any], world: World, now: int, view: Callable[[str], dict[str, Any]]) -> Iterator[Look]:
     """All subjects that a rule can be about now."""
     views = {client: view(client) for client in sorted(world.known)}
-    signals = [signal["name"] for signal in spec.get("signals", []) if "stream" in signal or "rule" in signal]
+    signals = [signal["name"] for signal in spec.get("signals", []) if "stream" in signal or "ruleName" in signal]
     each = spec.get("each")
     for element in [None] if each is None else each["of"]:
         extra = {} if element is None else {each["as"]: element}

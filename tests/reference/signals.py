@@ -71,7 +71,7 @@ class Item:
 
 def of_rule(signal: dict[str, Any]) -> tuple[str, bool]:
     """Whose starts or ends a signal is over."""
-    return signal["rule"], signal.get("samples") == "Ends"
+    return signal["ruleName"], signal.get("samples") == "Ends"
 
 
 @dataclass
@@ -92,14 +92,14 @@ class Sources:
             client = signal["client"]
             if client not in self.world.known:
                 return NOTHING
-        if "rule" in signal:
-            if signal["rule"] not in self.open_of:
+        if "ruleName" in signal:
+            if signal["ruleName"] not in self.open_of:
                 return NOTHING
             if aggregate == "Active":
-                return any(clients is None or client in clients for clients in self.open_of[signal["rule"]])
+                return any(clients is None or client in clients for clients in self.open_of[signal["ruleName"]])
         if aggregate == "Age":
             return self._age(signal, client, now, ticks)
-        always_known = "rule" in signal or aggregate in ("Count", "Any")
+        always_known = "ruleName" in signal or aggregate in ("Count", "Any")
         if not always_known and not self.world.fresh(client, signal["stream"], now):
             return NOTHING
         window = list(self._picked(signal, self._items(signal, client, now)))

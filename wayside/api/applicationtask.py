@@ -38,7 +38,7 @@ Holder = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[a-z0-9](
 class Requester(Model):
     """The subjects on whose behalf the task was emitted, and the holder that emitted it."""
 
-    detector: ObjectName | None = Field(
+    detector_name: ObjectName | None = Field(
         default=None, description="The name of the Detector. Absent in a task that a person created."
     )
     holder: Holder | None = Field(
@@ -124,7 +124,7 @@ class ApplicationTaskStatus(Model):
     """The observed state of the demand."""
 
     phase: TaskPhase | None = Field(default=None, description="A one-word summary of the state.")
-    instance: str | None = Field(
+    instance_name: str | None = Field(
         default=None, max_length=63, description="The name of the ApplicationInstance that serves the task."
     )
     message: str | None = Field(
@@ -157,14 +157,18 @@ class ApplicationTask(Kind):
         {"name": "Operation", "type": "string", "jsonPath": ".spec.operation"},
         {"name": "Rule", "type": "string", "jsonPath": ".spec.event.rule"},
         {"name": "Subject", "type": "string", "jsonPath": ".spec.event.subject"},
-        {"name": "Instance", "type": "string", "jsonPath": ".status.instance"},
+        {"name": "Instance", "type": "string", "jsonPath": ".status.instanceName"},
         {"name": "Phase", "type": "string", "jsonPath": ".status.phase"},
         {"name": "Priority", "type": "integer", "jsonPath": ".spec.priority", "priority": "1"},
         {"name": "Holder", "type": "string", "jsonPath": ".spec.requester.holder", "priority": "1"},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": ".status.message"},
     ]
-    selectable_fields: ClassVar[list[str]] = [".spec.templateName", ".spec.requester.detector", ".status.instance"]
+    selectable_fields: ClassVar[list[str]] = [
+        ".spec.templateName",
+        ".spec.requester.detectorName",
+        ".status.instanceName",
+    ]
     # CEL does not see event.values, whose items may be of any type.
     object_validations: ClassVar[list[JsonDict]] = [
         validation(

@@ -79,13 +79,13 @@ OF_AN_EPISODE = frozenset(
 )  # fmt: skip
 """The aggregates of an open episode: they need no more than a few numbers, however long it lasts."""
 
-_SOURCE = "give exactly one of stream, rule, model, plugin and of (aggregate Age with over: Episode needs none)"
+_SOURCE = "give exactly one of stream, ruleName, model, plugin and of (aggregate Age with over: Episode needs none)"
 _OF = "a signal with of has no value or where, and its aggregate is not Age or Active"
 _LAG = "lag is for a signal with of, and not with over: Episode"
 _EPISODE = f"over: Episode is for a signal with of and the aggregates {', '.join(sorted(OF_AN_EPISODE))}; Age has no of"
 _QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95, and other aggregates have none"
-_CLIENT = "client is for a signal with stream or rule: remove it"
-_ENDS = "samples: Ends is for a signal with rule and an aggregate other than Active"
+_CLIENT = "client is for a signal with stream or ruleName: remove it"
+_ENDS = "samples: Ends is for a signal with ruleName and an aggregate other than Active"
 
 
 class Signal(Model):
@@ -105,12 +105,12 @@ class Signal(Model):
             ".value",
         ),
         (
-            "self.aggregate != 'Active' || (has(self.rule) && !has(self.over) && !has(self.where))",
-            "aggregate Active is for a signal with rule, without over and where",
+            "self.aggregate != 'Active' || (has(self.ruleName) && !has(self.over) && !has(self.where))",
+            "aggregate Active is for a signal with ruleName, without over and where",
             ".aggregate",
         ),
         (
-            "[has(self.stream), has(self.rule), has(self.model), has(self.plugin), has(self.of)]"
+            "[has(self.stream), has(self.ruleName), has(self.model), has(self.plugin), has(self.of)]"
             ".filter(given, given).size() == "
             "(self.aggregate == 'Age' && has(self.over) && self.over == 'Episode' ? 0 : 1)",
             _SOURCE,
@@ -123,8 +123,8 @@ class Signal(Model):
             _EPISODE,
         ),
         ("(self.aggregate == 'Quantile') == has(self.quantile)", _QUANTILE),
-        ("!has(self.client) || has(self.stream) || has(self.rule)", _CLIENT, ".client", "Forbidden"),
-        ("self.samples == 'Starts' || (has(self.rule) && self.aggregate != 'Active')", _ENDS, ".samples"),
+        ("!has(self.client) || has(self.stream) || has(self.ruleName)", _CLIENT, ".client", "Forbidden"),
+        ("self.samples == 'Starts' || (has(self.ruleName) && self.aggregate != 'Active')", _ENDS, ".samples"),
         (
             "!(has(self.model) || has(self.plugin)) || !(has(self.where) || has(self.over) || has(self.value))",
             "the signal of a model or plugin has no value, where or over: remove them",
@@ -133,7 +133,7 @@ class Signal(Model):
 
     name: Identifier = Field(description="The name of the variable in expressions.")
     stream: ObjectName | None = Field(default=None, description="The name of a stream of the Detector.")
-    rule: ObjectName | None = Field(
+    rule_name: ObjectName | None = Field(
         default=None,
         description="Instead of a stream: another rule that the Detector selects. Its samples are the starts of "
         "episodes that have the client as a subject, or their ends: see samples. msg contains episode, subject, "
@@ -190,7 +190,7 @@ class Signal(Model):
         "oldest value. Min, Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: last - first. "
         "Rate: Delta per second. Slope: of the line of least squares, per second. All, Any: of booleans. Distinct: "
         "the list of distinct values. Count: the number of samples. Age: seconds "
-        "since the last sample was received; over an episode, since its start. Active (only for a rule): whether an "
+        "since the last sample was received; over an episode, since its start. Active (only with ruleName): whether an "
         "episode is open. MinTime, MaxTime: when the smallest or largest number first occurred, seconds since the "
         "epoch.",
     )
@@ -211,7 +211,7 @@ class Signal(Model):
     @model_validator(mode="after")
     def _complete(self) -> Signal:
         episode = self.over is not None and self.over.is_episode
-        sources = sum(each is not None for each in (self.stream, self.rule, self.model, self.plugin, self.of))
+        sources = sum(each is not None for each in (self.stream, self.rule_name, self.model, self.plugin, self.of))
         if sources != (0 if episode and self.aggregate is Aggregate.AGE else 1):
             raise ValueError(_SOURCE)
         if episode and (self.aggregate not in OF_AN_EPISODE or (self.of is None) != (self.aggregate is Aggregate.AGE)):
@@ -220,9 +220,9 @@ class Signal(Model):
             raise ValueError(_LAG)
         if (self.aggregate is Aggregate.QUANTILE) != (self.quantile is not None):
             raise ValueError(_QUANTILE)
-        if self.client is not None and self.stream is None and self.rule is None:
+        if self.client is not None and self.stream is None and self.rule_name is None:
             raise ValueError(_CLIENT)
-        if self.samples is Samples.ENDS and (self.rule is None or self.aggregate is Aggregate.ACTIVE):
+        if self.samples is Samples.ENDS and (self.rule_name is None or self.aggregate is Aggregate.ACTIVE):
             raise ValueError(_ENDS)
         if self.model is not None or self.plugin is not None:
             if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
@@ -232,8 +232,8 @@ class Signal(Model):
             raise ValueError(_OF)
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
-        if self.aggregate is Aggregate.ACTIVE and (self.rule is None or self.over or self.where):
-            raise ValueError("aggregate Active is for a signal with rule, without over and where")
+        if self.aggregate is Aggregate.ACTIVE and (self.rule_name is None or self.over or self.where):
+            raise ValueError("aggregate Active is for a signal with ruleName, without over and where")
         if self.of is None and self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:

@@ -174,8 +174,8 @@ class _RuleCompiler:
         at: FieldPath = ("spec", "signals", index)
         if (problem := signal_name_problem(signal.name, self.spec)) is not None:
             self.problem((*at, "name"), problem)
-        if signal.rule is not None:
-            return self._episode_signal(at, signal, signal.rule)
+        if signal.rule_name is not None:
+            return self._episode_signal(at, signal, signal.rule_name)
         if signal.stream is None:
             return None  # a model's or a plugin's, or computed from other signals
         stream = self.stream((*at, "stream"), signal.stream)

@@ -49,7 +49,7 @@ def dependency_problems(rules: Sequence[EventRule]) -> dict[str, list[RuleProble
                 )
             else:
                 continue
-            problems.setdefault(name, []).append(RuleProblem(("spec", "signals", index, "rule"), message))
+            problems.setdefault(name, []).append(RuleProblem(("spec", "signals", index, "ruleName"), message))
     return problems
 
 
@@ -59,7 +59,7 @@ def depends(rule: EventRule) -> bool:
 
 
 def _named(rule: EventRule) -> Iterator[tuple[int, str]]:
-    return ((index, signal.rule) for index, signal in enumerate(rule.spec.signals) if signal.rule is not None)
+    return ((index, signal.rule_name) for index, signal in enumerate(rule.spec.signals) if signal.rule_name is not None)
 
 
 def _unknown(name: str, others: Sequence[str]) -> str:

@@ -105,8 +105,8 @@ def _compiled(rule: EventRule, detector: Detector, known: Sequence[RuleProblem])
 def _names_what_is_not_there(problem: RuleProblem, rule: EventRule, beside: Sequence[EventRule]) -> bool:
     """Whether it is about a signal whose rule is not there; else it is about a circle."""
     match problem.path:
-        case ("spec", "signals", int(index), "rule"):
-            return rule.spec.signals[index].rule not in {rule.name, *(each.name for each in beside)}
+        case ("spec", "signals", int(index), "ruleName"):
+            return rule.spec.signals[index].rule_name not in {rule.name, *(each.name for each in beside)}
     return False
 
 

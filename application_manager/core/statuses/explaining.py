@@ -78,7 +78,7 @@ def serving(found: Found, task: ApplicationTask, now: float) -> str | None:
     claimed: str | None = getattr(claim(template, task), "instance", None)
     if claimed is not None and template_of_all(claimed) is not None:
         return None
-    verdict, written = _outcome(found, now).verdicts[task.name], task.status.instance if task.status else None
+    verdict, written = _outcome(found, now).verdicts[task.name], task.status.instance_name if task.status else None
     if verdict.standing is Standing.FINISHED:
         return written or claimed
     return verdict.instance or claimed or written
@@ -148,7 +148,7 @@ def explain(found: Found, *, task: str | None, instance: str | None, now: float)
 
 def _names(task: ApplicationTask, instance: str | None) -> bool:
     """Whether a task that is over was served by the instance."""
-    return instance is not None and task.status is not None and task.status.instance == instance
+    return instance is not None and task.status is not None and task.status.instance_name == instance
 
 
 def _written_leases(tasks: Sequence[ApplicationTask]) -> dict[str, LeaseView]:
@@ -171,7 +171,7 @@ def _task(task: ApplicationTask, verdict: Verdict, leases: Mapping[str, Object],
         operation=str(task.spec.operation.value),
         priority=task.spec.priority,
         created=task.metadata.creation_timestamp or None,
-        detector=task.spec.requester.detector,
+        detector=task.spec.requester.detector_name,
         holder=holder,
         lease_age_seconds=_lease_age(leases.get(holder), now) if holder else None,
         holder_is_lost=accepted is not None and accepted.reason == HOLDER_LOST,

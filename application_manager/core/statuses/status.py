@@ -107,10 +107,10 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
     # A task that counts keeps what is known of its service while nothing newer is.
     only_while = (STALLED,) if verdict.standing is Standing.COUNTS else ("Applied", "Ready", STALLED)
     conditions = updated(old.conditions, aspects, task.metadata.generation, now, only_while=only_while)
-    instance = old.instance or verdict.instance if finished else verdict.instance
+    instance = old.instance_name or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, service, suspends),
-        instance=instance,
+        instance_name=instance,
         message=_task_message(verdict, service, suspends),
         observed_generation=task.metadata.generation,
         applied_time=applied_time,

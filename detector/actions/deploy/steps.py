@@ -57,7 +57,7 @@ def differences(demand: Demand, stored: StoredTask) -> list[str]:
         "templateName": (demand.template, spec.template_name),
         "operation": (demand.operation, spec.operation),
         "priority": (demand.priority, spec.priority),
-        "requester.detector": (demand.detector, spec.requester.detector),
+        "requester.detectorName": (demand.detector, spec.requester.detector_name),
         "requester.subjects": (list(demand.subjects), spec.requester.subjects),
     }
     if event is not None:

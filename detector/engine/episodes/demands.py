@@ -112,7 +112,7 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
             operation=demand.operation,
             priority=demand.priority,
             parameters=plain(demand.parameters),
-            requester=Requester(detector=demand.detector, holder=demand.holder, subjects=list(demand.subjects)),
+            requester=Requester(detector_name=demand.detector, holder=demand.holder, subjects=list(demand.subjects)),
             event=TaskEvent(
                 id=demand.episode,
                 rule=demand.rule,
@@ -133,7 +133,7 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
 def from_task(task: ApplicationTask) -> Demand | None:
     """The demand that a task stands for; None where no detector emitted it (no holder or no event)."""
     spec = task.spec
-    if spec.event is None or spec.requester.holder is None or spec.requester.detector is None:
+    if spec.event is None or spec.requester.holder is None or spec.requester.detector_name is None:
         return None
     event = spec.event
     return Demand(
@@ -142,7 +142,7 @@ def from_task(task: ApplicationTask) -> Demand | None:
         template=spec.template_name,
         priority=spec.priority,
         parameters=spec.parameters,
-        detector=spec.requester.detector,
+        detector=spec.requester.detector_name,
         holder=spec.requester.holder,
         namespace=task.metadata.namespace,
         subject=event.subject,

@@ -146,8 +146,8 @@ def test_kinds_have_their_short_names_status_and_selectable_fields() -> None:
     (task,) = spec_of("applicationtasks")["versions"]
     assert {field["jsonPath"] for field in task["selectableFields"]} == {
         ".spec.templateName",
-        ".spec.requester.detector",
-        ".status.instance",
+        ".spec.requester.detectorName",
+        ".status.instanceName",
     }
     names = {kind: schema_of(kind)["properties"]["metadata"]["properties"]["name"]["maxLength"] for kind in KINDS}
     assert names == dict.fromkeys(KINDS, 63) | {"applicationtemplates": 40}

@@ -211,7 +211,10 @@ def test_what_may_be_right_is_not_warned_of(case: str) -> None:
 
 
 def test_what_a_named_rule_looks_at_counts_as_well() -> None:
-    spec = {"signals": [{"name": "starts", "rule": "other", "over": "30m", "aggregate": "Count"}], "when": "starts > 2"}
+    spec = {
+        "signals": [{"name": "starts", "ruleName": "other", "over": "30m", "aggregate": "Count"}],
+        "when": "starts > 2",
+    }
     other = a_rule("other", signals=[over("40m"), a_model({"name": "x", "signals": ["m"]})], when="risk > 0.5")
     (period,) = told({"observationPeriod": ["ShortTerm"]}, other, **spec)
     assert "it looks back 70m (spec.signals[0].over: 30m and spec.signals[0].over: 40m of the rule other)" in period

@@ -160,7 +160,7 @@ def _signal(draw: st.DrawFn, name: str, others: tuple[str, ...]) -> dict[str, An
     if draw(st.integers(0, 3)) == 0:
         signal["client"] = draw(st.sampled_from(("a", "b", "o", "nobody")))
     if of_rule:
-        signal["rule"] = draw(st.sampled_from(others))
+        signal["ruleName"] = draw(st.sampled_from(others))
         aggregate = draw(st.sampled_from(("Active", "Count", "Age", aggregate)))
         if aggregate == "Active":
             return {**signal, "aggregate": aggregate}

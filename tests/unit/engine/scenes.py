@@ -202,7 +202,7 @@ def _a_random_spec(random: Random, number: int, kind: str) -> dict[str, Any]:
     spec["when"] = _condition(random, names, each)
     if kind == "over":
         signal, form = random.choice(_OVER)
-        signals.append({"name": "over", "rule": f"r{random.randrange(number)}", **signal})
+        signals.append({"name": "over", "ruleName": f"r{random.randrange(number)}", **signal})
         spec["when"] = random.choice(["{1}", "{1} && ({0})", "({0}) || {1}"]).format(spec["when"], form)
     if kind == "pairs":
         position = {"stream": "p", "x": "msg.q.w", "y": "msg.q.z", "maxAge": "1s"}

@@ -179,7 +179,9 @@ def test_events_of_a_tick_are_in_the_order_of_rules_whichever_way_those_are_eval
     )
     rules = [
         speeding("a", evaluation=FIFTHS),
-        a_rule("b", signals=[{"name": "active", "rule": "e", "aggregate": "Active"}], when="active", evaluation=FIFTHS),
+        a_rule(
+            "b", signals=[{"name": "active", "ruleName": "e", "aggregate": "Active"}], when="active", evaluation=FIFTHS
+        ),
         a_rule(
             "c",
             signals=[SPEED],

@@ -15,7 +15,7 @@ def test_a_rule_has_another_key_with_what_it_depends_on_and_with_nothing_else(tm
     map_file.write_text("{}")
     detector = a_detector(a_stream("odom"), maps=[{"file": str(map_file)}])
     fast = a_rule("fast", signals=SIGNALS, when="v > 10")
-    often = {"name": "n", "rule": "fast", "over": "60s", "aggregate": "Count"}
+    often = {"name": "n", "ruleName": "fast", "over": "60s", "aggregate": "Count"}
     rules = [fast, a_rule("often", signals=[often], when="n > 2"), a_rule("slow", signals=SIGNALS, when="v < 1")]
     before = rule_keys(detector, rules)
     changed = rule_keys(detector, [a_rule("fast", signals=SIGNALS, when="v > 11"), *rules[1:]])

@@ -13,7 +13,7 @@ from wayside.rules import RuleError, dependency_problems, in_order
 
 
 def over(rule: str, name: str = "it", **fields: Any) -> dict[str, Any]:
-    return {"name": name, "rule": rule, **fields}
+    return {"name": name, "ruleName": rule, **fields}
 
 
 def count(rule: str, window: str, name: str = "it", **fields: Any) -> dict[str, Any]:
@@ -177,11 +177,13 @@ def test_a_circle_is_told_with_its_way_and_an_unknown_rule_with_the_nearest() ->
     told = {name: [str(problem) for problem in problems] for name, problems in dependency_problems(rules).items()}
     circle = "rules must not depend on each other in a cycle: {}; remove one of these signals"
     assert told == {
-        "a": ["spec.signals[0].rule: " + circle.format("a → b → c → a")],
-        "b": ["spec.signals[1].rule: " + circle.format("b → c → a → b")],
-        "c": ["spec.signals[0].rule: " + circle.format("c → a → b → c")],
-        "e": ["spec.signals[0].rule: " + circle.format("e → e")],
-        "f": ["spec.signals[0].rule: there is no rule brakin that the same Detector selects; did you mean braking?"],
+        "a": ["spec.signals[0].ruleName: " + circle.format("a → b → c → a")],
+        "b": ["spec.signals[1].ruleName: " + circle.format("b → c → a → b")],
+        "c": ["spec.signals[0].ruleName: " + circle.format("c → a → b → c")],
+        "e": ["spec.signals[0].ruleName: " + circle.format("e → e")],
+        "f": [
+            "spec.signals[0].ruleName: there is no rule brakin that the same Detector selects; did you mean braking?"
+        ],
     }
 
 
@@ -196,11 +198,11 @@ def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"name": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream, rule, model, plugin and of"),
-        ({"name": "s", "rule": "r", "stream": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream"),
-        ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active is for a signal with rule"),
-        ({"name": "s", "rule": "r", "aggregate": "Active", "over": "1s"}, "without over and where"),
-        ({"name": "s", "rule": "r", "aggregate": "Active", "value": "msg.episode"}, "uses no value"),
+        ({"name": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream, ruleName, model, plugin and of"),
+        ({"name": "s", "ruleName": "r", "stream": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream"),
+        ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active is for a signal with ruleName"),
+        ({"name": "s", "ruleName": "r", "aggregate": "Active", "over": "1s"}, "without over and where"),
+        ({"name": "s", "ruleName": "r", "aggregate": "Active", "value": "msg.episode"}, "uses no value"),
     ],
 )
 def test_what_a_signal_over_a_rule_cannot_be(fields: Any, message: str) -> None:
@@ -256,12 +258,12 @@ def test_an_end_by_loss_counts_for_the_other_client_of_a_pair_alone() -> None:
     "signal",
     [
         {"stream": "speed", "value": "msg.v", "samples": "Ends"},
-        {"rule": "braking", "aggregate": "Active", "samples": "Ends"},
+        {"ruleName": "braking", "aggregate": "Active", "samples": "Ends"},
     ],
 )
 def test_ends_are_of_rules_and_never_active(signal: dict[str, Any]) -> None:
     with pytest.raises(
-        ValidationError, match="samples: Ends is for a signal with rule and an aggregate other than Active"
+        ValidationError, match="samples: Ends is for a signal with ruleName and an aggregate other than Active"
     ):
         a_rule(signals=[{"name": "s", **signal}], when="s")
 

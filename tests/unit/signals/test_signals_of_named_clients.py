@@ -54,7 +54,7 @@ def test_pairs_fleets_and_episodes_see_it_as_well() -> None:
     fleet = {"fleet": {"members": "speed > 1"}}
     many = a_rule("many", scope=fleet, signals=[SPEED, LIGHT], when="members.exists(m, m.light == 'red')")
     phase = a_rule("phase", signals=[{**LIGHT, "client": None}], when="light == 'red'")
-    active = {"name": "on", "rule": "phase", "client": "light-3", "aggregate": "Active"}
+    active = {"name": "on", "ruleName": "phase", "client": "light-3", "aggregate": "Active"}
     stop = a_rule("stop", signals=[active, SPEED], when="on && speed > 1")
     drive = Drive(DETECTOR, near, many, phase, stop)
     told = drive.take(place(0.1, "a", 0), place(0.2, "b", 3), speed(0.3, "a", 5), light(0.4, "red"), until=1)
@@ -67,7 +67,7 @@ def test_pairs_fleets_and_episodes_see_it_as_well() -> None:
     [
         (
             {"name": "s", "plugin": {"name": "p"}, "client": "a"},
-            "client is for a signal with stream or rule: remove it",
+            "client is for a signal with stream or ruleName: remove it",
         ),
         ({"name": "s", "stream": "speed", "value": "msg.v", "client": "a b"}, "client"),
     ],

@@ -127,7 +127,7 @@ def test_the_replay_of_lags_and_statistics_gives_the_same_events() -> None:
 @pytest.mark.parametrize(
     ("signal", "message"),
     [
-        ({"of": "v", "stream": "speed"}, "exactly one of stream, rule, model, plugin and of"),
+        ({"of": "v", "stream": "speed"}, "exactly one of stream, ruleName, model, plugin and of"),
         ({"over": "Episode", "aggregate": "Min"}, "exactly one of"),
         ({"of": "v", "value": "msg.v"}, "a signal with of has no value or where"),
         ({"of": "v", "aggregate": "Age"}, "its aggregate is not Age or Active"),

@@ -39,8 +39,8 @@ def emitted(name: str, parameters: dict[str, Any], subject: str = "car1+car2", *
         "values": {"distance": 142.5},
     }
     raw = made.to_json()
-    raw["spec"] |= {"event": event, "requester": {"detector": "town", "holder": "town"}}
-    raw["status"] = {"phase": "Active", "instance": NAME, "observedGeneration": 0}
+    raw["spec"] |= {"event": event, "requester": {"detectorName": "town", "holder": "town"}}
+    raw["status"] = {"phase": "Active", "instanceName": NAME, "observedGeneration": 0}
     return ApplicationTask.model_validate(raw)
 
 

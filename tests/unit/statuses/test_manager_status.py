@@ -96,7 +96,7 @@ def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it
 def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
     served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, None, NOW)})
     done = task_status(served, Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 7)
-    assert (done.phase, done.instance) == (TaskPhase.FINISHED, "app")
+    assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, "app")
     assert finished_since(served.model_copy(update={"status": done})) == NOW + 7
     assert finished_since(served) is None
 
@@ -111,7 +111,7 @@ def test_a_task_that_ends_before_its_status_is_written_still_says_what_served_it
     verdict = book.verdict(name)
     assert verdict is not None
     done = task_status(ended, verdict, None, NOW)
-    assert (done.phase, done.instance) == (TaskPhase.FINISHED, claimed.instance)
+    assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, claimed.instance)
 
 
 def test_a_holder_that_returns_takes_back_that_its_task_is_finished() -> None:

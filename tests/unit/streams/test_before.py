@@ -97,7 +97,7 @@ def test_messages_of_ros_are_compared_by_their_fields() -> None:
     [
         (jump("msg.pose.position.x - before.poses.x"), r"value: before has no field poses; did you mean pose\?"),
         (
-            a_rule(signals=[{"name": "s", "rule": "r", "value": "before.subject"}], when="s == 'car'"),
+            a_rule(signals=[{"name": "s", "ruleName": "r", "value": "before.subject"}], when="s == 'car'"),
             r"value: .*`before` is not declared here.*; before is for signals over streams, not over a rule",
         ),
         (

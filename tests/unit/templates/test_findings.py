@@ -28,7 +28,7 @@ def rule(name: str = "fast", **spec: Any) -> EventRule:
 
 
 def counting(name: str, of: str) -> EventRule:
-    signal = {"name": "others", "rule": of, "over": "10s", "aggregate": "Count"}
+    signal = {"name": "others", "ruleName": of, "over": "10s", "aggregate": "Count"}
     return rule(name, signals=[signal], when="others > 2")
 
 

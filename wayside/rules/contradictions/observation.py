@@ -63,13 +63,13 @@ def _reaches(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[
         yield _Reach(_CLOSING_SPEED_NS, "closingSpeed")
     for index, signal in detecting(rule):
         own = _reach(f"spec.signals[{index}]", signal)
-        if signal.rule is None or signal.rule in above:
+        if signal.rule_name is None or signal.rule_name in above:
             yield own
-        elif signal.rule not in others:
+        elif signal.rule_name not in others:
             yield own._replace(any_time=True)
         else:
-            other = _observation(others[signal.rule], others, above)
-            why = f"{other.why} of the rule {signal.rule}" if other.ns else ""
+            other = _observation(others[signal.rule_name], others, above)
+            why = f"{other.why} of the rule {signal.rule_name}" if other.ns else ""
             yield _Reach(
                 own.ns + other.ns,
                 " and ".join(each for each in (own.why, why) if each),
@@ -89,11 +89,11 @@ def _reach(at: str, signal: Signal) -> _Reach:
     if signal.lag is not None:
         over = 0 if signal.over is None else signal.over.ns
         return _Reach(signal.lag.ns + over, f"{at}.lag: {signal.lag}" + (f" and over: {signal.over}" if over else ""))
-    if signal.aggregate is Aggregate.LAST and signal.rule is None:
+    if signal.aggregate is Aggregate.LAST and signal.rule_name is None:
         return _Reach(0, "")  # `over` limits its age; one sample is enough
     if signal.over is not None:
         return _Reach(signal.over.ns, f"{at}.over: {signal.over}")
-    return _Reach(0, "", any_time=signal.aggregate in _OF_ANY_TIME or signal.rule is not None)
+    return _Reach(0, "", any_time=signal.aggregate in _OF_ANY_TIME or signal.rule_name is not None)
 
 
 def looks_back(observed: Observation) -> str:

@@ -169,9 +169,9 @@ def _learnt(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[s
         plugins = plugins or signal.plugin is not None
         if signal.model is not None:
             models.append(f"spec.signals[{index}].model")
-        elif signal.rule is not None and signal.rule in others and signal.rule not in above:
-            further, any_plugin = _learnt(others[signal.rule], others, above | {rule.name})
-            models += [f"{each} of the rule {signal.rule}" for each in further]
+        elif signal.rule_name is not None and signal.rule_name in others and signal.rule_name not in above:
+            further, any_plugin = _learnt(others[signal.rule_name], others, above | {rule.name})
+            models += [f"{each} of the rule {signal.rule_name}" for each in further]
             plugins = plugins or any_plugin
     return models, plugins
 
