@@ -113,9 +113,10 @@ class Executor:
         for step in steps:
             match step:
                 case Insert(arrivals, times):
-                    if self._blocks.waiting and not self._may_wait(arrivals, times):
+                    size = self._known.ingest.size_of(arrivals)
+                    if self._blocks.waiting and not self._may_wait(arrivals, times, size):
                         events += self._evaluate_waiting()
-                    self._known.ingest.insert(arrivals, times)
+                    self._known.ingest.insert(arrivals, times, size)
                 case Tick():
                     events += self._tick(step)
                 case Gap(time, backwards):
@@ -127,11 +128,11 @@ class Executor:
         self._known.looked(self._now())
         return events
 
-    def _may_wait(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> bool:
-        """Whether what comes changes nothing that the ticks that wait see."""
+    def _may_wait(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> bool:
+        """Whether what comes (at most `size` bytes) changes nothing that the ticks that wait see."""
         first, last = (arrivals[0].received, arrivals[-1].received) if times is None else (min(times), max(times))
         in_order = times is None or first > self._last_wait
-        return in_order and last - self._blocks.since <= LONGEST and self._known.fits(arrivals)
+        return in_order and last - self._blocks.since <= LONGEST and self._known.buffer.takes(size)
 
     def _evaluate_waiting(self) -> list[Event]:
         """Evaluate the ticks that wait."""

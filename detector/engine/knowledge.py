@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from detector.engine.buffering.buffer import Buffer, bytes_of
+from detector.engine.buffering.buffer import Buffer
 from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.ingest import Ingest
 from detector.engine.buffering.items import Items
@@ -144,10 +144,6 @@ class Knowledge:
             self._rows_forgotten = now
             self.tables.expire(now - now % HOUSEKEEPING)
 
-    def fits(self, arrivals: Sequence[Arrival]) -> bool:
-        """Whether the buffer takes in the arrivals without pushing anything out."""
-        return self.buffer.bytes + bytes_of(arrivals) + self.ingest.overhead_of(arrivals) <= self.buffer.maximum_bytes
-
     def new_tables(self) -> None:
         """Begin with new tables: rules that are evaluated in columns have to be set again."""
         tables = self.tables
@@ -173,6 +169,7 @@ class Knowledge:
         """Time went on from here without us, or (backwards) restarts: windows do not reach back further."""
         if backwards:
             self.buffer.step_back(time)
+            self.ingest.step_back(time)
             self.tables.forget()
         self._floor = time
         self.signals.gap(time)

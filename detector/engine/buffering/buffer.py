@@ -37,7 +37,7 @@ class Lane:
     """The samples of one client on one stream, in order of time."""
 
     __slots__ = (
-        "bytes", "came", "capped", "client", "duration", "evicted", "latest", "maximum_bytes", "maximum_count",
+        "_pushed_out", "bytes", "came", "capped", "client", "duration", "evicted", "maximum_bytes", "maximum_count",
         "number", "samples", "stream",
     )  # fmt: skip
 
@@ -62,8 +62,8 @@ class Lane:
         self.limit(duration, maximum_bytes, maximum_count)
         self.samples: deque[Sample] = deque()
         self.bytes = 0
-        self.latest = NEVER
-        """The greatest time of all samples that came, also of those that a cap pushed out."""
+        self._pushed_out = NEVER
+        """The time of the newest sample, if a cap pushed it out."""
         self.evicted = 0
         """Samples that a cap pushed out before their time."""
 
@@ -88,20 +88,21 @@ class Lane:
         """The sample of the greatest time; of several, the one that arrived last."""
         return self.samples[-1] if self.samples else None
 
+    @property
+    def latest(self) -> int:
+        """The greatest time of all samples that came, also of those that a cap pushed out."""
+        return max(self.samples[-1].received, self._pushed_out) if self.samples else self._pushed_out
+
     def insert(self, sample: Sample) -> int:
         """Put the sample in its place; returns by how many bytes the lane grew."""
         if self.came is not None:
             self.came.append(sample)
         samples = self.samples
-        if sample.time >= self.latest:
-            self.latest = sample.time
-            samples.append(sample)
-        else:
-            later = []
-            while samples and samples[-1].time > sample.time:
-                later.append(samples.pop())
-            samples.append(sample)
-            samples.extend(reversed(later))
+        later = []
+        while samples and samples[-1].time > sample.time:
+            later.append(samples.pop())
+        samples.append(sample)
+        samples.extend(reversed(later))
         size = self.size_of(sample)
         self.bytes += size
         if self.maximum_bytes is not None:
@@ -116,7 +117,10 @@ class Lane:
 
     def drop_oldest(self) -> int:
         """Forget the oldest sample; returns the bytes freed."""
-        size = self.size_of(self.samples.popleft())
+        oldest = self.samples.popleft()
+        if not self.samples:
+            self._pushed_out = max(self._pushed_out, oldest.time)
+        size = self.size_of(oldest)
         self.bytes -= size
         return size
 
@@ -126,9 +130,11 @@ class Lane:
 
     def expire(self, now: int) -> int:
         """Forget what is older than the duration, but never the newest; returns the bytes freed."""
-        samples = self.samples
-        count = bisect_right(samples, now - self.duration, 0, max(len(samples) - 1, 0), key=_RECEIVED)
-        freed = self._freed([samples.popleft() for _ in range(count)])
+        samples, horizon = self.samples, now - self.duration
+        if not samples or samples[0].received > horizon:
+            return 0
+        pop = samples.popleft
+        freed = self._freed([pop() for _ in range(bisect_right(samples, horizon, 0, len(samples) - 1, key=_RECEIVED))])
         self.bytes -= freed
         return freed
 
@@ -139,7 +145,7 @@ class Lane:
         """Time goes on from `to`, which is earlier: forget all samples, and that there were any."""
         self.samples.clear()
         self.bytes = 0
-        self.latest = NEVER
+        self._pushed_out = NEVER
 
     def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
         """The samples of (after, until] from the newest on; all up to `until` where `after` is None.
@@ -203,6 +209,10 @@ class Buffer:
             lanes[lane.stream] = lane
             self.on_added(lane)
         return lanes[lane.stream]
+
+    def takes(self, size: int) -> bool:
+        """Whether so much comes in without pushing anything out."""
+        return self.bytes + size <= self.maximum_bytes
 
     def grew(self, size: int) -> None:
         """Account for what was inserted, and keep to the cap."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from operator import attrgetter
 
-from detector.engine.buffering.buffer import Buffer, Lane
+from detector.engine.buffering.buffer import NEVER, Buffer, Lane, bytes_of
 from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.lanes import LaneMaker
 from detector.engine.buffering.messages import KeyReader
@@ -47,10 +47,12 @@ class Ingest:
         self._clients = clients
         self._counters = counters
         self._number = 0
+        self._newest = NEVER
+        """The greatest time of all that came: what is not before it is late in no lane."""
         self.came: list[Sample] = []
         """What came since somebody took it, while `noting`."""
-        self.lanes: list[Lane | None] = []
-        """The lane of each of these; None: it was dropped."""
+        self.lanes: list[Lane] = []
+        """The lane of each of these."""
         self.noting = False
         self.linked: frozenset[str] = frozenset()
         """The streams whose samples take along the one before: some rule reads it."""
@@ -76,35 +78,40 @@ class Ingest:
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
         """By key; of streams whose messages name their client, by client, which no key is: see `_lane_of_message`."""
 
-    def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
-        """Everything that is received comes through here. `times`: None for the receive times, in order."""
-        self._counters.samples.update(map(_STREAM, arrivals))
-        apart = self._of_items | self.linked
-        if times is None and (not apart or apart.isdisjoint(map(_STREAM, arrivals))):
-            self._insert_in_order(arrivals)
+    def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> None:
+        """Everything that is received comes through here.
+
+        `times`: None for the receive times, in order. `size`: what the arrivals take at most, see `size_of`.
+        """
+        streams = {arrival.stream for arrival in arrivals}
+        if len(streams) == 1:
+            self._counters.samples[arrivals[0].stream] += len(arrivals)
+        else:
+            self._counters.samples.update(map(_STREAM, arrivals))
+        if times is None and self._of_items.isdisjoint(streams) and self.linked.isdisjoint(streams):
+            self._insert_in_order(arrivals, size)
             return
         for at, arrival in enumerate(arrivals):
             stream, key, payload = arrival.stream, arrival.key, arrival.payload
             time = arrival.received if times is None else times[at]
+            self._newest = max(self._newest, time)
             if stream in self._of_items:
                 self._insert_items(arrival, time)
                 continue
             lane = self._lane(stream, key, time, payload)
-            if lane is None:
-                if stream == LIVELINESS:
-                    self._token(key, payload, time)
-            else:
+            if lane is not None:
                 self._number += 1
                 if stream in self.linked:
                     self._put(lane, Linked(time, self._number, payload, key, self._before(lane, time)))
                 else:
                     self._put(lane, arrival if times is None else Stamped(time, self._number, payload, key))
 
-    def overhead_of(self, arrivals: Sequence[Arrival]) -> int:
-        """What the items of these take at most in the buffer beside the messages, in bytes."""
-        if not self._of_items:
-            return 0
-        return MAXIMUM_ITEMS * SAMPLE_OVERHEAD * sum(arrival.stream in self._of_items for arrival in arrivals)
+    def size_of(self, arrivals: Sequence[Arrival]) -> int:
+        """What these take at most in the buffer, in bytes: their items take less."""
+        size = bytes_of(arrivals)
+        if self._of_items:
+            size += MAXIMUM_ITEMS * SAMPLE_OVERHEAD * sum(arrival.stream in self._of_items for arrival in arrivals)
+        return size
 
     def _insert_items(self, arrival: Arrival, time: int) -> None:
         """Put each item of a message into the lane of its client."""
@@ -135,41 +142,32 @@ class Ingest:
             self.came.append(sample)
             self.lanes.append(lane)
 
-    def _insert_in_order(self, arrivals: Sequence[Arrival]) -> None:
-        """The hot path. What `Lane.insert` and `Buffer.grew` do is written out: a call costs as much as the rest."""
-        lanes, buffer = self._lanes, self._buffer
-        held, cap = buffer.bytes, buffer.maximum_bytes
-        note = self.lanes.append
+    def _insert_in_order(self, arrivals: Sequence[Arrival], size: int) -> None:
+        """The hot path: what `_put` does is written out where nothing is late or pushed out."""
+        known, buffer, newest = self._lanes, self._buffer, self._newest
+        self._newest = max(newest, arrivals[-1].received)
+        lanes: list[Lane]
+        try:
+            lanes = [known[arrival.stream][arrival.key] for arrival in arrivals]
+        except KeyError:
+            found = [(self._lane(each.stream, each.key, each.received, each.payload), each) for each in arrivals]
+            arrivals = [arrival for lane, arrival in found if lane is not None]
+            lanes = [lane for lane, _ in found if lane is not None]
+            size = bytes_of(arrivals)
+        if not buffer.takes(size) or (arrivals and arrivals[0].received < newest):
+            for lane, arrival in zip(lanes, arrivals, strict=True):
+                self._put(lane, arrival)
+            return
+        for lane, arrival in zip(lanes, arrivals, strict=True):
+            if lane.capped:
+                size += lane.insert(arrival) - lane.size_of(arrival)
+            else:
+                lane.samples.append(arrival)
+                lane.bytes += len(arrival.payload) + SAMPLE_OVERHEAD
+        buffer.bytes += size
         if self.noting:
             self.came += arrivals
-        for arrival in arrivals:
-            time = arrival.received
-            try:
-                lane = lanes[arrival.stream][arrival.key]
-            except KeyError:
-                found = self._lane(arrival.stream, arrival.key, time, arrival.payload)
-                if found is None:
-                    if arrival.stream == LIVELINESS:
-                        self._token(arrival.key, arrival.payload, time)
-                    note(None)
-                    continue
-                lane = found
-            note(lane)
-            if time >= lane.latest and not lane.capped:
-                lane.latest = time
-                lane.samples.append(arrival)
-                size = len(arrival.payload) + SAMPLE_OVERHEAD
-                lane.bytes += size
-            else:
-                size = lane.insert(arrival)
-            held += size
-            if held > cap:
-                buffer.bytes = held
-                buffer.shrink()
-                held = buffer.bytes
-        buffer.bytes = held
-        if not self.noting:
-            self.lanes.clear()
+            self.lanes += lanes
 
     def _lane(self, stream: str, key: str, time: int, payload: bytes) -> Lane | None:
         """The lane that takes a sample; None, and not counted among those taken in, where there is none for it."""
@@ -179,6 +177,8 @@ class Ingest:
             lane = self._lanes.get(stream, _NO_LANES).get(key) or self._route(stream, key, time)
         if lane is None:
             self._counters.samples[stream] -= 1
+            if stream == LIVELINESS:
+                self._token(key, payload, time)
         return lane
 
     def sender_of(self, arrival: Arrival) -> str | None:
@@ -199,6 +199,10 @@ class Ingest:
             return self._read_message(arrival.stream, arrival.key, arrival.payload)
         lane = self._lanes.get(arrival.stream, _NO_LANES).get(arrival.key)
         return lane.client if lane is not None else self._read(arrival.stream, arrival.key)
+
+    def step_back(self, to: int) -> None:
+        """Time goes on from `to`, which is earlier; nanoseconds."""
+        self._newest = to
 
     def lose(self, lost: Collection[str]) -> None:
         """These clients are lost. The next sample of one makes it known again; its last samples are still there then.

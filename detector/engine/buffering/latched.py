@@ -89,7 +89,7 @@ class LatchedLane(Lane):
     def step_back(self, to: int) -> None:
         """Time continues from `to`: samples stay valid, none of them newer than that."""
         self._keep([_not_after(sample, to) for sample in self.samples])
-        self.latest = self.samples[-1].time if self.samples else NEVER
+        self._pushed_out = NEVER
 
     def _about(self, sample: Sample) -> Hashable:
         """What the sample speaks of."""

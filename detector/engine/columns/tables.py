@@ -145,8 +145,8 @@ class Tables:
         """Whether the buffer has dropped samples that are still here."""
         return self._stale or self._evictions != self._buffer.evictions
 
-    def settle(self, samples: list[Sample], lanes: list[Lane | None]) -> None:
-        """Take in what entered the buffer since the last time: samples, and the lane of each (None: it was dropped)."""
+    def settle(self, samples: list[Sample], lanes: list[Lane]) -> None:
+        """Take in what entered the buffer since the last time: samples, and the lane of each."""
         for table, reader in zip(self._tables.values(), self.readers.values(), strict=True):
             if len(table.columns) != reader.count:
                 table.set_columns(reader.count)
@@ -181,27 +181,21 @@ class Tables:
                 place = f"signal {signal.name} of {self.names[failure.client]}, stream {signal.stream}"
                 counters.note(failure.reason, failure.message, place, failure.samples)
 
-    def _append(self, samples: list[Sample], lanes: list[Lane | None]) -> None:
-        if None in lanes:
-            kept = [(sample, lane) for sample, lane in zip(samples, lanes, strict=True) if lane is not None]
-            samples, lanes = [sample for sample, _ in kept], [lane for _, lane in kept]
-            if not samples:
-                return
-        numbers = np.fromiter([lane.number for lane in lanes], np.int64, len(lanes))  # type: ignore[union-attr]
+    def _append(self, samples: list[Sample], lanes: list[Lane]) -> None:
+        numbers = np.fromiter([lane.number for lane in lanes], np.int64, len(lanes))
         if numbers.min() < 0:
             for lane in dict.fromkeys(lanes):
-                assert lane is not None  # noqa: S101  left out above
                 lane.number = self.number(lane.client)
-            numbers = np.fromiter([lane.number for lane in lanes], np.int64, len(lanes))  # type: ignore[union-attr]
+            numbers = np.fromiter([lane.number for lane in lanes], np.int64, len(lanes))
         if len(self.names) < 2**15:
             numbers = numbers.astype(np.int16)  # sorted faster
         times = np.fromiter([sample.received for sample in samples], np.int64, len(samples))
-        streams = {lane.stream for lane in set(lanes)}  # type: ignore[union-attr]
+        streams = {lane.stream for lane in set(lanes)}
         for stream in streams & self._tables.keys():
             if len(streams) == 1:
                 self._tables[stream].append(numbers, times, samples)
             else:
-                of = np.array([lane.stream == stream for lane in lanes])  # type: ignore[union-attr]
+                of = np.array([lane.stream == stream for lane in lanes])
                 at = np.flatnonzero(of)
                 self._tables[stream].append(numbers[at], times[at], [samples[each] for each in at.tolist()])
 
