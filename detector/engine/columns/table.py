@@ -29,6 +29,8 @@ _SHIFT = 46
 _REACH = 2**46
 """Range of times that keys can represent, in nanoseconds."""
 _LEAST_ROOM = 16
+_BATCHES = 3
+"""How many more batches like the one that needs room fit in at most: moving rows costs more than adding them."""
 
 
 class StoredColumn:
@@ -184,7 +186,7 @@ class Table:
         self._base = base
         live = self.end - self.first
         need = live + counts
-        room = np.where(need > 0, np.maximum(_LEAST_ROOM, need + need // 4), 0)
+        room = np.where(need > 0, np.maximum(_LEAST_ROOM, need + need // 4 + _BATCHES * np.minimum(counts, live)), 0)
         start = np.cumsum(room) - room
         source, target = rows_between(self.first, self.end), rows_between(start, start + live)
         size = int(room.sum())
