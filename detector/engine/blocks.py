@@ -7,6 +7,7 @@ an evaluation could see or change; how many are evaluated together never changes
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
 
 from detector.engine.columns.block import Context
 from detector.engine.columns.fleets import FleetGroup, fits_fleet
@@ -22,6 +23,9 @@ from wayside.rules import CompiledRule, episode_stream
 
 _POINTS = 2_000_000
 """Maximum number of points, for all rules, ticks and clients, in a block: the columns of all rules are in memory."""
+
+
+_place = attrgetter("time", "order", "event.subject")
 
 
 class Blocks:
@@ -159,9 +163,9 @@ class Blocks:
         return happened
 
     def _noted(self, happened: list[Happened]) -> list[Happened]:
-        """The same, in order, once rules that look at episodes of others can see it."""
-        happened.sort(key=_place)
+        """The same, once rules that look at episodes of others can see it."""
         if self._context.starts.needed:
+            happened.sort(key=_place)
             for each in happened:
                 self._context.starts.note(each.event)
         return happened
@@ -173,10 +177,6 @@ class Blocks:
         group = self._on_sample[stream]
         present = sorted({client for each in only.values() for client in each.present(self._context.clients)})
         return self._noted(_timed(group, (time,), stopwatch, group.evaluate((time,), present, self._floor(), only)))
-
-
-def _place(happened: Happened) -> tuple[int, int, str]:
-    return happened.time, happened.order, happened.event.subject
 
 
 def _timed(

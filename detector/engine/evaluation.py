@@ -367,17 +367,20 @@ class RuleRun:
         return condition(expression, candidate.variables, place, candidate.never, self.counters)
 
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
-        subject = candidate.subject
-        identifier = episode_id(self._identity.holder, self.rule.name, subject.text, now)
-        episode = Episode(identifier, subject, onset, now, {}, None, statistics=Statistics.of(self.rule, now))
-        candidate = self._measured(now, episode, candidate)
-        episode.values = snapshot(self.rule, candidate)
-        episode.variables = candidate.variables if self.rule.has_actions else None
+        subject, rule = candidate.subject, self.rule
+        identifier = episode_id(self._identity.holder, rule.name, subject.text, now)
+        episode = Episode(identifier, subject, onset, now, {}, None)
+        if rule.derived:
+            episode.statistics = Statistics.of(rule, now)
+            candidate = self._measured(now, episode, candidate)
+        episode.values = snapshot(rule, candidate)
+        episode.variables = candidate.variables if rule.has_actions else None
         self._open[subject] = episode
         self.counters.started += 1
-        self._render(episode)
-        self._note_demands(now, episode, {})
-        return episode.started(self.rule, self._identity)
+        if rule.deploys:
+            self._render(episode)
+            self._note_demands(now, episode, {})
+        return episode.started(rule, self._identity)
 
     def _ended(
         self, now: int, episode: Episode, reason: Reason, values: Mapping[str, Any], variables: Mapping[str, Any]

@@ -66,6 +66,8 @@ class RuleGroup:
         self._of = [run for run in runs for _ in run.rule.elements]
         """The rule of each track."""
         self._budgeted = [run for run in runs if run.rule.maximum_per_hour is not None]
+        self._measures = any(signal.episode for run in runs for signal in run.rule.derived)
+        """Whether some rule has statistics of its episodes."""
         self._deploying = [(row, run) for row, run in enumerate(self._of) if run.has_deploys]
         self._plain = [isinstance(run.rule.subject, ClientSubject) and not run.rule.has_actions for run in self._of]
         """Rules of which only signals go into events, and nothing is rendered."""
@@ -95,7 +97,7 @@ class RuleGroup:
         states: list[tuple[int, int, bool, int]] = []
         for change in self._changed(block, codes, looked):
             yield from self._step(block, change, numbers[change.at], states)
-        if isinstance(block, Block) and block.measured:
+        if self._measures and isinstance(block, Block):
             self._measure(block)
         if states:
             rows, at, watched, wakes = zip(*states, strict=True)
@@ -194,12 +196,12 @@ class RuleGroup:
             first = begin
             while first < end:
                 one_by_one = deploys and state.is_open and run.needs_every_tick(subject)
-                ran = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
-                wake, happened_at = ran.wake, ran.at
-                if ran.what is not None:
-                    self._measure_until(block, row, at, subject, happened_at)
+                happened_at, what, wake = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
+                if what is not None:
+                    if self._measures:
+                        self._measure_until(block, row, at, subject, happened_at)
                     candidate = self._candidate(block, track, subject, at * count + happened_at)
-                    event = run.happened(ticks[happened_at], ran.what, candidate)
+                    event = run.happened(ticks[happened_at], what, candidate)
                     if event is not None:
                         happened.append(Happened(ticks[happened_at], self._orders[row], event))
                     happened_at += 1
@@ -215,8 +217,10 @@ class RuleGroup:
 
     def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
         if not isinstance(block, Block):
-            return Candidate(subject, block.variables(track, point), in_scope=True, near=True)
+            return Candidate(subject, block.variables(track, point), True, True)
         seen = block.values(track, point) if self._plain[track.row] else block.variables(track, point)
+        if not self._measures:
+            return Candidate(subject, seen, True, True)
         return Candidate(subject, seen, in_scope=True, near=True, measured=block.measured_at(track.row, point))
 
     def _measure(self, block: Block) -> None:

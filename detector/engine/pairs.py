@@ -181,20 +181,20 @@ class PairGroup:
         subject = self._subject(key)
         state = run.state(subject) or run.new_state(subject)
         stays = state.is_open and run.needs_every_tick(subject)
-        ran = state.run((tick,), 0, 1, run.timing, code)
-        if ran.what is not None or stays:
+        _, what, wakes = state.run((tick,), 0, 1, run.timing, code)
+        if what is not None or stays:
             measured = self._columns.measured(these, row)
             variables = self._columns.variables(these, row)
             candidate = Candidate(subject, variables, in_scope=True, near=True, measured=measured)
-            if ran.what is None:
+            if what is None:
                 run.stays(tick, candidate)
-            elif (event := run.happened(tick, ran.what, candidate)) is not None:
+            elif (event := run.happened(tick, what, candidate)) is not None:
                 yield Happened(tick, self._order, event)
         if state.idle_at(tick):
             run.drop_state(subject)
             return
         in_progress = state.is_open or state.onset is not None
-        wake = ran.wake if in_progress else state.rests_until
+        wake = wakes if in_progress else state.rests_until
         matters = _ENDS if state.is_open else _STARTS
         kept.append((key, code, NO_WAKE if wake is None else wake, in_progress, matters))
 

@@ -103,11 +103,10 @@ def _stepped(
             continue
         first = begin
         while first < last:
-            ran = state.run(ticks, first, last, run.timing, code)
-            first = ran.at
-            if ran.what is not None:
-                time_of = ticks[ran.at]
-                yield from _event(run, time_of, ran.what, Candidate(subject, values.at(time_of), True, True))
+            first, what, _ = state.run(ticks, first, last, run.timing, code)
+            if what is not None:
+                time_of = ticks[first]
+                yield from _event(run, time_of, what, Candidate(subject, values.at(time_of), True, True))
                 first += 1
 
 

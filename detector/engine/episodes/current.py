@@ -65,14 +65,13 @@ class Episode:
 
         Templates that read statistics of the episode are rendered again.
         """
-        names = {signal.name for signal in rule.derived if signal.episode}
-        reading = [
-            action
-            for action in rule.actions
-            if names and any(names & template.names for template in action.templates.values())
-        ]
-        seen = {**(self.variables or {}), **variables}
-        return self._event(rule, identity, now, reason, values, {each.name: render(each, seen) for each in reading})
+        rendered: dict[str, Rendered] = {}
+        if rule.actions and (names := {signal.name for signal in rule.derived if signal.episode}):
+            seen = {**(self.variables or {}), **variables}
+            for action in rule.actions:
+                if any(names & template.names for template in action.templates.values()):
+                    rendered[action.name] = render(action, seen)
+        return self._event(rule, identity, now, reason, values, rendered)
 
     def kept(self, rule: CompiledRule) -> OpenEpisode:
         """As it is kept beyond a restart."""

@@ -62,6 +62,8 @@ class Ended(NamedTuple):
     reason: Reason
 
 
+_UNTIL, _OUT_OF_SCOPE, _UNKNOWN = map(Ended, (Reason.UNTIL, Reason.OUT_OF_SCOPE, Reason.UNKNOWN))
+
 FALSE, UNSURE, TRUE = 0, 1, 2
 """Whether an episode may start: the lower two bits of an observation that is one byte."""
 UNTIL_UNSURE, UNTIL, OUTSIDE = 4, 8, 12
@@ -73,14 +75,9 @@ NO_WAKE = 2**63 - 1
 """In place of a time to wake: nothing happens before the observation changes. Nanoseconds, beyond all times."""
 
 
-class Ran(NamedTuple):
-    """What became of ticks at which a subject was observed alike."""
-
-    at: int
-    """The tick at which something happened, or after the last one."""
-    what: Started | Ended | None
-    wake: int | None
-    """When something will happen although nothing changes; nanoseconds."""
+Ran = tuple[int, Started | Ended | None, int | None]
+"""What became of ticks at which a subject was observed alike: the tick at which something happened, or after the last
+one; what happened; and when something will happen although nothing changes, in nanoseconds."""
 
 
 @dataclass(slots=True)
@@ -132,46 +129,44 @@ class SubjectState:
             return self._open_run(ticks, first, last, timing, stop)
         if start == FALSE:
             self.onset = self.unknown_since = None
-            return Ran(last, None, None)
+            return last, None, None
         if start == UNSURE:
             if self.onset is None:
-                return Ran(last, None, None)
+                return last, None, None
             if self.unknown_since is None:
                 self.unknown_since = ticks[first]
             due = self.unknown_since + timing.hold + 1
             if ticks[last - 1] < due:
-                return Ran(last, None, due)
+                return last, None, due
             self.onset = self.unknown_since = None
-            return Ran(last, None, None)
+            return last, None, None
         self.unknown_since = None
         if self.onset is None:
             first = bisect_left(ticks, self.rests_until, first, last)
             if first == last:
-                return Ran(last, None, self.rests_until)
+                return last, None, self.rests_until
             self.onset = ticks[first]
         at = bisect_left(ticks, self.onset + timing.hold, first, last)
         if at == last:
-            return Ran(last, None, self.onset + timing.hold)
+            return last, None, self.onset + timing.hold
         onset, self.onset = self.onset, None
         self.is_open = True
-        return Ran(at, Started(onset), None)
+        return at, Started(onset), None
 
     def _open_run(self, ticks: Sequence[int], first: int, last: int, timing: Timing, stop: int) -> Ran:
-        at, reason = first, Reason.UNTIL
         if stop == 0:
             self.unknown_since = None
-            return Ran(last, None, None)
-        if stop == OUTSIDE:
-            reason = Reason.OUT_OF_SCOPE
-        elif stop == UNTIL_UNSURE:
+            return last, None, None
+        at, ended = first, _OUT_OF_SCOPE if stop == OUTSIDE else _UNTIL
+        if stop == UNTIL_UNSURE:
             if self.unknown_since is None:
                 self.unknown_since = ticks[first]
             due = self.unknown_since + timing.unknown_timeout
-            at, reason = bisect_left(ticks, due, first, last), Reason.UNKNOWN
+            at, ended = bisect_left(ticks, due, first, last), _UNKNOWN
             if at == last:
-                return Ran(last, None, due)
+                return last, None, due
         self.end(ticks[at], timing)
-        return Ran(at, Ended(reason), None)
+        return at, ended, None
 
     def step(self, now: int, timing: Timing, seen: Observation) -> Started | Ended | None:
         """Go on to the tick `now`; returns what happened."""

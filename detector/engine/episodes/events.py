@@ -18,7 +18,7 @@ STARTED = "dev.wayside.event.started"
 ENDED = "dev.wayside.event.ended"
 
 
-class Event(msgspec.Struct, frozen=True):
+class Event(msgspec.Struct, frozen=True, gc=False):
     """An episode started, or ended where there is a reason. Times are nanoseconds since the epoch."""
 
     holder: str

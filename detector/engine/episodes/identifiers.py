@@ -12,17 +12,14 @@ _TEN_BITS = 0x3FF
 def identifier(data: bytes) -> str:
     """The first 80 bits of the SHA-256 of the data, in lowercase base32: 16 letters and digits."""
     # base64.b32encode and .lower() take twice as long, and each episode needs an identifier.
-    digest = hashlib.sha256(data).digest()
-    return _base32(int.from_bytes(digest[:5], "big")) + _base32(int.from_bytes(digest[5:10], "big"))
+    digest, pairs = hashlib.sha256(data).digest(), _PAIRS
+    head, tail = int.from_bytes(digest[:5], "big"), int.from_bytes(digest[5:10], "big")
+    return (
+        f"{pairs[head >> 30]}{pairs[head >> 20 & _TEN_BITS]}{pairs[head >> 10 & _TEN_BITS]}{pairs[head & _TEN_BITS]}"
+        f"{pairs[tail >> 30]}{pairs[tail >> 20 & _TEN_BITS]}{pairs[tail >> 10 & _TEN_BITS]}{pairs[tail & _TEN_BITS]}"
+    )
 
 
 def episode_id(holder: str, rule: str, subject: str, start: int) -> str:
     """The identifier of the episode that starts at a time, in nanoseconds since the epoch."""
     return identifier(f"{holder}\0{rule}\0{subject}\0{start}".encode())
-
-
-def _base32(bits: int) -> str:
-    """Eight letters for 40 bits."""
-    return (
-        _PAIRS[bits >> 30] + _PAIRS[bits >> 20 & _TEN_BITS] + _PAIRS[bits >> 10 & _TEN_BITS] + _PAIRS[bits & _TEN_BITS]
-    )

@@ -22,9 +22,10 @@ def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
     """Signals, positions, distance and closing speed, where known; of a fleet its first members and their number."""
     variables = candidate.variables
     values = _of_the_scope(rule, variables)
-    for name in (*(plugin.name for plugin in rule.plugins), *(signal.name for signal in rule.derived)):
-        if name in variables:
-            values[name] = _without_bytes(variables[name])
+    for others in (rule.plugins, rule.derived):
+        for each in others:
+            if each.name in variables:
+                values[each.name] = _without_bytes(variables[each.name])
     return values
 
 

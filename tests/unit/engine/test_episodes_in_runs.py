@@ -68,10 +68,9 @@ def test_a_run_of_ticks_is_the_same_as_each_tick(
         indices = [*block]
         first, end = indices[0], indices[-1] + 1
         while first < end:
-            result = ran.run(ticks, first, end, timing, code)
-            first = result.at
-            if result.what is not None:
-                found.append((ticks[first], result.what))
+            first, what, _ = ran.run(ticks, first, end, timing, code)
+            if what is not None:
+                found.append((ticks[first], what))
                 first += 1
     assert found == expected
     assert what_is_left(ran) == what_is_left(stepped)
@@ -87,10 +86,10 @@ def test_nothing_happens_before_the_wake_of_a_run(
         for _ in range(count):
             state.step(now, timing, observation)
             now += 1
-    result = state.run([now], 0, 1, timing, code_of(last))
-    if result.what is None:
+    _, what, wake = state.run([now], 0, 1, timing, code_of(last))
+    if what is None:
         for tick in range(now + 1, now + 30):
             happened = state.step(tick, timing, last)
-            assert happened is None or (result.wake is not None and tick >= result.wake)
+            assert happened is None or (wake is not None and tick >= wake)
             if happened is not None:
                 break
