@@ -55,7 +55,14 @@ def main() -> int:
         manifest = yaml.safe_load((EXAMPLE / "detector.yaml").read_text())
         manifest["spec"]["zenoh"] = {"mode": "client", "connect": [endpoint]}
         detector.write_text(yaml.safe_dump(manifest))
-        run = [sys.executable, "-m", "detector.cli", "run", f"--detector={detector}", f"--rules={EXAMPLE}/rules.yaml"]
+        run = [
+            sys.executable,
+            "-m",
+            "detector.commands.cli",
+            "run",
+            f"--detector={detector}",
+            f"--rules={EXAMPLE}/rules.yaml",
+        ]
         run += [f"--output={folder}/output"]
         for _ in range(options.rounds):
             ours.append(_until_subscribed(run, publisher))

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from benchmarks.intake_rate import MARK
-from detector import cli
+from detector.commands import cli
 from detector.engine.blocks import Blocks
 from detector.engine.buffering.ingest import Ingest
 from detector.engine.engine import Engine

@@ -110,7 +110,7 @@ def receiver(rules: Sequence[dict[str, Any]] | None, *, answers: bool = False) -
             document["spec"]["zenoh"] = {"mode": "peer", "listen": [endpoint], "scouting": False}
             (folder / "detector.yaml").write_text(yaml.safe_dump(document))
             (folder / "rules.yaml").write_text(yaml.safe_dump_all(rules))
-            command = [sys.executable, "-m", "detector.cli", "run", f"--detector={folder / 'detector.yaml'}"]
+            command = [sys.executable, "-m", "detector.commands.cli", "run", f"--detector={folder / 'detector.yaml'}"]
             command += [f"--rules={folder / 'rules.yaml'}", f"--output={folder / 'out'}"]
         process = subprocess.Popen(command, stdout=log, stderr=log)
         try:

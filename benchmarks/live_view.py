@@ -77,7 +77,16 @@ def running(vehicles: int) -> Iterator[tuple[int, int, Path]]:
         document = yaml.safe_load((folder / "detector.yaml").read_text())
         document["spec"]["zenoh"] = {"mode": "peer", "listen": [endpoint], "scouting": False}
         (folder / "detector.yaml").write_text(yaml.safe_dump(document))
-        command = [sys.executable, "-m", "detector.cli", "run", "--detector", "detector.yaml", "--rules", "rules.yaml"]
+        command = [
+            sys.executable,
+            "-m",
+            "detector.commands.cli",
+            "run",
+            "--detector",
+            "detector.yaml",
+            "--rules",
+            "rules.yaml",
+        ]
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen([*command, "--foxglove", str(port)], cwd=folder, stdout=log, stderr=log)
         driving = threading.Thread(target=drive, args=(endpoint, vehicles, over))

@@ -88,7 +88,7 @@ def on_dask(folder: Path, output: str) -> float:
 def command(folder: Path, output: str, options: list[str], drives: str = "drives") -> list[str]:
     rules = [] if "--rules" in options else ["--rules", "rules.yaml"]
     given = ["mine", drives, "--detector", "detector.yaml", *rules, "--output", output, *options]
-    return [sys.executable, "-m", "detector.cli", *given]
+    return [sys.executable, "-m", "detector.commands.cli", *given]
 
 
 def timed(folder: Path, output: str, options: list[str], drives: str = "drives") -> float:

@@ -55,7 +55,7 @@ def main() -> int:
 
 def replayed(folder: Path, output: str, more: list[str]) -> float:
     """The CPU time of one replay, seconds."""
-    command = [sys.executable, "-m", "detector.cli", "replay", "drive.jsonl", "--detector", "detector.yaml"]
+    command = [sys.executable, "-m", "detector.commands.cli", "replay", "drive.jsonl", "--detector", "detector.yaml"]
     command += ["--rules", "rules.yaml", "--output", output, *more]
     before = os.times()
     subprocess.run(command, cwd=folder, check=True, stderr=subprocess.DEVNULL)

@@ -92,7 +92,16 @@ class Detector:
         self.files = ["--detector", "detector.yaml", "--rules", "rules.yaml", "--rules", str(EXAMPLE / "rules.yaml")]
         recording = ["--record-intake", "intake.mcap"] if record else []
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "detector.cli", "run", *self.files, "--metrics-port", str(self.port), *recording],
+            [
+                sys.executable,
+                "-m",
+                "detector.commands.cli",
+                "run",
+                *self.files,
+                "--metrics-port",
+                str(self.port),
+                *recording,
+            ],
             cwd=folder,
             stderr=(folder / "log").open("w"),
             env=environment(),

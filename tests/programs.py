@@ -20,7 +20,10 @@ from pathlib import Path
 from typing import Literal
 
 Name = Literal["detector", "application-manager"]
-PROGRAMS: Mapping[str, str] = {"detector": "detector.program", "application-manager": "application_manager.program"}
+PROGRAMS: Mapping[str, str] = {
+    "detector": "detector.commands.program",
+    "application-manager": "application_manager.program",
+}
 """The module of each program; its `main` reads `sys.argv`."""
 BIN = Path(sys.executable).parent
 PATIENCE = 120.0  # s for a command that ends by itself

@@ -135,7 +135,7 @@ QUIET: tuple[str, ...] = ()
 
 
 def look_at_replay(verdict: Verdict, folder: Path, environment: Mapping[str, str]) -> None:
-    command = [sys.executable, "-m", "detector.cli", "replay", "intake.mcap", "--output", "replayed"]
+    command = [sys.executable, "-m", "detector.commands.cli", "replay", "intake.mcap", "--output", "replayed"]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     verdict.equal("the replay's exit code", done.returncode, 0)
     live, replayed = (folder / each / "events.jsonl" for each in ("out", "replayed"))

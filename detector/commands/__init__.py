@@ -1,1 +1,1 @@
-"""What the commands run."""
+"""The command line, and what its commands run."""

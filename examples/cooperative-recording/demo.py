@@ -99,7 +99,7 @@ def _vehicles() -> Iterator[subprocess.Popen[bytes]]:
 @contextmanager
 def _detector(output: Path) -> Iterator[subprocess.Popen[bytes]]:
     """`detector run` on the example's files; ended in good order."""
-    command = ["-m", "detector.cli", "run", "--detector", "detector.yaml", "--rules", "rules.yaml"]
+    command = ["-m", "detector.commands.cli", "run", "--detector", "detector.yaml", "--rules", "rules.yaml"]
     command += ["--record-intake", str(output.resolve() / INTAKE)]
     with (output / "detector.log").open("wb") as log:
         process = subprocess.Popen(
@@ -114,7 +114,7 @@ def _detector(output: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 def _report(output: Path) -> int:
     """Replay what the detector took in, for a report. The replay gives the same events and tasks."""
-    command = ["-m", "detector.cli", "replay", INTAKE, "--output", ".", "--results", "report"]
+    command = ["-m", "detector.commands.cli", "replay", INTAKE, "--output", ".", "--results", "report"]
     with (output / "detector.log").open("ab") as log:
         return subprocess.run([sys.executable, *command], cwd=output, stderr=log, stdout=log, check=False).returncode
 

@@ -231,7 +231,7 @@ def test_the_pods_of_the_mining_job_make_one_dataset(helm: Helm, tmp_path: Path)
         for name, value in {**variables, "$(JOB_COMPLETION_INDEX)": str(index)}.items():
             arguments = [each.replace(name, value, 1) for each in arguments]
         assert arguments.pop(0) == "detector"
-        subprocess.run([sys.executable, "-m", "detector.cli", *arguments], check=True)
+        subprocess.run([sys.executable, "-m", "detector.commands.cli", *arguments], check=True)
         assert (tmp_path / "claim" / "dataset" / "report.html").exists() is (index == 1)
     with pytest.raises(HelmError, match="mining needs detector, rules, recordings and claim"):
         helm.rendered({"mining": {"enabled": True}})

@@ -131,7 +131,7 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
 
     replayed = tmp_path / "replayed"
     subprocess.run(
-        [sys.executable, "-m", "detector.cli", "replay", str(intake), "--output", str(replayed)],
+        [sys.executable, "-m", "detector.commands.cli", "replay", str(intake), "--output", str(replayed)],
         check=True,
         timeout=PATIENCE,
     )
@@ -231,7 +231,7 @@ def test_with_clock_data_a_recording_gives_the_same_events_played_live_and_repla
     wait_until(lambda: len(events_of(live)), lambda count: count >= expected, what="all events are there")
     assert detector.terminate() == 0
     subprocess.run(
-        [sys.executable, "-m", "detector.cli", "replay", str(recording), *files, "--output", str(replayed)],
+        [sys.executable, "-m", "detector.commands.cli", "replay", str(recording), *files, "--output", str(replayed)],
         check=True,
         timeout=PATIENCE,
     )

@@ -27,7 +27,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def check(path: Path | None) -> subprocess.CompletedProcess[str]:
     extra = [] if path is None else [str(path)]
     return subprocess.run(
-        [sys.executable, "-m", "detector.cli", "check", str(EXAMPLE / "detector.yaml"), str(EXAMPLE / "rules.yaml")],
+        [
+            sys.executable,
+            "-m",
+            "detector.commands.cli",
+            "check",
+            str(EXAMPLE / "detector.yaml"),
+            str(EXAMPLE / "rules.yaml"),
+        ],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([*extra, *filter(None, sys.path)])},
         capture_output=True,
         text=True,

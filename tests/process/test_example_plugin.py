@@ -54,7 +54,7 @@ def test_the_commands_find_it_and_give_the_same_events(
     site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = os.pathsep.join([str(site), *filter(None, sys.path)])
-    command = [sys.executable, "-m", "detector.cli"]
+    command = [sys.executable, "-m", "detector.commands.cli"]
 
     def detector(*arguments: object) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

@@ -21,7 +21,7 @@ ALWAYS = a_rule("r", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}
 FAULTS = """
 import asyncio, os, sys, threading, time
 import detector.live.answers
-from detector import cli
+from detector.commands import cli
 from detector.engine.engine import Engine
 from detector.live.running import Running
 

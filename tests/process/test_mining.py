@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 import pytest
 from distributed import LocalCluster
 
-from detector.cli import app
+from detector.commands.cli import app
 from detector.commands.replay import replay_files
 from detector.mining.dask import DaskWorkers
 from detector.mining.workers import Call, Lost, Pool
@@ -48,7 +48,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def command(folder: Path, output: str, *options: str, rules: str = "rules.yaml", drives: str = "drives") -> list[str]:
     given = ["mine", drives, "--detector", "detector.yaml", "--rules", rules, "--output", output]
-    return [sys.executable, "-m", "detector.cli", *given, *options]
+    return [sys.executable, "-m", "detector.commands.cli", *given, *options]
 
 
 def mine(folder: Path, output: str, *options: str, **more: Any) -> str:

@@ -27,7 +27,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
 
 
 def detector(*arguments: str | Path) -> list[str | Path]:
-    return [sys.executable, "-m", "detector.cli", *arguments]
+    return [sys.executable, "-m", "detector.commands.cli", *arguments]
 
 
 def test_what_the_plugin_asks_for_is_checked_with_line_and_column(

@@ -9,7 +9,7 @@ import yaml
 import zenoh
 from typer.testing import CliRunner
 
-from detector.cli import app
+from detector.commands.cli import app
 from tests.networks import session
 from tests.ros_messages import cdr, odometry
 from wayside.api import Detector

@@ -21,7 +21,7 @@ from detector.actions.trigger.requests import (
     read_reports,
     write_request,
 )
-from detector.cli import app
+from detector.commands.cli import app
 from detector.streams.answering import status_key
 from detector.streams.session import open_session
 from tests.driving import a_rule

@@ -148,7 +148,10 @@ def _project_layer(wheel: Path, work: Path, folder: Path, base: Layer) -> Layer:
     )
     shutil.rmtree(target / "bin")
     sources = []
-    for name, module in (("detector", "detector.program"), ("application-manager", "application_manager.program")):
+    for name, module in (
+        ("detector", "detector.commands.program"),
+        ("application-manager", "application_manager.program"),
+    ):
         stub = work / name
         stub.write_text(STUB.format(module=module))
         stub.chmod(0o755)

@@ -10,7 +10,7 @@ import yaml
 from jsonschema import Draft7Validator
 from typer.testing import CliRunner
 
-from detector.cli import app
+from detector.commands.cli import app
 from tests.guides import ROOT
 
 FILES = sorted((ROOT / "examples").glob("*/*.yaml"))

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from detector.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
 from detector.catalog.markdown import markdown_view
 from detector.catalog.page import page
-from detector.cli import app
 from detector.cluster.errors import NoClusterError
+from detector.commands.cli import app
 from wayside import commandline
 from wayside.api.classification import Classification
 from wayside.api.documents import DocumentError

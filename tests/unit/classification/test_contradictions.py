@@ -10,7 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.cli import app
+from detector.commands.cli import app
 from tests.driving import POSITION, a_detector, a_rule, a_stream
 from tests.guides import guide
 from wayside import commandline

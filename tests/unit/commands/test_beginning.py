@@ -52,7 +52,7 @@ def loaded(code: str, *words: str) -> set[str]:
     return {name.partition(".")[0] for name in done.stdout.splitlines()[-1].split()}
 
 
-@pytest.mark.parametrize("package", ["detector", "application_manager"])
+@pytest.mark.parametrize("package", ["detector.commands", "application_manager"])
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"]], ids=" ".join)
 def test_help_loads_nothing_that_only_a_running_command_needs(package: str, words: list[str]) -> None:
     of_typer = {"pydantic", "rich"}  # it lays out the help and checks options with them
@@ -62,7 +62,7 @@ def test_help_loads_nothing_that_only_a_running_command_needs(package: str, word
 @pytest.mark.parametrize(
     ("package", "words", "needs_not"),
     [
-        pytest.param("detector", ["check", *FILES], HEAVY | {"asyncio"}, id="detector check"),
+        pytest.param("detector.commands", ["check", *FILES], HEAVY | {"asyncio"}, id="detector check"),
         pytest.param(
             "application_manager",
             ["check", *FILES],

@@ -6,12 +6,12 @@ import pytest
 import typer
 
 import application_manager.cli
-import detector.cli
+import detector.commands.cli
 from wayside import commandline
 
 APPS = [
     pytest.param(application_manager.cli.app, ["render", "--tasks", "x"], "--templates", id="application-manager"),
-    pytest.param(detector.cli.app, ["replay", "x"], "--output", id="detector"),
+    pytest.param(detector.commands.cli.app, ["replay", "x"], "--output", id="detector"),
 ]
 
 

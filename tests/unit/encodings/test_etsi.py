@@ -194,5 +194,5 @@ def test_without_the_extra_the_error_names_the_stream_and_what_to_install(monkey
 
 def test_the_packages_of_definitions_are_imported_only_where_a_stream_needs_them() -> None:
     heavy = "[name for name in sys.modules if name.startswith(('pycrate', 'asn1tools'))]"
-    code = f"import sys, detector.cli, detector.assembly, detector.live.service; print({heavy})"
+    code = f"import sys, detector.commands.cli, detector.assembly, detector.live.service; print({heavy})"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

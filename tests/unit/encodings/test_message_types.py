@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from detector.assembly import DetectorError, inlets
 from detector.checking import check_documents
-from detector.cli import app
+from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
 from detector.replay.intake_writer import IntakeWriter

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from detector import cli
+from detector.commands import cli
 from examples.running.__main__ import main
 from examples.running.cases import Ran, folder_of, run, scenario_of, use_cases
 from examples.running.demanding import Running, unlike

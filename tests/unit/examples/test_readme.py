@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from application_manager import cli as manager
-from detector import cli as detector
+from detector.commands import cli as detector
 from tests.guides import ROOT
 
 APPS = {".venv/bin/detector": detector.app, ".venv/bin/application-manager": manager.app}

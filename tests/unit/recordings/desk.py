@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 
-from detector.cli import main
+from detector.commands.cli import main
 from tests.driving import a_detector, a_rule, a_stream, at
 from tests.unit.recordings.test_recordings import write_lines
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector import cli
+from detector.commands import cli
 from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.replay.comparing import compare

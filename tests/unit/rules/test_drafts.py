@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from detector.cli import app
-from detector.drafts import drafts
+from detector.commands.cli import app
+from detector.commands.drafts import drafts
 from tests.driving import START, a_detector
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from detector.cli import main
+from detector.commands.cli import main
 from detector.engine.samples.sample import Arrival
 from detector.losses import Losses
 from detector.replay.replaying import Outcome, replay_arrivals

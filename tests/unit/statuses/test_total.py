@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from detector.cli import app
+from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
 from detector.status.model import Drops, RuleState, Status, read_status, to_json
 from detector.status.total import Total, total

@@ -13,7 +13,7 @@ import yaml
 from mcap.writer import Writer
 from typer.testing import CliRunner
 
-from detector.cli import app
+from detector.commands.cli import app
 from detector.topics.proposal import proposals
 from detector.topics.survey import Topic, encoding_of, shape_of
 from tests.ros_messages import cdr, odometry

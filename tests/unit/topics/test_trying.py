@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from detector.cli import app
+from detector.commands.cli import app
 from tests.unit.topics.test_topics import drive, two_cars
 
 

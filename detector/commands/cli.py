@@ -288,7 +288,7 @@ def new(
 ) -> None:
     """Print a rule to begin with, made from a use case."""
     with importing():
-        from detector.drafts import draft, drafts
+        from detector.commands.drafts import draft, drafts
 
     if case is not None:
         typer.echo(draft(case, stream, name), nl=False)

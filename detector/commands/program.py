@@ -9,6 +9,6 @@ def main() -> None:
     """Run the command line."""
     end_on_sigterm()
     with importing():
-        from detector.cli import main as run  # noqa: PLC0415  that is the point
+        from detector.commands.cli import main as run  # noqa: PLC0415  that is the point
 
     run()
