@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from detector.actions.base import Action
 from detector.actions.secrets import secret_problems
-from detector.entrypoints import Offers, PluginError
+from detector.plugins.entrypoints import Offers, PluginError
 from wayside.api import Detector, EventRule
 from wayside.api.actions import action as api
 from wayside.rules import RuleProblem

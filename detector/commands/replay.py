@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from detector.actions.deploy.file_store import write_tasks_yaml
+from detector.actions.tracing import episode_traces
 from detector.assembly import lasting_problems
 from detector.engine.episodes.demands import from_task
 from detector.engine.episodes.events import Event
@@ -34,7 +35,6 @@ from detector.rules.files import load_rules
 from detector.rules.selection import select
 from detector.topics.doubts import topic_doubts
 from detector.topics.survey import survey
-from detector.tracing import episode_traces
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.commandline import refuse

@@ -14,13 +14,13 @@ from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
 from detector.actions.deploy.lease import HolderLease
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.stores import TaskStore
+from detector.actions.tracing import EpisodeTraces
 from detector.cluster.connection import connect
 from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
 from detector.live.state import state_file
 from detector.rules.kubernetes import ClusterRules
 from detector.status.server import PagesAddress
-from detector.tracing import EpisodeTraces
 
 Result = TypeVar("Result")
 _OTHERWISE = "run without a cluster, with --detector FILE and --rules FILE"

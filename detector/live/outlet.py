@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from detector.actions.base import ActionError, Surroundings
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.host import ActionHost
+from detector.actions.tracing import EpisodeTraces
 from detector.engine.consequences.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
@@ -16,7 +17,6 @@ from detector.live.event_log import EventLog
 from detector.live.state import StateFile
 from detector.requested import with_requested
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
-from detector.tracing import EpisodeTraces
 from wayside.api import EventRule
 
 _log = logging.getLogger(__name__)

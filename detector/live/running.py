@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.outcomes import Outcomes
+from detector.actions.tracing import EpisodeTraces
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.liveliness import LIVELINESS
@@ -34,7 +35,6 @@ from detector.status.server import PagesAddress, StatusServer
 from detector.streams.answering import Answering
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
-from detector.tracing import EpisodeTraces
 from wayside.api import Detector
 from wayside.api.source import ZENOH
 from wayside.api.stream import Stream

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from importlib.metadata import EntryPoint
 from typing import Any
 
-from detector.entrypoints import Offers, PluginError
 from detector.plugins.base import Plugin, PluginParameters
+from detector.plugins.entrypoints import Offers, PluginError
 from wayside.api import Detector, EventRule
 from wayside.rules import RuleProblem
 

@@ -21,8 +21,8 @@ from detector.engine.queries.geometry import Pose
 from detector.engine.queries.poses import PoseError
 from detector.engine.queries.queries import DecodedSample, QueryError
 from detector.engine.queries.transforms import TransformError
-from detector.entrypoints import PluginError
 from detector.plugins.base import Subject
+from detector.plugins.entrypoints import PluginError
 from detector.plugins.instances import Instances, failure_text
 from detector.plugins.wire import ClosedError, Wire
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from detector.entrypoints import Offers, PluginError
+from detector.plugins.entrypoints import Offers, PluginError
 from detector.sources.base import Source
 from wayside.api import Detector
 from wayside.api.source import DataSource

@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from detector import entrypoints
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
 from detector.engine.samples.intake import Intake
 from detector.live.restoring import Restored
 from detector.live.running import Running
+from detector.plugins import entrypoints
 from detector.rules.selection import RuleSet
 from detector.sources import Feed, Source
 from detector.sources.registry import OFFERS, source_problems

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from detector.actions.tracing import episode_traces
 from detector.engine.consequences.consequences import Begun, Completed, Run
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.rendering import Rendered
-from detector.tracing import episode_traces
 from tests.otlp import Receiver
 from tests.ports import free_ports
 from wayside.tracecontext import Span, TraceContext, episode_context, parse_traceparent

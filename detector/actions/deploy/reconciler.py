@@ -28,9 +28,9 @@ from detector.actions.deploy.stores import (
     TaskRefusedError,
     TaskStore,
 )
+from detector.actions.tracing import EpisodeTraces
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.plain import plain
-from detector.tracing import EpisodeTraces
 from wayside.backoff import Backoff
 
 _log = logging.getLogger(__name__)

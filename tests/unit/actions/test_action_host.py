@@ -120,7 +120,7 @@ KINDS = {
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     entries = [EntryPoint(name, f"{__name__}:{kind.__name__}", "wayside.actions") for name, kind in KINDS.items()]
-    monkeypatch.setattr("detector.entrypoints.entry_points", lambda group: entries)
+    monkeypatch.setattr("detector.plugins.entrypoints.entry_points", lambda group: entries)
     Recorded.told.clear()
     SLOW.clear()
     before = threading.enumerate()

@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from detector import entrypoints
 from detector.actions import Action
 from detector.actions.registry import OFFERS, action_problems, prepare_action
 from detector.assembly import RuleIndex, inlets
 from detector.checking import check_documents
+from detector.plugins import entrypoints
 from tests.driving import a_detector, a_rule
 from wayside.api.documents import load_documents
 

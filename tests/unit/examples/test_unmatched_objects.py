@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.samples.sample import Arrival
-from detector.entrypoints import PluginError
 from detector.plugins.assignment import assigned
+from detector.plugins.entrypoints import PluginError
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import prepare_plugin
 from detector.plugins.tracking import Tracks
