@@ -21,7 +21,7 @@ from detector.engine.engine import Engine
 from detector.engine.knowledge import Knowledge
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
-from detector.losses import Losses
+from detector.findings.losses import Losses
 from detector.streams.inlets import Inlet
 
 spent: Counter[str] = Counter()

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from detector.assembly import Inlets, inlets, make_engine
+from detector.assembly.memory import tune_garbage_collection
 from detector.engine.samples.sample import Arrival
-from detector.memory import tune_garbage_collection
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.rules import compile_rule
 

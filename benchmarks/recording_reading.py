@@ -20,7 +20,7 @@ from mcap.reader import SeekingReader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from detector.memory import tune_garbage_collection
+from detector.assembly.memory import tune_garbage_collection
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from wayside.api.stream import Encoding, Stream

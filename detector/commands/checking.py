@@ -7,8 +7,8 @@ from pathlib import Path
 
 import typer
 
-from detector.checking import findings, summary
-from detector.findings import CHECKS, UNREADABLE_RECORDING
+from detector.assembly.checking import findings, summary
+from detector.findings.checks import CHECKS, UNREADABLE_RECORDING
 from wayside.api.documents import DocumentError, load_documents
 from wayside.findings import UNREADABLE_FILE, ignorable, listed
 

@@ -212,8 +212,8 @@ def replay(
 ) -> None:
     """Run the same engine over recordings. An intake file brings its Detector and rules along."""
     with importing():
+        from detector.assembly.memory import tune_garbage_collection
         from detector.commands.replay import replay_files
-        from detector.memory import tune_garbage_collection
 
     tune_garbage_collection()  # otherwise a third of the time of reading is spent on searching among samples
     replay_files(

@@ -16,7 +16,7 @@ from detector.assembly import lasting_problems
 from detector.engine.episodes.demands import from_task
 from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
-from detector.findings import CUT_RECORDING
+from detector.findings.checks import CUT_RECORDING
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.clips import Clips

@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 from detector.actions.base import Surroundings
 from detector.assembly import RuleIndex, inlets
+from detector.assembly.memory import Sweeper
 from detector.engine.consequences.consequences import Consequence
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, to_task
@@ -26,10 +27,9 @@ from detector.engine.observing import Observer
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.timeline import ORDER
+from detector.findings.losses import Losses
 from detector.live.overload import LONG, Overload
 from detector.live.restoring import Restored
-from detector.losses import Losses
-from detector.memory import Sweeper
 from detector.plugins.outages import Outages
 from detector.rules.selection import RuleSet
 from detector.status.keeping import StatusKeeper

@@ -18,13 +18,13 @@ from detector.actions.tracing import EpisodeTraces
 from detector.assembly import DetectorError, Inlets, inlets, make_engine
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.liveliness import LIVELINESS
+from detector.findings.losses import Loss
 from detector.live.answers import Answers
 from detector.live.evaluator import Evaluator, Onlooker
 from detector.live.event_log import EventLog
 from detector.live.outlet import LiveOutlet
 from detector.live.restoring import Restored
 from detector.live.state import StateFile
-from detector.losses import Loss
 from detector.plugins.processes import ProcessHost
 from detector.requested import Requested
 from detector.rules.selection import RuleSet

@@ -17,10 +17,10 @@ from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.tracing import EpisodeTraces, episode_traces
 from detector.assembly import detector_problems
+from detector.assembly.memory import tune_garbage_collection
 from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
 from detector.live.state import state_file
-from detector.memory import tune_garbage_collection
 from detector.rules.files import load_rules
 from detector.rules.following import follow_files, hangups
 from detector.status.server import PagesAddress

@@ -14,7 +14,7 @@ import msgspec
 
 from detector.actions.record.description import DESCRIPTION
 from detector.actions.record.destination import finished
-from detector.memory import tune_garbage_collection
+from detector.assembly.memory import tune_garbage_collection
 from detector.mining.sources import Source, fetched
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost

@@ -22,7 +22,7 @@ from detector.engine.observing import Observer
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
-from detector.losses import Losses
+from detector.findings.losses import Losses
 from detector.replay.clips import Clips, Recorders
 from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control

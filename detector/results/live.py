@@ -28,7 +28,7 @@ from detector.engine.columns.verdicts import Codes
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.scoping.scopes import Evaluated
-from detector.losses import Loss
+from detector.findings.losses import Loss
 from detector.results.channels import (
     EPISODE,
     EPISODES,

@@ -21,7 +21,7 @@ from detector.engine.engine import Engine
 from detector.engine.evaluation import RuleRun
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.schedule import Schedule
-from detector.losses import Losses
+from detector.findings.losses import Losses
 from detector.status.explaining import Watching
 from detector.status.model import (
     ClientStatus,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, inlets
-from detector.findings import FIELD_NOT_RECORDED, UNMATCHED_STREAM
+from detector.findings.checks import FIELD_NOT_RECORDED, UNMATCHED_STREAM
 from detector.rules.selection import select
 from detector.topics.proposal import Proposal
 from detector.topics.shape import Shape

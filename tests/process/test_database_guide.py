@@ -13,7 +13,7 @@ import yaml
 from detector.actions import Surroundings
 from detector.actions.host import ActionHost
 from detector.assembly import inlets
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from tests.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
 from tests.mongodb.way import Way
 from tests.process.database_desk import wait_until

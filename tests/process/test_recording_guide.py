@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.status.model import read_status
 from detector.streams.querying import query_detectors
 from tests.process.running import PATIENCE, Process

@@ -15,9 +15,9 @@ from msgspec.structs import replace
 from rosbags.rosbag2 import Writer as BagWriter
 
 from detector.assembly import inlets, make_engine
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.engine.samples.intake import Intake
-from detector.losses import Losses
+from detector.findings.losses import Losses
 from detector.replay.recordings import open_recordings
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import Router

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from tests.driving import a_detector, a_rule
 from tests.process.ros2_services import HASHES, Node
 from tests.process.running import Process

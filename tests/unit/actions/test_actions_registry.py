@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from detector.actions import Action
 from detector.actions.registry import OFFERS, action_problems, prepare_action
 from detector.assembly import RuleIndex, inlets
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.plugins import entrypoints
 from tests.driving import a_detector, a_rule
 from wayside.api.documents import load_documents

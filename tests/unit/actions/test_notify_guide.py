@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from detector.actions.notify import Notify
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from tests.driving import a_detector
 from tests.guides import guide, yaml_blocks
 from wayside.api.actions.notify import Notify as Parameters

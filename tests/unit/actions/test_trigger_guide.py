@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from detector.actions.trigger.services import KNOWN
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from tests.guides import guide, yaml_blocks
 from wayside.api.documents import load_documents
 

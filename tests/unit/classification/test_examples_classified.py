@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from detector.assembly.checking import findings
 from detector.catalog.catalog import catalog
 from detector.catalog.document import json_view
 from detector.catalog.files import read_files
-from detector.checking import findings
 from tests.guides import ROOT
 from wayside.api.documents import load_documents
 

@@ -6,7 +6,7 @@ import re
 from fractions import Fraction
 from pathlib import Path
 
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.streams.codecs.etsi.messages import KINDS, PREFIX
 from detector.streams.codecs.etsi.quantities import UNITS
 from tests.guides import guide, yaml_blocks

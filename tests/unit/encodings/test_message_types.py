@@ -20,7 +20,7 @@ from rosbags.typesys.store import Typestore
 from typer.testing import CliRunner
 
 from detector.assembly import DetectorError, inlets
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from detector.assembly import RuleIndex, inlets
-from detector.checking import findings
+from detector.assembly.checking import findings
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 
 from application_manager.core.findings import checks as manager_checks
-from detector import findings as detector_checks
+from detector.findings import checks as detector_checks
 from tests.guides import ROOT, guide
 
 TROUBLES = guide("troubleshooting")

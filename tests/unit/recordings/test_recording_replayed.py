@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.replay.errors import RecordingError
 from detector.replay.recordings import types_of
 from detector.testing import run

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from detector.findings import CHECKS
+from detector.findings.checks import CHECKS
 from tests.driving import START, a_detector, a_rule, a_stream, at
 from tests.unit.recordings.desk import FAST, Desk
 from tests.unit.recordings.test_recordings import write_lines

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from tests.driving import POSITION, Drive, a_deploy, a_detector, a_rule, arrival, compiled
 from wayside.api import Detector, EventRule
 from wayside.api.documents import load_documents

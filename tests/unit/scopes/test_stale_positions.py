@@ -14,7 +14,7 @@ import pytest
 
 from detector.commands.cli import main
 from detector.engine.samples.sample import Arrival
-from detector.losses import Losses
+from detector.findings.losses import Losses
 from detector.replay.replaying import Outcome, replay_arrivals
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 

@@ -14,7 +14,7 @@ from onnx import helper
 from rosbags.typesys import Stores, get_typestore
 
 from detector.assembly import RuleIndex, inlets, make_engine
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.engine.samples.sample import Arrival
 from tests import onnx_models
 from tests.driving import SPEED, Drive, a_detector, a_rule, a_stream, arrival, at

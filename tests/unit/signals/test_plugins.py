@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from detector.checking import check_documents
+from detector.assembly.checking import check_documents
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import OFFERS
 from detector.plugins.values import plain

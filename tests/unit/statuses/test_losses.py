@@ -7,7 +7,7 @@ from itertools import count
 import pytest
 
 from detector.engine.samples.intake import Intake
-from detector.losses import Losses
+from detector.findings.losses import Losses
 from tests.driving import POSITION, Drive, a_detector, a_rule, arrival
 
 PAIRS = a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="distance < 10")

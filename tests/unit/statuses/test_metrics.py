@@ -88,7 +88,7 @@ def test_a_port_that_is_taken_is_told_with_the_option(server: StatusServer) -> N
 
 def test_the_documentation_names_every_metric_and_every_cause() -> None:
     text = guide("operations")
-    causes = re.findall(r'cause="([a-z_]+)"', Path("detector/losses.py").read_text())
+    causes = re.findall(r'cause="([a-z_]+)"', Path("detector/findings/losses.py").read_text())
     names = [f"{name}_total" if kind is CounterMetricFamily else name for name, kind, *_ in (*DETECTOR, *STREAM, *RULE)]
     before = [cause.name.lower() for cause in Cause]
     missing = [each for each in (*names, *causes, *before, "event_unpublished") if f"`{each}`" not in text]

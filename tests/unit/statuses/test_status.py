@@ -14,8 +14,8 @@ from detector.assembly import Refusal
 from detector.commands.inquiry import inquire
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
+from detector.findings.losses import Losses
 from detector.live.evaluator import Evaluator
-from detector.losses import Losses
 from detector.status.explaining import Watching
 from detector.status.keeping import StatusKeeper
 from detector.status.model import CertificateStatus, Explanation, RuleState, Status, read_status, to_json

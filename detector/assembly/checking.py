@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from detector.assembly import DetectorError, Inlets, inlets, offer_problems
-from detector.findings import (
+from detector.findings.checks import (
     INVALID_RULE,
     MISSING_DETECTOR,
     RULE_NOT_SELECTED,

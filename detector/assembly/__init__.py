@@ -6,13 +6,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from detector.actions.registry import action_problems
+from detector.assembly.maps import known_places
 from detector.engine.buffering.naming import CLIENT_NAME
 from detector.engine.engine import Engine, KeyReader
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.engine.samples.sample import Decoder
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
-from detector.maps import known_places
 from detector.models.binding import bind_models
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import plugin_problems

@@ -16,7 +16,7 @@ from detector.engine.counters import RuleCounters
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
 from detector.engine.timing.data import DataTimeline
-from detector.findings import (
+from detector.findings.checks import (
     DIVERGING_STAMPS,
     OLD_SAMPLES,
     STALE_BETWEEN_SAMPLES,

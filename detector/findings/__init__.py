@@ -1,0 +1,1 @@
+"""What a Detector finds wrong: the findings of `check`, and what is lost while it runs."""
