@@ -18,7 +18,7 @@ from detector.replay.gathering import intake_file_of, recordings_of
 from detector.replay.intake_file import read_intake
 from detector.replay.playing import play
 from detector.replay.replaying import replay_intake
-from detector.rules.files import load_rules
+from detector.resources.files import load_rules
 
 __all__ = ["Event", "RefusedError", "run"]
 

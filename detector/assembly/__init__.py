@@ -13,7 +13,7 @@ from detector.engine.samples.liveliness import LIVELINESS
 from detector.engine.samples.sample import Decoder
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
-from detector.models.binding import bind_models
+from detector.onnx.binding import bind_models
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import plugin_problems
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for

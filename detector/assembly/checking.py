@@ -14,7 +14,7 @@ from detector.findings.checks import (
     STREAM_WITHOUT_STAMPS,
     UNKNOWN_RULE,
 )
-from detector.models.binding import bind_models
+from detector.onnx.binding import bind_models
 from detector.sources.registry import source_problems
 from wayside.api import Detector, EventRule
 from wayside.api.detector import Clock

@@ -5,7 +5,7 @@ from __future__ import annotations
 from detector.catalog.catalog import CatalogEntry, Read, entry
 from detector.cluster.connection import connect
 from detector.cluster.errors import ApiError, NoClusterError
-from detector.rules.kubernetes import EVENT_RULES
+from detector.resources.kubernetes import EVENT_RULES
 from wayside.api import API_VERSION, EventRule
 from wayside.api.documents import parse_object
 

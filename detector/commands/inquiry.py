@@ -124,7 +124,7 @@ def _inquire_all(
     if detector is None:
         return [answer.payload for answer in inquire("status", {}, None, None, connect, timeout)], {}
     with importing():
-        from detector.rules.files import load_detectors
+        from detector.resources.files import load_detectors
         from detector.streams.querying import NetworkError, NoAnswerError, query_detectors
         from wayside.api.pod import DetectorMode
 
@@ -210,7 +210,7 @@ def inquire(
 ) -> list[Reply]:
     """Query the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
     with importing():
-        from detector.rules.files import load_rules
+        from detector.resources.files import load_rules
         from detector.streams.querying import query_detectors
         from wayside.api.pod import DetectorMode
         from wayside.api.zenoh import Zenoh, ZenohMode

@@ -18,8 +18,8 @@ from detector.mining.report import REPORT, write_report
 from detector.mining.sources import sampled, sources_of
 from detector.mining.summary import Summary, show, summary_of
 from detector.mining.workers import Pool, Workers
+from detector.resources.files import load_rules
 from detector.results.installed import check_package
-from detector.rules.files import load_rules
 from wayside.commandline import refuse
 
 _WIDTH = 160

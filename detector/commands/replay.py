@@ -28,11 +28,11 @@ from detector.replay.progress import Progress
 from detector.replay.recordings import quick_span_of
 from detector.replay.replaying import Outcome, replay_intake
 from detector.replay.variants import Variant, variants_of, with_variants
+from detector.resources.files import load_rules
+from detector.resources.selection import select
 from detector.results.kinds import Kind
 from detector.results.variants import comparisons, show_variants, write_variants
 from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
-from detector.rules.files import load_rules
-from detector.rules.selection import select
 from detector.topics.doubts import topic_doubts
 from detector.topics.survey import survey
 from wayside.api import ApplicationTask, Detector, EventRule

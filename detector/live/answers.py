@@ -18,7 +18,7 @@ from detector.actions.trigger.requests import RECORDINGS
 from detector.engine.episodes.plain import plain
 from detector.live.evaluator import Evaluator
 from detector.live.outlet import LiveOutlet
-from detector.requested import Requested
+from detector.live.requested import Requested
 from detector.sources.supervision import SourceThread
 from detector.status.model import ActionStatus, CertificateStatus, Drops, Explanation, SourceStatus, Status, to_json
 from wayside.times import format_time

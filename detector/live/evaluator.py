@@ -31,7 +31,7 @@ from detector.findings.losses import Losses
 from detector.live.overload import LONG, Overload
 from detector.live.restoring import Restored
 from detector.plugins.outages import Outages
-from detector.rules.selection import RuleSet
+from detector.resources.selection import RuleSet
 from detector.status.keeping import StatusKeeper
 from detector.streams.codecs.ros import RosTypes
 from wayside.api import EventRule

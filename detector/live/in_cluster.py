@@ -19,7 +19,7 @@ from detector.cluster.connection import connect
 from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
 from detector.live.state import state_file
-from detector.rules.kubernetes import ClusterRules
+from detector.resources.kubernetes import ClusterRules
 from detector.status.server import PagesAddress
 
 Result = TypeVar("Result")

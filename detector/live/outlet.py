@@ -14,8 +14,8 @@ from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.live.event_log import EventLog
+from detector.live.requested import with_requested
 from detector.live.state import StateFile
-from detector.requested import with_requested
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
 from wayside.api import EventRule
 

@@ -23,11 +23,11 @@ from detector.live.answers import Answers
 from detector.live.evaluator import Evaluator, Onlooker
 from detector.live.event_log import EventLog
 from detector.live.outlet import LiveOutlet
+from detector.live.requested import Requested
 from detector.live.restoring import Restored
 from detector.live.state import StateFile
 from detector.plugins.processes import ProcessHost
-from detector.requested import Requested
-from detector.rules.selection import RuleSet
+from detector.resources.selection import RuleSet
 from detector.sources.registry import source_problems
 from detector.sources.supervision import Sources
 from detector.status.pulse import Pulse

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, inlets
 from detector.findings.checks import FIELD_NOT_RECORDED, UNMATCHED_STREAM
-from detector.rules.selection import select
+from detector.resources.selection import select
 from detector.topics.proposal import Proposal
 from detector.topics.shape import Shape
 from detector.topics.survey import Topic, shape_of

@@ -29,7 +29,7 @@ from detector.replay.latched import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import Outcome, Replay
 from detector.replay.routing import Router
-from detector.rules.files import load_rules
+from detector.resources.files import load_rules
 from detector.testing import RefusedError
 from examples.running.scenario import START_NS
 from wayside.api import ApplicationTask, Detector

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from detector.rules.kubernetes import ClusterRules
-from detector.rules.selection import RuleSet
+from detector.resources.kubernetes import ClusterRules
+from detector.resources.selection import RuleSet
 from tests.cluster.api import Api, Object
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane

@@ -17,7 +17,7 @@ from detector.live.restoring import Restored
 from detector.live.running import Running
 from detector.replay.intake_file import read_intake
 from detector.replay.replaying import replay_intake
-from detector.rules.selection import RuleSet
+from detector.resources.selection import RuleSet
 from detector.streams.zenoh import Network
 from tests.driving import SECOND, START, Drive, a_detector, a_rule, a_stream, arrival, at, lines
 from tests.networks import Arrivals, router, session, stream, wait_for

@@ -18,7 +18,7 @@ from detector.actions.deploy.reconciler import DemandReconciler
 from detector.engine.samples.liveliness import LIVELINESS, Token
 from detector.live.restoring import Restored
 from detector.live.running import Running
-from detector.rules.selection import RuleSet
+from detector.resources.selection import RuleSet
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
 from tests.certificates import Authority

@@ -25,7 +25,7 @@ from detector.plugins.processes import ProcessHost
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.replaying import replay_intake
-from detector.rules.selection import RuleSet
+from detector.resources.selection import RuleSet
 from tests.driving import a_detector
 from tests.plugins.rules import plugin_rule, plugins
 from wayside.api import EventRule

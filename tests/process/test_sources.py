@@ -18,7 +18,7 @@ from detector.engine.samples.intake import Intake
 from detector.live.restoring import Restored
 from detector.live.running import Running
 from detector.plugins import entrypoints
-from detector.rules.selection import RuleSet
+from detector.resources.selection import RuleSet
 from detector.sources import Feed, Source
 from detector.sources.registry import OFFERS, source_problems
 from detector.sources.supervision import Sources, SourceThread, State

@@ -12,7 +12,7 @@ from detector.engine.samples.sample import Arrival
 from detector.live.evaluator import Evaluator
 from detector.live.restoring import Restored
 from detector.replay.intake_file import Control
-from detector.rules.selection import RuleSet
+from detector.resources.selection import RuleSet
 from tests.driving import START
 from wayside.api import Detector
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from detector.rules.files import load_rules
+from detector.resources.files import load_rules
 from wayside.api.documents import DocumentError
 
 Write = Callable[..., Path]

@@ -69,7 +69,7 @@ def test_a_models_output_is_a_signal_and_its_sha256_is_in_the_event(tmp_path: Pa
 def test_all_clients_of_a_tick_are_one_batch_and_those_with_an_unknown_input_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from detector.models.loading import ModelFile
+    from detector.onnx.loading import ModelFile
 
     batches: list[int] = []
     original = ModelFile.run_rows

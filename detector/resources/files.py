@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from detector.rules.selection import RuleSet, select
+from detector.resources.selection import RuleSet, select
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, DocumentError, Problem, load_documents
 from wayside.rules import RuleProblem

@@ -8,8 +8,8 @@ import signal
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
-from detector.rules.files import Check, load_rules
-from detector.rules.selection import RuleSet
+from detector.resources.files import Check, load_rules
+from detector.resources.selection import RuleSet
 from wayside.api.documents import DocumentError
 
 _log = logging.getLogger(__name__)

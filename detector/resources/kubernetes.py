@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 from detector.cluster.api import Api, JsonObject, Resource
 from detector.cluster.reflector import Change, Changed, Deleted, Listed, Reflector
-from detector.rules.selection import RuleSet, select
+from detector.resources.selection import RuleSet, select
 from wayside.api import API_VERSION, Detector, EventRule, Kind
 from wayside.api.documents import parse_object
 

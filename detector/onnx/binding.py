@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.models.loading import ModelError, ModelFile, Tensor, load_model
+from detector.onnx.loading import ModelError, ModelFile, Tensor, load_model
 from detector.streams.codecs.tensors import gray, image, points
 from wayside.api.documents import FieldPath
 from wayside.api.model import Channels, Layout, ModelImage, ModelInput, ModelPoints

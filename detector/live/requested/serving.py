@@ -12,8 +12,8 @@ from detector.actions.episode import Outcome, OutcomeState
 from detector.actions.outcomes import Which
 from detector.actions.trigger.requests import RecordingReport, RecordingRequest, read_request, write_reports
 from detector.engine.engine import Engine
-from detector.requested.index import RecordingIndex, RequestedRecording
-from detector.requested.running import REQUESTED, begin, run_of
+from detector.live.requested.index import RecordingIndex, RequestedRecording
+from detector.live.requested.running import REQUESTED, begin, run_of
 
 _log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from detector.actions.outcomes import Which
 from detector.engine.consequences.consequences import Consequences, Run
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import identifier
-from detector.requested.index import RequestedRecording
+from detector.live.requested.index import RequestedRecording
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.names import FLEET, parse_subject
 from wayside.rules.actions import window_of
