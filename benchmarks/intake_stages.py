@@ -15,10 +15,10 @@ from typing import Any
 
 from benchmarks.intake_rate import MARK
 from detector.commands import cli
-from detector.engine.blocks import Blocks
 from detector.engine.buffering.ingest import Ingest
 from detector.engine.engine import Engine
-from detector.engine.knowledge import Knowledge
+from detector.engine.evaluation.blocks import Blocks
+from detector.engine.evaluation.knowledge import Knowledge
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.findings.losses import Losses

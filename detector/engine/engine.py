@@ -18,10 +18,10 @@ from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
-from detector.engine.evaluation import OnDemandResult, RuleRun, same_semantics
-from detector.engine.executor import Executor
-from detector.engine.knowledge import Knowledge
-from detector.engine.observing import Instruments
+from detector.engine.evaluation.executor import Executor
+from detector.engine.evaluation.knowledge import Knowledge
+from detector.engine.evaluation.observing import Instruments
+from detector.engine.evaluation.rule import OnDemandResult, RuleRun, same_semantics
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals

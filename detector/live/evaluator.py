@@ -22,8 +22,8 @@ from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.evaluation import OnDemandResult
-from detector.engine.observing import Observer
+from detector.engine.evaluation.observing import Observer
+from detector.engine.evaluation.rule import OnDemandResult
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.timeline import ORDER

@@ -12,9 +12,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from detector.assembly import RuleIndex, inlets, make_engine
+from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.group import names_of, signals_of
 from detector.engine.engine import Engine
-from detector.engine.timing.ticks import HOUSEKEEPING
 from detector.replay.gathering import Recording
 from detector.replay.mcap_file import mcap_chunks
 from detector.replay.recorded_types import with_recorded_types

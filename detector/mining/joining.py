@@ -14,7 +14,7 @@ from detector.engine.episodes.current import Identity
 from detector.engine.episodes.episodes import Ended, Reason, Started, SubjectState
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.subjects import Subject
-from detector.engine.evaluation import RuleRun
+from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
 from detector.mining.pieces import LOST, Observed, Values
 from detector.mining.work import Job, Mined, RuleCount, holder_of, in_their_order

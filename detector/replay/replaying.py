@@ -18,7 +18,7 @@ from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, from_task, to_task
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
-from detector.engine.observing import Observer
+from detector.engine.evaluation.observing import Observer
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER

@@ -18,7 +18,7 @@ from itertools import islice
 from detector.assembly import Refusal
 from detector.engine.buffering.buffer import NEVER, Lane
 from detector.engine.engine import Engine
-from detector.engine.evaluation import RuleRun
+from detector.engine.evaluation.rule import RuleRun
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.schedule import Schedule
 from detector.findings.losses import Losses

@@ -22,6 +22,9 @@ from detector.engine.samples.sample import SAMPLE_OVERHEAD, Item, Sample
 NEVER = -(2**63)
 """Before all times: nothing has come yet."""
 
+HOUSEKEEPING = 1_000_000_000
+"""Old samples are forgotten this often, in nanoseconds, and there is a tick for it, also without rules."""
+
 _RECEIVED = attrgetter("received")
 
 _SLACK = 64

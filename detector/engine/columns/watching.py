@@ -1,4 +1,4 @@
-"""How old the samples are that rules use: see `detector.engine.ages`, for a whole block."""
+"""How old the samples are that rules use: see `detector.engine.counters.ages`, for a whole block."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.engine.ages import Ages, Use
+from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.table import Integers, Table, Truths
-from detector.engine.timing.ticks import HOUSEKEEPING
+from detector.engine.counters.ages import Ages, Use
 
 _POWERS = 10 ** np.arange(19, dtype=np.int64)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -94,3 +94,12 @@ class Event(msgspec.Struct, frozen=True, gc=False):
             f',"onsetTime":"{format_time(self.onset_time)}","startTime":"{start}"{reason}'
             f',"values":{values}{models}{classification}{dry_run}}}}}'
         )
+
+
+class Happened(NamedTuple):
+    """An event, and where it belongs in the order of all."""
+
+    time: int
+    order: int
+    """The rule's place among the rules."""
+    event: Event

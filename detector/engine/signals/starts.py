@@ -11,12 +11,11 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
-from detector.engine.buffering.buffer import NEVER, Buffer, Lane
+from detector.engine.buffering.buffer import HOUSEKEEPING, NEVER, Buffer, Lane
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.plain import plain, to_text
 from detector.engine.episodes.subjects import FLEET
 from detector.engine.samples.sample import Sample, Stamped
-from detector.engine.timing.ticks import HOUSEKEEPING
 from wayside.rules import CompiledRule, episode_stream
 
 MAXIMUM_BYTES = 64 * 2**20

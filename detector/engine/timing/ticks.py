@@ -5,8 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Collection
 
-HOUSEKEEPING = 1_000_000_000
-"""There is a tick at least this often, in nanoseconds, also without rules: old samples are forgotten at ticks."""
+from detector.engine.buffering.buffer import HOUSEKEEPING
 
 
 class Ticks:

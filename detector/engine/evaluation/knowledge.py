@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from detector.engine.buffering.buffer import Buffer
+from detector.engine.buffering.buffer import HOUSEKEEPING, Buffer
 from detector.engine.buffering.clients import Clients
 from detector.engine.buffering.ingest import Ingest
 from detector.engine.buffering.items import Items
@@ -18,7 +18,7 @@ from detector.engine.buffering.possible import Possible
 from detector.engine.columns.block import Context
 from detector.engine.columns.tables import Tables
 from detector.engine.counters import Counters
-from detector.engine.evaluation import RuleRun
+from detector.engine.evaluation.rule import RuleRun
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.queries.transforms import Transforms, TransformStream
 from detector.engine.samples.sample import Arrival, Decoder, Sample
@@ -26,7 +26,6 @@ from detector.engine.scoping.positions import Positions
 from detector.engine.scoping.scopes import Views
 from detector.engine.signals.signals import Signals
 from detector.engine.signals.starts import Starts
-from detector.engine.timing.ticks import HOUSEKEEPING
 from wayside.api import Detector
 from wayside.api.stream import Encoding, Stream
 from wayside.rules import compile_stream

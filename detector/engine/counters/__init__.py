@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
-from detector.engine.ages import Ages
+from detector.engine.counters.ages import Ages
 from wayside.expressions import Reason
 
 _MAXIMUM_NOTES = 1000

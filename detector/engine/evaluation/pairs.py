@@ -12,10 +12,10 @@ from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.pairs import PairBlock, PairColumns
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
+from detector.engine.episodes.events import Happened
 from detector.engine.episodes.subjects import Subject
-from detector.engine.evaluation import RuleRun
-from detector.engine.happened import Happened
-from detector.engine.observing import Observer
+from detector.engine.evaluation.observing import Observer
+from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
 

@@ -18,7 +18,7 @@ from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject, fits
-from detector.engine.scoping.derived import with_derived
+from detector.engine.evaluation.derived import with_derived
 from detector.engine.scoping.plugins import PluginSignals
 from detector.engine.scoping.scopes import Candidate, Evaluated, Views, candidates, condition
 from detector.engine.scoping.snapshots import signals_read, snapshot

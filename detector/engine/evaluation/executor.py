@@ -7,23 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from detector.engine.blocks import Blocks
+from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.table import LONGEST
 from detector.engine.consequences.consequences import Consequences
-from detector.engine.episodes.events import Event
+from detector.engine.episodes.events import Event, Happened
 from detector.engine.episodes.subjects import Subject
-from detector.engine.evaluation import RuleRun
-from detector.engine.groups import RuleGroup
-from detector.engine.happened import Happened
-from detector.engine.knowledge import Knowledge
-from detector.engine.observing import Instruments
-from detector.engine.pairs import PairGroup
+from detector.engine.evaluation.blocks import Blocks
+from detector.engine.evaluation.groups import RuleGroup
+from detector.engine.evaluation.knowledge import Knowledge
+from detector.engine.evaluation.observing import Instruments
+from detector.engine.evaluation.pairs import PairGroup
+from detector.engine.evaluation.rule import RuleRun
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginSignals
 from detector.engine.signals.starts import Starts
 from detector.engine.timing.schedule import Only, Schedule
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
-from detector.engine.timing.ticks import HOUSEKEEPING, Ticks
+from detector.engine.timing.ticks import Ticks
 from wayside.rules import CompiledRule
 
 

@@ -7,13 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from detector.engine.samples.sample import Sample
-
 OLD = 3
 """Usual periods: a sample that is older shows that its sender fell silent."""
 
 _MANY, _SHARE = 10, 0.1
 """Uses of old samples are reported from this number and share on; a client that leaves always gives a few."""
+
+
+class AgedSample(Protocol):
+    """A sample of a lane."""
+
+    @property
+    def time(self) -> int:
+        """When it came, in nanoseconds."""
 
 
 class AgedLane(Protocol):
@@ -32,7 +38,7 @@ class AgedLane(Protocol):
         """The time of the newest, in nanoseconds."""
 
     @property
-    def samples(self) -> Sequence[Sample]:
+    def samples(self) -> Sequence[AgedSample]:
         """Those that are still there."""
 
 

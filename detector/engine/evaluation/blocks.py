@@ -13,11 +13,11 @@ from detector.engine.columns.block import Context
 from detector.engine.columns.fleets import FleetGroup, fits_fleet
 from detector.engine.columns.group import ClientGroup, fit_signals, fits_clients, signals_of
 from detector.engine.columns.pairs import fits_pairs
-from detector.engine.evaluation import RuleRun
-from detector.engine.groups import RuleGroup
-from detector.engine.happened import Happened
-from detector.engine.observing import Observer
-from detector.engine.pairs import PairGroup
+from detector.engine.episodes.events import Happened
+from detector.engine.evaluation.groups import RuleGroup
+from detector.engine.evaluation.observing import Observer
+from detector.engine.evaluation.pairs import PairGroup
+from detector.engine.evaluation.rule import RuleRun
 from detector.engine.timing.schedule import Only
 from wayside.rules import CompiledRule, episode_stream
 
