@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from detector.catalog.command import command as catalog_command
 from detector.commands import inquiry, recordings
+from detector.commands.catalog.command import command as catalog_command
 from detector.commands.mine_command import mine
 from detector.results.kinds import Kind, chosen
 from wayside import commandline
@@ -253,7 +253,7 @@ def topics(
     if connect and not live:
         refuse("--connect requires --live")
     with importing():
-        from detector.commands.topics import list_live_topics, list_topics
+        from detector.commands.topics.command import list_live_topics, list_topics
 
     if live:
         list_live_topics(connect or (), seconds, as_yaml=as_yaml)

@@ -13,6 +13,8 @@ from rich.console import Console
 from detector.actions.deploy.file_store import write_tasks_yaml
 from detector.actions.tracing import episode_traces
 from detector.assembly import lasting_problems
+from detector.commands.topics.doubts import topic_doubts
+from detector.commands.topics.survey import survey
 from detector.engine.episodes.demands import from_task
 from detector.engine.episodes.events import Event
 from detector.engine.scoping.plugins import PluginHost
@@ -33,8 +35,6 @@ from detector.resources.selection import select
 from detector.results.kinds import Kind
 from detector.results.variants import comparisons, show_variants, write_variants
 from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
-from detector.topics.doubts import topic_doubts
-from detector.topics.survey import survey
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.commandline import refuse

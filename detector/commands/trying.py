@@ -11,15 +11,15 @@ import typer
 from pydantic import ValidationError
 
 from detector.assembly import inlets
+from detector.commands.topics.doubts import fields_of
+from detector.commands.topics.proposal import Proposal, detector_document, proposals
+from detector.commands.topics.survey import survey
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
 from detector.replay.playing import play
 from detector.replay.recorded_types import with_recorded_types
 from detector.results.series import Kind, Series, Trace
 from detector.results.tracing import Tracer
-from detector.topics.doubts import fields_of
-from detector.topics.proposal import Proposal, detector_document, proposals
-from detector.topics.survey import survey
 from wayside.api import Detector, EventRule
 from wayside.api.wording import messages
 from wayside.commandline import refuse

@@ -11,10 +11,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
-from detector.catalog.markdown import markdown_view
-from detector.catalog.page import page
 from detector.cluster.errors import NoClusterError
+from detector.commands.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
+from detector.commands.catalog.markdown import markdown_view
+from detector.commands.catalog.page import page
 from detector.commands.cli import app
 from wayside import commandline
 from wayside.api.classification import Classification

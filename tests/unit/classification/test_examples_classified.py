@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from detector.assembly.checking import findings
-from detector.catalog.catalog import catalog
-from detector.catalog.document import json_view
-from detector.catalog.files import read_files
+from detector.commands.catalog.catalog import catalog
+from detector.commands.catalog.document import json_view
+from detector.commands.catalog.files import read_files
 from tests.guides import ROOT
 from wayside.api.documents import load_documents
 

@@ -14,8 +14,8 @@ from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from detector.commands.cli import app
-from detector.topics.proposal import proposals
-from detector.topics.survey import Topic, encoding_of, shape_of
+from detector.commands.topics.proposal import proposals
+from detector.commands.topics.survey import Topic, encoding_of, shape_of
 from tests.ros_messages import cdr, odometry
 from wayside.api.stream import Encoding
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from detector.assembly import DetectorError, inlets
+from detector.commands.topics.proposal import Proposal, detector_document
+from detector.commands.topics.shape import paths_of
+from detector.commands.topics.survey import shape_of
 from detector.replay.gathering import Recording
 from detector.replay.recorded_types import with_recorded_types
-from detector.topics.proposal import Proposal, detector_document
-from detector.topics.shape import paths_of
-from detector.topics.survey import shape_of
 from wayside.api import Detector
 from wayside.api.stream import Encoding
 from wayside.manifests import to_yaml

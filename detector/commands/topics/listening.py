@@ -7,9 +7,9 @@ import time
 
 import zenoh
 
+from detector.commands.topics.survey import Survey, Topic
 from detector.streams.rmw_zenoh import MisfitError, split
 from detector.streams.session import open_session
-from detector.topics.survey import Survey, Topic
 from wayside.api.stream import Encoding, Layout
 from wayside.api.zenoh import Zenoh
 

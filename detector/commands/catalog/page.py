@@ -11,7 +11,7 @@ import colorsys
 from collections.abc import Iterator, Mapping
 from html import escape
 
-from detector.catalog.catalog import Catalog, CatalogEntry
+from detector.commands.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME, Dimension, Value
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import typer
 
+from detector.commands.topics.listening import listen
+from detector.commands.topics.listing import lines, yaml_of
+from detector.commands.topics.proposal import proposals
+from detector.commands.topics.survey import Survey, survey
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import Recording, intake_file_of, recordings_of
-from detector.topics.listening import listen
-from detector.topics.listing import lines, yaml_of
-from detector.topics.proposal import proposals
-from detector.topics.survey import Survey, survey
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.commandline import refuse
 from wayside.inputerror import InputError

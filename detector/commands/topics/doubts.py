@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, inlets
+from detector.commands.topics.proposal import Proposal
+from detector.commands.topics.shape import Shape
+from detector.commands.topics.survey import Topic, shape_of
 from detector.findings.checks import FIELD_NOT_RECORDED, UNMATCHED_STREAM
 from detector.resources.selection import select
-from detector.topics.proposal import Proposal
-from detector.topics.shape import Shape
-from detector.topics.survey import Topic, shape_of
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.api.stream import Encoding, Stream

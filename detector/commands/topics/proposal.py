@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from detector.topics.survey import Topic, encoding_of, shape_of
+from detector.commands.topics.survey import Topic, encoding_of, shape_of
 from wayside.api.stream import Encoding, Layout
 
 _STALE_S = 5.0

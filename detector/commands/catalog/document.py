@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from detector.catalog.catalog import Catalog, CatalogEntry
+from detector.commands.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME
 
 

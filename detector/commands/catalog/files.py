@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from detector.catalog.catalog import Read, entry
+from detector.commands.catalog.catalog import Read, entry
 from wayside.api import EventRule
 from wayside.api.documents import load_documents
 

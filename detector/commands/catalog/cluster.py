@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from detector.catalog.catalog import CatalogEntry, Read, entry
 from detector.cluster.connection import connect
 from detector.cluster.errors import ApiError, NoClusterError
+from detector.commands.catalog.catalog import CatalogEntry, Read, entry
 from detector.resources.kubernetes import EVENT_RULES
 from wayside.api import API_VERSION, EventRule
 from wayside.api.documents import parse_object

@@ -8,7 +8,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from detector.catalog.catalog import Catalog, CatalogEntry
+from detector.commands.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME
 
 

@@ -12,7 +12,7 @@ from wayside.beginning import importing
 from wayside.commandline import refuse
 
 if TYPE_CHECKING:
-    from detector.catalog.catalog import Catalog, Read
+    from detector.commands.catalog.catalog import Catalog, Read
 
 _WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""
@@ -54,8 +54,8 @@ def command(
     if namespace is not None and not cluster:
         refuse("--namespace requires --cluster; rules in files name their namespace themselves")
     with importing():
-        from detector.catalog.catalog import ChoiceError, catalog, choose
-        from detector.catalog.files import read_files
+        from detector.commands.catalog.catalog import ChoiceError, catalog, choose
+        from detector.commands.catalog.files import read_files
 
     try:
         chosen = choose(only or ())
@@ -76,7 +76,7 @@ def command(
 def _read_cluster(namespace: str | None) -> Read:
     import asyncio
 
-    from detector.catalog.cluster import read_cluster
+    from detector.commands.catalog.cluster import read_cluster
 
     return asyncio.run(read_cluster(namespace))
 
@@ -85,15 +85,15 @@ def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
     """The catalog as it is shown; a table depends on where it goes."""
     match form:
         case Format.MARKDOWN:
-            from detector.catalog.markdown import markdown_view
+            from detector.commands.catalog.markdown import markdown_view
 
             return markdown_view(found)
         case Format.JSON:
-            from detector.catalog.document import json_view
+            from detector.commands.catalog.document import json_view
 
             return json_view(found)
         case Format.HTML:
-            from detector.catalog.page import page
+            from detector.commands.catalog.page import page
 
             return page(found)
         case Format.TABLE:
@@ -103,7 +103,7 @@ def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
 def _table(found: Catalog, *, into_file: bool) -> str:
     from rich.console import Console
 
-    from detector.catalog.terminal import terminal_view
+    from detector.commands.catalog.terminal import terminal_view
 
     console = Console()
     if into_file or not console.is_terminal:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from detector.commands.topics.shape import Shape
 from detector.engine.samples.sample import DecodeError
 from detector.replay.batches import Batch, Channel
 from detector.replay.gathering import Recording
 from detector.replay.message import Cut
 from detector.replay.recordings import open_recordings
 from detector.streams.codecs.cbor import CborDecoder
-from detector.topics.shape import Shape
 from wayside.api.stream import Encoding, Layout
 
 _SAMPLES = 512

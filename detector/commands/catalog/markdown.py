@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
-from detector.catalog.catalog import Catalog, CatalogEntry
+from detector.commands.catalog.catalog import Catalog, CatalogEntry
 from wayside.api.scheme import SCHEME
 
 _MEANINGFUL = re.compile(r"([\\`*_{}\[\]<>()#+!|~])")
