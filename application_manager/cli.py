@@ -316,10 +316,10 @@ def check(
         from application_manager.commands.checking import check_files
         from application_manager.core.findings.checks import CHECKS
         from wayside.api.documents import DocumentError
-        from wayside.findings import UNREADABLE_FILE, ignorable, listed
+        from wayside.findings import UNREADABLE_FILE, check_lines, ignorable
 
     if listing:
-        typer.echo("\n".join(listed(CHECKS)))
+        typer.echo("\n".join(check_lines(CHECKS)))
         raise typer.Exit
     if not files:
         commandline.refuse("give YAML files or folders, or --list")

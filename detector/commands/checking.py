@@ -10,12 +10,12 @@ import typer
 from detector.checking import findings, summary
 from detector.findings import CHECKS, UNREADABLE_RECORDING
 from wayside.api.documents import DocumentError, load_documents
-from wayside.findings import UNREADABLE_FILE, ignorable, listed
+from wayside.findings import UNREADABLE_FILE, check_lines, ignorable
 
 
 def list_checks() -> None:
     """Print the name, severity and meaning of every finding."""
-    for line in listed(CHECKS):
+    for line in check_lines(CHECKS):
         typer.echo(line)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from wayside.rules import Each, Fields
+from wayside.rules import Fields, ItemFields
 
 _FIELDS = 500
 """A map with more different names is a table, not a message: no more of them are noted."""
@@ -54,7 +54,7 @@ class Shape:
         """As for checking paths; None where the values are not maps or lists of maps, or there are too many names."""
         if self.items is not None and self.kinds <= {"list", "null"}:
             known = self.items.known_fields
-            return None if known is None or isinstance(known, Each) else Each(known)
+            return None if known is None or isinstance(known, ItemFields) else ItemFields(known)
         if "map" not in self.kinds or not self.kinds <= {"map", "null"} or len(self.fields) >= _FIELDS:
             return None
         return {name: child.known_fields for name, child in self.fields.items()}
@@ -75,7 +75,7 @@ def paths_of(fields: Fields | None, above: str = "msg", depth: int = 0) -> Itera
     if not fields or depth >= _DEPTH:
         yield above, ""
         return
-    if isinstance(fields, Each):
+    if isinstance(fields, ItemFields):
         above = f"{above}[0]"
     for name, child in fields.items():
         yield from paths_of(child, f"{above}.{name}", depth + 1)

@@ -106,7 +106,7 @@ class PositiveDuration(Duration):
         return parsed
 
 
-class Over(PositiveDuration):
+class WindowLength(PositiveDuration):
     """The length of a window, or `Episode`: from the start of the open episode on."""
 
     pattern = rf"({PositiveDuration.pattern}|Episode)"

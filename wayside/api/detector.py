@@ -21,7 +21,7 @@ from wayside.api.base import (
     validations,
 )
 from wayside.api.constants import Constants
-from wayside.api.database import Database
+from wayside.api.database import DatabaseConnection
 from wayside.api.place import MapFile, Place
 from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
@@ -37,7 +37,7 @@ STALE_AFTER = PositiveDuration("5s")
 """The default of a stream's `staleAfter`: a stream with one sample per second, such as slow CAMs, may miss a few."""
 
 
-class Client(Model):
+class KnownClient(Model):
     """A client that is known in advance."""
 
     name: ClientName = Field(description="The name of the client, as in the keys of the streams.")
@@ -57,7 +57,7 @@ class Client(Model):
     )
 
 
-class Buffer(Model):
+class BufferLimits(Model):
     """The limits of the buffer of all streams."""
 
     duration: PositiveDuration = Field(
@@ -139,7 +139,7 @@ class DetectorSpec(Model):
         description="Sources of streams other than Zenoh.",
         json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
     )
-    clients: list[Client] = Field(
+    clients: list[KnownClient] = Field(
         default_factory=list,
         max_length=1024,
         description="Clients that are known in advance. Other clients appear with their first sample.",
@@ -176,7 +176,7 @@ class DetectorSpec(Model):
         description="Files with more places. Lanelet2 maps, and origin, need the extra maps.",
         json_schema_extra={"x-kubernetes-list-type": "atomic"},
     )
-    buffer: Buffer = Field(default=Buffer(), description="The limits of the buffer of samples.")
+    buffer: BufferLimits = Field(default=BufferLimits(), description="The limits of the buffer of samples.")
     client_timeout: PositiveDuration = Field(
         default=PositiveDuration("30s"),
         description="A client is lost after this time without data: its episodes end with reason ClientLost. The time "
@@ -202,7 +202,7 @@ class DetectorSpec(Model):
     recordings: Recordings | None = Field(
         default=None, description="The storage of record actions. Required by rules that record."
     )
-    database: Database | None = Field(
+    database: DatabaseConnection | None = Field(
         default=None, description="The MongoDB database of database actions. Required by rules that use them."
     )
     rule_selector: LabelSelector = Field(

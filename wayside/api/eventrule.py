@@ -17,8 +17,8 @@ from wayside.api.base import (
     Kind,
     Model,
     ObjectName,
-    Over,
     PositiveDuration,
+    WindowLength,
     conditions_field,
     validations,
 )
@@ -173,7 +173,7 @@ class Signal(Model):
     where: Expression | None = Field(
         default=None, description="CEL over msg, key, sample and parameters. Only samples for which it is true count."
     )
-    over: Over | None = Field(
+    over: WindowLength | None = Field(
         default=None,
         description="The length of the window: at tick t it is (t - over, t]. Required, except with the aggregates "
         "Last, First, Previous, Age and Active. Episode, for a signal with of: the evaluations of the open episode, "

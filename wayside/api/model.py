@@ -66,7 +66,7 @@ class Channels(StrEnum):
     BGR = "Bgr"
 
 
-class Layout(StrEnum):
+class ImageLayout(StrEnum):
     """The order of an image's axes."""
 
     CHW = "Chw"
@@ -84,8 +84,8 @@ class ModelImage(Model):
     channels: Channels = Field(
         default=Channels.RGB, description="The channels of a pixel: Gray, Rgb or Bgr. The image is converted to them."
     )
-    layout: Layout = Field(
-        default=Layout.CHW,
+    layout: ImageLayout = Field(
+        default=ImageLayout.CHW,
         description="The order of the axes. Chw: channels, rows, columns. Hwc: rows, columns, channels.",
     )
     scale: float = Field(
@@ -183,7 +183,7 @@ class ModelInput(Model):
             return (self.window.steps, *several)
         if self.image is not None:
             flat, depth = (self.image.height, self.image.width), self.image.depth
-            return (depth, *flat) if self.image.layout is Layout.CHW else (*flat, depth)
+            return (depth, *flat) if self.image.layout is ImageLayout.CHW else (*flat, depth)
         if self.points is not None:
             return (self.points.count, len(self.points.fields))
         return (len(self.signals),)

@@ -18,7 +18,7 @@ Corner = Annotated[
 """x and y, or latitude and longitude."""
 
 
-class Frame(StrEnum):
+class CoordinateFrame(StrEnum):
     """What the coordinates of places are."""
 
     METRES = "Metres"
@@ -34,8 +34,8 @@ class Place(Model):
     )
 
     name: ClientName = Field(description='The name of the place in expressions, as in at(position, "crossing").')
-    frame: Frame = Field(
-        default=Frame.METRES,
+    frame: CoordinateFrame = Field(
+        default=CoordinateFrame.METRES,
         description="Metres: the points are x and y in the frame of the positions. Wgs84: they are latitude and "
         "longitude in degrees.",
     )

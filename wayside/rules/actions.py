@@ -47,7 +47,7 @@ def compile_actions(
     return [_compiled(compiler, ("spec", "actions", index), action, environment) for index, action in actions]
 
 
-def canonical(value: object) -> str:
+def canonical_json(value: object) -> str:
     """JSON that is the same for the same value."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
@@ -71,7 +71,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
         action.name,
         {name: template for name, template in rendered.items() if template is not None},
         None if window is None else _window(compiler, (*at, action.field), action, window),
-        canonical(action.to_json()),
+        canonical_json(action.to_json()),
     )
 
 

@@ -15,19 +15,19 @@ from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Samples, Signal
 from wayside.api.stream import Stream
 from wayside.expressions import (
+    CelType,
     CompiledTemplate,
     Embedded,
     Environment,
     Expression,
     ExpressionError,
     InterpolationError,
-    Kind,
     Path,
     compile_template,
 )
-from wayside.expressions.expanding import POSITION, Places
+from wayside.expressions.expanding import POSITION, NamedPlaces
 from wayside.geometry import Shape
-from wayside.rules.actions import canonical, compile_actions
+from wayside.rules.actions import canonical_json, compile_actions
 from wayside.rules.compiled import (
     CompiledDeploy,
     CompiledPlugin,
@@ -179,8 +179,8 @@ class _RuleCompiler:
         if signal.stream is None:
             return None  # a model's or a plugin's, or computed from other signals
         stream = self.stream((*at, "stream"), signal.stream)
-        value = self.sample((*at, "value"), signal.value, stream, Kind.DYN, element_of(self.spec))
-        where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL, element_of(self.spec))
+        value = self.sample((*at, "value"), signal.value, stream, CelType.DYN, element_of(self.spec))
+        where = self.sample((*at, "where"), signal.where, stream, CelType.BOOL, element_of(self.spec))
         over = None if signal.over is None else signal.over.ns
         only = None if stream is None or stream.names_by_message else stream.client
         if only is not None and signal.client not in (None, only):
@@ -203,7 +203,7 @@ class _RuleCompiler:
         ends = signal.samples is Samples.ENDS
         value, where = (
             self.sample((*at, field), source, None, kind, element_of(self.spec), of_rule=True)
-            for field, source, kind in (("value", signal.value, Kind.DYN), ("where", signal.where, Kind.BOOL))
+            for field, source, kind in (("value", signal.value, CelType.DYN), ("where", signal.where, CelType.BOOL))
         )
         for field, expression in (("value", value), ("where", where)):
             members = END_MEMBERS if ends else EPISODE_MEMBERS
@@ -232,7 +232,7 @@ class _RuleCompiler:
             for name, value in deploy.parameters.items()
             if deploy.follow
         }
-        source = canonical(deploy.parameters)
+        source = canonical_json(deploy.parameters)
         return CompiledDeploy(
             action,
             deploy.template_name,
@@ -270,7 +270,7 @@ class _RuleCompiler:
         return stream
 
     def condition(
-        self, path: FieldPath, source: str | None, environment: Environment, kind: Kind = Kind.BOOL
+        self, path: FieldPath, source: str | None, environment: Environment, kind: CelType = CelType.BOOL
     ) -> Expression | None:
         """An expression over what a subject is seen as; None where there is none, or it is wrong."""
         expression = self._expression(path, source, environment, kind)
@@ -283,7 +283,7 @@ class _RuleCompiler:
         path: FieldPath,
         source: str | None,
         stream: Stream | None,
-        kind: Kind,
+        kind: CelType,
         element: str | None = None,
         *,
         of_rule: bool = False,
@@ -319,8 +319,8 @@ class _RuleCompiler:
         path: FieldPath,
         source: str | None,
         environment: Environment,
-        kind: Kind,
-        places: Places | None = None,
+        kind: CelType,
+        places: NamedPlaces | None = None,
         whose: str = "",
     ) -> Expression | None:
         """`whose` samples it is over: the stream's name, or `rule`."""
@@ -339,7 +339,7 @@ class _RuleCompiler:
     def _use(self, expression: Expression) -> None:
         self._used.update({shape.name: shape for shape in expression.places})
 
-    def _typed(self, environment: Environment, places: Places | None = None) -> Environment:
+    def _typed(self, environment: Environment, places: NamedPlaces | None = None) -> Environment:
         """The environment, knowing of which kinds the rule's parameters are, and the places; None: of conditions."""
         key = environment, None if places is None else places.stream
         if key not in self._knowing:
@@ -393,7 +393,7 @@ def _digest(written: EventRule, rule: EventRule, detector: Detector, places: Map
         for stream in detector.spec.streams
         if stream.position is not None and any(POSITION in each for each in _of_stream(written, stream.name))
     ]
-    return hashlib.sha256(canonical(decisive).encode()).hexdigest()[:16]
+    return hashlib.sha256(canonical_json(decisive).encode()).hexdigest()[:16]
 
 
 def _of_stream(rule: EventRule, stream: str) -> list[str]:

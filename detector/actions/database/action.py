@@ -24,7 +24,7 @@ from detector.actions.database.work import BATCH_BYTES, BATCH_DOCUMENTS, Write
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from wayside.api.actions.database import Attachments, DatabaseAction
 from wayside.api.base import JsonValue
-from wayside.api.database import Database as Place
+from wayside.api.database import DatabaseConnection as Place
 
 _log = logging.getLogger(__name__)
 

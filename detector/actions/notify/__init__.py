@@ -32,12 +32,12 @@ from wayside.api.actions.notify import Moment
 __all__ = ["Notify"]
 
 
-class Notify(Action[api.Notify]):
+class Notify(Action[api.NotifyAction]):
     """Enqueues notifications. The sender does what takes time: here only the disk blocks."""
 
-    Parameters: ClassVar[type[BaseModel]] = api.Notify
+    Parameters: ClassVar[type[BaseModel]] = api.NotifyAction
 
-    def __init__(self, parameters: api.Notify, setting: Setting) -> None:
+    def __init__(self, parameters: api.NotifyAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._keeping = Keeping(setting)
         name = f"notify {setting.rule.name} {setting.action}"
@@ -79,7 +79,9 @@ class Notify(Action[api.Notify]):
 class _Events:
     """Notifications as CloudEvents."""
 
-    def __init__(self, parameters: api.Notify, setting: Setting, keeping: Keeping, name: str, target: Target) -> None:
+    def __init__(
+        self, parameters: api.NotifyAction, setting: Setting, keeping: Keeping, name: str, target: Target
+    ) -> None:
         self._moments = parameters.moments
         self._queue = EventQueue(parameters, setting, keeping)
 
@@ -117,7 +119,7 @@ class _Alerts:
 
     def __init__(
         self,
-        parameters: api.Notify,
+        parameters: api.NotifyAction,
         alertmanager: api.NotifyAlertmanager,
         setting: Setting,
         keeping: Keeping,
@@ -144,7 +146,7 @@ class _Alerts:
         self._queue.drain()
 
 
-def _target(parameters: api.Notify, setting: Setting, field: str) -> Target:
+def _target(parameters: api.NotifyAction, setting: Setting, field: str) -> Target:
     if parameters.http is not None:
         return HttpTarget(parameters.http, f"{field}.http")
     if parameters.zenoh is not None:

@@ -14,7 +14,7 @@ from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import Notice, Texts
 from detector.actions.notify.outbox import Delivery, Fate
 from detector.actions.notify.targets import Poster
-from wayside.api.actions.notify import Notify, NotifyAlertmanager
+from wayside.api.actions.notify import NotifyAction, NotifyAlertmanager
 
 _PATH = "/api/v2/alerts"
 
@@ -22,7 +22,9 @@ _PATH = "/api/v2/alerts"
 class AlertQueue:
     """Firing and resolved alerts. Guarded by the lock of the sender."""
 
-    def __init__(self, notify: Notify, alertmanager: NotifyAlertmanager, setting: Setting, keeping: Keeping) -> None:
+    def __init__(
+        self, notify: NotifyAction, alertmanager: NotifyAlertmanager, setting: Setting, keeping: Keeping
+    ) -> None:
         self._alerts = Alerts(alertmanager.repeat.seconds, notify.give_up_after.seconds, notify.waiting)
         self._setting = setting
         self._keeping = keeping

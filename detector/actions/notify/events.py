@@ -13,7 +13,7 @@ from detector.actions.notify.ledger import DeliveryLedger
 from detector.actions.notify.notice import Notice, event_of, event_of_group
 from detector.actions.notify.outbox import Budget, Delivery, Fate, Message, Outbox
 from detector.actions.notify.targets import encoded
-from wayside.api.actions.notify import Notify
+from wayside.api.actions.notify import NotifyAction
 
 UNDELIVERED = "the detector stopped, or the action was removed from the rule, before it was delivered"
 FULL = "the queue is full (waiting)"
@@ -22,7 +22,7 @@ FULL = "the queue is full (waiting)"
 class EventQueue:
     """The events of one action, from `add` to delivery. Guarded by the lock of the sender."""
 
-    def __init__(self, notify: Notify, setting: Setting, keeping: Keeping) -> None:
+    def __init__(self, notify: NotifyAction, setting: Setting, keeping: Keeping) -> None:
         rate, grouping = notify.rate, notify.grouping
         budget = None if rate is None else Budget(rate.messages, rate.per.seconds)
         self._outbox = Outbox(notify.waiting, notify.give_up_after.seconds, budget)

@@ -40,12 +40,12 @@ class _Open:
     reported: float
 
 
-class Record(Action[api.Record]):
+class Record(Action[api.RecordAction]):
     """Writes the samples of each episode into a rosbag2 folder with MCAP files."""
 
-    Parameters: ClassVar[type[BaseModel]] = api.Record
+    Parameters: ClassVar[type[BaseModel]] = api.RecordAction
 
-    def __init__(self, parameters: api.Record, setting: Setting) -> None:
+    def __init__(self, parameters: api.RecordAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._open: dict[str, _Open] = {}
         self._flushed = self._expired = -math.inf

@@ -30,7 +30,7 @@ from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.mcap_file import McapFile, SyncError
 from detector.actions.record.stamps import Stamps
 from detector.engine.buffering.lanes import latched_topics
-from wayside.api.actions.record import Record
+from wayside.api.actions.record import RecordAction
 
 
 class _Latched(NamedTuple):
@@ -47,7 +47,7 @@ class Recording:
         self,
         folder: RecordingFolder,
         description: Mapping[str, Any],
-        parameters: Record,
+        parameters: RecordAction,
         surroundings: Surroundings,
         *,
         start: int | None,

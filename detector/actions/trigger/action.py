@@ -43,17 +43,17 @@ _LEAVE = 2.0
 """Seconds at the end for what still is to be stopped."""
 
 
-class Trigger(Action[api.Trigger]):
+class Trigger(Action[api.TriggerAction]):
     """Has another system record as long as an episode lasts."""
 
-    Parameters = api.Trigger
+    Parameters = api.TriggerAction
 
     @classmethod
-    def problems(cls, parameters: api.Trigger, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
+    def problems(cls, parameters: api.TriggerAction, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
         """Services that are not known, and requests that do not fit."""
         return problems(parameters, detector)
 
-    def __init__(self, parameters: api.Trigger, setting: Setting) -> None:
+    def __init__(self, parameters: api.TriggerAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._system = self._make_system()
         self._limits = Limits(
@@ -269,6 +269,6 @@ class Trigger(Action[api.Trigger]):
             self._journal.save([*self._left.values(), *(course.order for course in self._courses.values())])
 
 
-def _digest(parameters: api.Trigger) -> str:
+def _digest(parameters: api.TriggerAction) -> str:
     """Eight hexadecimal digits that distinguish versions of the action."""
     return hashlib.sha256(json.dumps(parameters.to_json(), sort_keys=True).encode()).hexdigest()[:8]

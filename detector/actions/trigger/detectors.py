@@ -16,7 +16,7 @@ from detector.actions.trigger.requests import (
     write_request,
 )
 from detector.streams.answering import status_key
-from wayside.api.actions.trigger import Trigger
+from wayside.api.actions.trigger import TriggerAction
 from wayside.api.actions.window import WindowClients
 from wayside.api.base import Duration
 
@@ -32,7 +32,7 @@ class OtherDetector:
     renew: float | None = _RENEW
     ends_by_itself = True
 
-    def __init__(self, parameters: Trigger, messenger: Messenger) -> None:
+    def __init__(self, parameters: TriggerAction, messenger: Messenger) -> None:
         assert parameters.detector is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.detector
         self._maximum = parameters.maximum_duration

@@ -15,7 +15,7 @@ from yarl import URL
 from detector.actions.base import ActionError
 from detector.actions.http import HttpClient, HttpError, Verdict, judge
 from detector.actions.trigger.orders import Order, Progress, Report, member
-from wayside.api.actions.trigger import HttpCall, Trigger
+from wayside.api.actions.trigger import HttpCall, TriggerAction
 from wayside.names import encode
 
 _GONE = (404, 410)
@@ -28,7 +28,7 @@ class HttpEndpoint:
     renew: float | None = None
     ends_by_itself = False
 
-    def __init__(self, parameters: Trigger, closing: threading.Event) -> None:
+    def __init__(self, parameters: TriggerAction, closing: threading.Event) -> None:
         """Once `closing` is set, a request that is under way is given up; a further one may take its time."""
         assert parameters.http is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.http

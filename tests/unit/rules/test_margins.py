@@ -14,7 +14,7 @@ from detector.results.episodes import Episode
 from detector.results.nearest import nearest
 from detector.results.series import Series, SubjectTrace
 from tests.driving import POSITION, Drive, a_detector, a_rule, at, place, speed
-from wayside.expressions import UNKNOWN, Environment, Kind
+from wayside.expressions import UNKNOWN, CelType, Environment
 from wayside.rules import RuleError, compile_rule
 from wayside.rules.margins import margin_of
 
@@ -48,10 +48,10 @@ def test_a_margin_is_what_rtamt_gives(formula: str, rows: list[tuple[float, floa
     columns = dict(zip(NAMES, map(list, zip(*rows, strict=True)), strict=True))
     expected = [margin for _, margin in reference.evaluate({"time": [*range(len(rows))], **columns})]
     source = margin_of(a_rule(signals=SIGNALS, when=formula, margin=dict.fromkeys(NAMES, 1)).spec)
-    expression = Environment(dict.fromkeys(NAMES, Kind.DYN)).compile(source)
+    expression = Environment(dict.fromkeys(NAMES, CelType.DYN)).compile(source)
     found = [expression.evaluate(dict(zip(NAMES, row, strict=True))) for row in rows]
     assert found == pytest.approx(expected)
-    held = Environment(dict.fromkeys(NAMES, Kind.DYN)).compile(formula)
+    held = Environment(dict.fromkeys(NAMES, CelType.DYN)).compile(formula)
     for margin, row in zip(expected, rows, strict=True):
         if margin:
             assert held.evaluate(dict(zip(NAMES, row, strict=True))) is (margin > 0)
@@ -59,7 +59,7 @@ def test_a_margin_is_what_rtamt_gives(formula: str, rows: list[tuple[float, floa
 
 def test_what_is_unknown_leaves_the_margin_unknown() -> None:
     source = margin_of(a_rule(signals=SIGNALS, when="a > 1 || b > 1", margin={"a": 1, "b": 2}).spec)
-    expression = Environment(dict.fromkeys(NAMES, Kind.DYN)).compile(source)
+    expression = Environment(dict.fromkeys(NAMES, CelType.DYN)).compile(source)
     assert expression.evaluate({"a": 2.0, "b": 7.0}) == 3.0
     assert expression.evaluate_or_unknown({"a": 2.0}) is UNKNOWN
     assert expression.evaluate_or_unknown({"a": 2.0, "b": math.nan}) is UNKNOWN

@@ -114,7 +114,7 @@ class Rate(Model):
     per: PositiveDuration = Field(default=PositiveDuration("1m"), description="The period.")
 
 
-class Notify(Model):
+class NotifyAction(Model):
     """Sends notifications of the rule's episodes."""
 
     model_config = validations(
@@ -162,7 +162,7 @@ class Notify(Model):
     )
 
     @model_validator(mode="after")
-    def _coherent(self) -> Notify:
+    def _coherent(self) -> NotifyAction:
         if sum(getattr(self, kind) is not None for kind in _TARGETS) != 1:
             raise ValueError(_ONE_TARGET)
         if self.alertmanager is not None and (self.grouping is not None or self.events is not None):

@@ -183,7 +183,7 @@ _SYSTEMS = ("detector", "ros2", "http")
 _ONE = f"give exactly one of {', '.join(_SYSTEMS[:-1])} and {_SYSTEMS[-1]}"
 
 
-class Trigger(Model):
+class TriggerAction(Model):
     """Makes another system record, from the start of the episode to its end."""
 
     model_config = validations(
@@ -208,7 +208,7 @@ class Trigger(Model):
     )
 
     @model_validator(mode="after")
-    def _one_system(self) -> Trigger:
+    def _one_system(self) -> TriggerAction:
         if sum(getattr(self, each) is not None for each in _SYSTEMS) != 1:
             raise ValueError(_ONE)
         return self
