@@ -54,7 +54,7 @@ filter.addEventListener("input", () => {{
 """
 
 
-def write_report(folder: Path, summary: Summary) -> None:
+def write_mining_report(folder: Path, summary: Summary) -> None:
     """Write the page beside the dataset that it is about. Raises OSError."""
     brief = (
         f"{summary.recordings_read} recordings, {summary.seconds / 3600:.1f} hours, {summary.samples} samples, "

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from detector.results.actions import Deed, deeds_of
-from detector.results.episodes import Episode
+from detector.results.episodes import EpisodeRow
 from detector.results.places import polygons_of
 from detector.results.result import Result
-from detector.results.series import UNKNOWN, Integers, Kind, Series, SubjectTrace
+from detector.results.series import UNKNOWN, Integers, Series, SeriesKind, SubjectTrace
 from detector.results.thinning import thinned
 from wayside.manifests import to_yaml
 from wayside.times import format_time
@@ -42,10 +42,10 @@ _DEEDS = 2000
 
 def write_report(path: Path, result: Result) -> None:
     """Write the page."""
-    path.write_text(page(data_of(result)), encoding="utf-8")
+    path.write_text(_page(data_of(result)), encoding="utf-8")
 
 
-def page(data: Mapping[str, Any]) -> str:
+def _page(data: Mapping[str, Any]) -> str:
     """The page around the data; the same data gives the same bytes."""
     own = resources.files("detector.results") / "page"
     scripts = resources.files("bokeh") / "server" / "static" / "js"
@@ -87,7 +87,7 @@ def data_of(result: Result) -> dict[str, Any]:
     trace = result.trace
     episodes = result.episodes
     table = _Table(result)
-    by_subject: dict[tuple[str, str], list[Episode]] = {}
+    by_subject: dict[tuple[str, str], list[EpisodeRow]] = {}
     told = {episode.episode for episode in episodes[:_VALUES]}
     for episode in episodes:
         by_subject.setdefault((episode.rule, episode.subject), []).append(episode)
@@ -167,9 +167,9 @@ class _Table:
         if place is None:
             place = self._places[digest] = len(self.entries)
             short = thinned(series, self._begin, self._end, self._buckets, self._exact[digest])
-            used = [*short.texts] if short.kind is Kind.TEXT else None
+            used = [*short.texts] if short.kind is SeriesKind.TEXT else None
             values = [value if math.isfinite(value) else None for value in short.values.tolist()]
-            if short.kind is not Kind.NUMBER:
+            if short.kind is not SeriesKind.NUMBER:
                 values = [None if value is None else int(value) for value in values]
             entry: dict[str, Any] = {"kind": short.kind.value, "t": self.times(short.times), "v": values}
             self.entries.append({**entry, "texts": used} if used is not None else entry)
@@ -216,7 +216,7 @@ def _event_times(result: Result) -> list[Integers]:
 
 
 def _subject(
-    result: Result, subject: SubjectTrace, episodes: Sequence[Episode], table: _Table, told: Set[str]
+    result: Result, subject: SubjectTrace, episodes: Sequence[EpisodeRow], table: _Table, told: Set[str]
 ) -> dict[str, Any]:
     terms = result.terms.get((subject.rule, subject.subject))
     return {
@@ -246,7 +246,7 @@ def _subject(
     }
 
 
-def _values(episode: Episode) -> dict[str, Any]:
+def _values(episode: EpisodeRow) -> dict[str, Any]:
     """Those that the page lists."""
     shown = (".start", ".max")
     values = ((name, value) for name, value in episode.values.items() if name.endswith(shown) and value is not None)
@@ -259,7 +259,7 @@ def _series_of(result: Result, subject: SubjectTrace) -> dict[str, Series]:
     return {**(terms.computed if terms is not None else {}), **subject.signals}
 
 
-def _rule(result: Result, name: str, episodes: Sequence[Episode]) -> dict[str, Any]:
+def _rule(result: Result, name: str, episodes: Sequence[EpisodeRow]) -> dict[str, Any]:
     document, rule = result.documents.get(name), result.rules[name]
     own = [each for each in episodes if each.rule == name]
     evaluations, unknowns, errors = result.counts.get(name, (0, 0, 0))

@@ -26,7 +26,7 @@ _STEADY = 60.0
 """Seconds: a run that lasted this long was a good one, and resets the backoff."""
 
 
-class State(StrEnum):
+class SourceState(StrEnum):
     """Where a source stands."""
 
     RUNNING = "Running"
@@ -53,7 +53,7 @@ class SourceThread:
         """The pauses are in seconds. Raises PluginError, KeyPatternError."""
         self.source = source
         self.streams = streams
-        self.state = State.RUNNING
+        self.state = SourceState.RUNNING
         self.last_error = ""
         self._make: Make = prepare_source(source)
         self._tally = tally
@@ -88,7 +88,7 @@ class SourceThread:
     def _run(self) -> None:
         pause = self._first_pause
         while not self._feed.stopping:
-            self.state = State.RUNNING
+            self.state = SourceState.RUNNING
             began = time.monotonic()
             try:
                 self._make().run(self._feed)
@@ -103,13 +103,13 @@ class SourceThread:
             else:
                 break
         if self._feed.stopping:
-            self.state = State.STOPPED
+            self.state = SourceState.STOPPED
         else:
-            self.state = State.FINISHED
+            self.state = SourceState.FINISHED
             log.info("source %s has ended after %d messages", self.source.name, self.messages)
 
     def _failed(self, error: BaseException, pause: float) -> None:
-        self.state = State.PAUSING
+        self.state = SourceState.PAUSING
         self.last_error = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         self._tally.add(Cause.FAILED, self.source.name, last=self.last_error)
         log.warning("source %s failed; restarting it in %g s: %s", self.source.name, pause, self.last_error)

@@ -8,8 +8,8 @@ from detector.assembly import DetectorError, inlets
 from detector.findings import FIELD_NOT_RECORDED, UNMATCHED_STREAM
 from detector.rules.selection import select
 from detector.topics.proposal import Proposal
-from detector.topics.shape import Shape
-from detector.topics.survey import Topic, shape_of
+from detector.topics.shape import MessageShape
+from detector.topics.survey import Topic, topic_shape
 from wayside.api import Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.api.stream import Encoding, Stream
@@ -80,9 +80,9 @@ def _seen(encoding: Encoding, topics: Sequence[Topic]) -> Fields | None:
     """The fields of JSON and CBOR by the samples of all topics; None where they are not maps."""
     if encoding not in (Encoding.JSON, Encoding.CBOR) or not topics:
         return None
-    whole = Shape()
+    whole = MessageShape()
     for topic in topics:
-        shape = shape_of(topic, encoding)
+        shape = topic_shape(topic, encoding)
         if shape is None:
             return None
         whole.join(shape)

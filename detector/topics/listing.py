@@ -10,8 +10,8 @@ from detector.assembly import DetectorError, inlets
 from detector.replay.gathering import Recording
 from detector.replay.recorded_types import with_recorded_types
 from detector.topics.proposal import Proposal, detector_document
-from detector.topics.shape import paths_of
-from detector.topics.survey import shape_of
+from detector.topics.shape import message_paths
+from detector.topics.survey import topic_shape
 from wayside.api import Detector
 from wayside.api.stream import Encoding
 from wayside.manifests import to_yaml
@@ -44,12 +44,12 @@ def lines(found: Sequence[Proposal], recordings: Sequence[Recording]) -> Iterato
 def _fields(each: Proposal, types: dict[str, Fields]) -> Iterator[tuple[str, str]]:
     found: dict[str, str] = {}
     for topic in each.topics:
-        shape = shape_of(topic, each.encoding)
+        shape = topic_shape(topic, each.encoding)
         found.update(shape.paths() if shape is not None else ())
     if found:
         yield from found.items()
     elif types.get(each.name):
-        yield from paths_of(types[each.name])
+        yield from message_paths(types[each.name])
     elif each.encoding is Encoding.RAW:
         yield "msg", "bytes, for numberAt, utf8 and checksum"
 

@@ -12,14 +12,14 @@ _FIELDS = 500
 _DEPTH = 12
 
 
-class Shape:
+class MessageShape:
     """Values of one place in messages."""
 
     def __init__(self) -> None:
         self.kinds: set[str] = set()
         """`number`, `boolean`, `text`, `bytes`, `list`, `map`, `null`."""
-        self.fields: dict[str, Shape] = {}
-        self.items: Shape | None = None
+        self.fields: dict[str, MessageShape] = {}
+        self.items: MessageShape | None = None
 
     def add(self, value: Any, depth: int = 0) -> None:
         """Look at one more value."""
@@ -33,20 +33,20 @@ class Shape:
                 if known is None:
                     if len(self.fields) >= _FIELDS:
                         continue
-                    known = self.fields[name] = Shape()
+                    known = self.fields[name] = MessageShape()
                 known.add(child, depth + 1)
         elif kind == "list" and value:
-            self.items = self.items or Shape()
+            self.items = self.items or MessageShape()
             for child in (value[0], value[-1]):
                 self.items.add(child, depth + 1)
 
-    def join(self, other: Shape) -> None:
+    def join(self, other: MessageShape) -> None:
         """Take in what another has seen."""
         self.kinds |= other.kinds
         for name, child in other.fields.items():
-            self.fields.setdefault(name, Shape()).join(child)
+            self.fields.setdefault(name, MessageShape()).join(child)
         if other.items is not None:
-            self.items = self.items or Shape()
+            self.items = self.items or MessageShape()
             self.items.join(other.items)
 
     @property
@@ -70,7 +70,7 @@ class Shape:
             yield above, " or ".join(sorted(self.kinds)) + of
 
 
-def paths_of(fields: Fields | None, above: str = "msg", depth: int = 0) -> Iterator[tuple[str, str]]:
+def message_paths(fields: Fields | None, above: str = "msg", depth: int = 0) -> Iterator[tuple[str, str]]:
     """The places of a message whose type is known."""
     if not fields or depth >= _DEPTH:
         yield above, ""
@@ -78,7 +78,7 @@ def paths_of(fields: Fields | None, above: str = "msg", depth: int = 0) -> Itera
     if isinstance(fields, ItemFields):
         above = f"{above}[0]"
     for name, child in fields.items():
-        yield from paths_of(child, f"{above}.{name}", depth + 1)
+        yield from message_paths(child, f"{above}.{name}", depth + 1)
 
 
 def _kind(value: Any) -> str:

@@ -13,7 +13,7 @@ from detector.replay.gathering import Recording
 from detector.replay.message import Cut
 from detector.replay.recordings import open_recordings
 from detector.streams.codecs.cbor import CborDecoder
-from detector.topics.shape import Shape
+from detector.topics.shape import MessageShape
 from wayside.api.stream import Encoding, Layout
 
 _SAMPLES = 512
@@ -110,15 +110,15 @@ def encoding_of(topic: Topic) -> Encoding:
         return Encoding.JSON
     if topic.recorded_as in {each.value for each in Encoding} - {Encoding.RAW.value}:
         return Encoding(topic.recorded_as)
-    return next((each for each in (Encoding.JSON, Encoding.CBOR) if shape_of(topic, each) is not None), Encoding.RAW)
+    return next((each for each in (Encoding.JSON, Encoding.CBOR) if topic_shape(topic, each) is not None), Encoding.RAW)
 
 
-def shape_of(topic: Topic, encoding: Encoding | None = None) -> Shape | None:
+def topic_shape(topic: Topic, encoding: Encoding | None = None) -> MessageShape | None:
     """What its samples look like; None where one is not of that encoding, or it is none of plain values."""
     encoding = encoding or encoding_of(topic)
     if encoding not in (Encoding.JSON, Encoding.CBOR):
         return None
-    shape = Shape()
+    shape = MessageShape()
     for value in _values(topic, encoding):
         if value is _UNREADABLE:
             return None

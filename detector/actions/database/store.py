@@ -41,7 +41,7 @@ Confirm = Callable[[bool, str], None]
 """Called with whether a scenario is complete in the database, and the reason if it is not."""
 
 
-class Store:
+class DatabaseWriter:
     """The queue, and the thread that empties it."""
 
     def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:

@@ -19,11 +19,11 @@ from pydantic import BaseModel
 from detector.actions.base import Action, Setting
 from detector.actions.episode import Completion, Episode
 from detector.actions.notify.alerting import AlertQueue, AlertTarget
-from detector.actions.notify.alerts import Batch
+from detector.actions.notify.alerts import AlertBatch
 from detector.actions.notify.events import EventQueue
 from detector.actions.notify.keeping import Keeping
-from detector.actions.notify.notice import Notice, Texts, texts
-from detector.actions.notify.outbox import Delivery, Message
+from detector.actions.notify.notice import Notice, NoticeTexts, texts
+from detector.actions.notify.outbox import Delivery, OutboxMessage
 from detector.actions.notify.sender import Sender
 from detector.actions.notify.targets import HttpTarget, Target, ZenohTarget
 from wayside.api.actions import notify as api
@@ -85,7 +85,7 @@ class _Events:
         self._moments = parameters.moments
         self._queue = EventQueue(parameters, setting, keeping)
 
-        def send(message: Message, give_up: Callable[[], bool]) -> Delivery:
+        def send(message: OutboxMessage, give_up: Callable[[], bool]) -> Delivery:
             return target.send(message.event, give_up)
 
         self._sender = Sender(name, self._queue, send)
@@ -93,12 +93,12 @@ class _Events:
     def changing(self) -> AbstractContextManager[None]:
         return self._sender.changing()
 
-    def started(self, episode: Episode, rendered: Texts) -> None:
+    def started(self, episode: Episode, rendered: NoticeTexts) -> None:
         self._queue.opened(episode)
         if not episode.resumed:
             self._notify(Moment.STARTED, episode, episode.started, rendered)
 
-    def ended(self, episode: Episode, rendered: Texts) -> None:
+    def ended(self, episode: Episode, rendered: NoticeTexts) -> None:
         if episode.ended is not None:
             self._notify(Moment.ENDED, episode, episode.ended, rendered)
 
@@ -109,7 +109,7 @@ class _Events:
         self._sender.finish()
         self._queue.drain(keep)
 
-    def _notify(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: Texts) -> None:
+    def _notify(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: NoticeTexts) -> None:
         if moment in self._moments:
             self._queue.add(Notice(episode.id, event, rendered, time.time()), time.monotonic())
 
@@ -127,15 +127,15 @@ class _Alerts:
         field: str,
     ) -> None:
         self._queue = AlertQueue(parameters, alertmanager, setting, keeping)
-        self._sender: Sender[Batch] = Sender(name, self._queue, AlertTarget(alertmanager, field).send)
+        self._sender: Sender[AlertBatch] = Sender(name, self._queue, AlertTarget(alertmanager, field).send)
 
     def changing(self) -> AbstractContextManager[None]:
         return self._sender.changing()
 
-    def started(self, episode: Episode, rendered: Texts) -> None:
+    def started(self, episode: Episode, rendered: NoticeTexts) -> None:
         self._queue.opened(episode, rendered)
 
-    def ended(self, episode: Episode, rendered: Texts) -> None:
+    def ended(self, episode: Episode, rendered: NoticeTexts) -> None:
         self._queue.over(episode)
 
     def completed(self, episode: Episode) -> None:

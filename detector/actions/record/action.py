@@ -20,7 +20,7 @@ from detector.actions.record.destination import Destination, Kept, NoRoomError, 
 from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.recording import Recording, reason
 from detector.actions.record.recovery import REASON, recover
-from detector.actions.record.series import Series
+from detector.actions.record.series import RecordedSeries
 from wayside.api.actions import record as api
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ _EXPIRE_SECONDS = 30.0
 class _Open:
     """An episode that is being recorded."""
 
-    series: Series
+    series: RecordedSeries
     episode: Episode
     reported: float
 
@@ -56,7 +56,7 @@ class Record(Action[api.RecordAction]):
         renew = self.parameters.renew_after
         start = None if episode.resumed else episode.onset_time - self.parameters.before.ns
         try:
-            series = Series(
+            series = RecordedSeries(
                 self._begin,
                 self._description(episode, surroundings),
                 start=start,

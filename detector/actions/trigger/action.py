@@ -16,12 +16,12 @@ from typing import Any
 
 from detector.actions.base import Action, ActionError, Setting
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
-from detector.actions.trigger.course import FOREVER, Course, CourseStep, Limits
+from detector.actions.trigger.course import FOREVER, Course, CourseStep, Timeouts
 from detector.actions.trigger.detectors import OtherDetector
 from detector.actions.trigger.endpoints import HttpEndpoint
 from detector.actions.trigger.journal import OrderJournal
 from detector.actions.trigger.orders import Order, Report, System
-from detector.actions.trigger.ros2 import Ros2Services, problems
+from detector.actions.trigger.ros2 import Ros2Services, call_problems
 from wayside.api import Detector
 from wayside.api.actions import trigger as api
 from wayside.api.detector import Clock
@@ -51,12 +51,12 @@ class Trigger(Action[api.TriggerAction]):
     @classmethod
     def problems(cls, parameters: api.TriggerAction, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
         """Services that are not known, and requests that do not fit."""
-        return problems(parameters, detector)
+        return call_problems(parameters, detector)
 
     def __init__(self, parameters: api.TriggerAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._system = self._make_system()
-        self._limits = Limits(
+        self._limits = Timeouts(
             FOREVER if self._system.ends_by_itself else parameters.maximum_duration.seconds,
             parameters.give_up_after.seconds,
             self._system.renew,

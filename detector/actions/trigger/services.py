@@ -46,7 +46,7 @@ _PARSER = (TypesysError, ValueError, TypeError, KeyError, IndexError, AssertionE
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
+class ServiceType:
     """A type of service, e.g. rosbag2_interfaces/srv/Snapshot."""
 
     name: str
@@ -81,7 +81,7 @@ class Service:
 
 
 @lru_cache(maxsize=64)
-def service(name: str, definition: str | None, types: RosTypes) -> Service:
+def service(name: str, definition: str | None, types: RosTypes) -> ServiceType:
     """The service of that type: with the definition where one is given, else as it is known.
 
     Raises ServiceError.
@@ -107,7 +107,7 @@ def service(name: str, definition: str | None, types: RosTypes) -> Service:
             store.register(made)
     except _PARSER as error:
         raise ServiceError(f"cannot use the definition of {name}: {error}") from error
-    return Service(name, store)
+    return ServiceType(name, store)
 
 
 def _parsed(name: str, text: str) -> Typesdict:

@@ -71,7 +71,7 @@ def from_idl(text: str) -> Typesdict:
         raise ValueError(f"not valid IDL: {str(error)[:200]}") from None
 
 
-def merged(definitions: Sequence[Definition]) -> Typesdict:
+def merged_types(definitions: Sequence[Definition]) -> Typesdict:
     """All types that the definitions hold. Raises DefinitionsError, with the problems of all of them."""
     types: Typesdict = {}
     given_in: dict[str, str] = {}

@@ -21,7 +21,7 @@ from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
 from detector.results.episodes import episodes_of
-from detector.results.nearest import nearest
+from detector.results.nearest import nearest_moments
 from detector.results.tracing import Tracer
 from examples.intersection.generator import RED, SECONDS, START_NS, messages, sent
 from tests.guides import ROOT
@@ -414,7 +414,7 @@ def test_the_least_time_to_collision_of_an_episode_is_that_of_numpy(events: list
 def test_the_nearest_that_did_not_happen_are_those_of_numpy(events: list[Event], tracer: Tracer) -> None:
     trace = tracer.trace()
     rules = {name: run.rule for name, run in tracer.engine.rules.items()} if tracer.engine is not None else {}
-    moments = nearest("", rules, trace.subjects, episodes_of("", events, trace))
+    moments = nearest_moments("", rules, trace.subjects, episodes_of("", events, trace))
     braked = {event.subject for event in events if event.rule == "hard-braking"}
     expected = {name: -5 - np.nanmin(acceleration(user)) for name, user in USERS.items() if name not in braked}
     found: dict[str, float] = {}

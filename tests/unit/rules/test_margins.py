@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.results.episodes import Episode
-from detector.results.nearest import nearest
+from detector.results.episodes import EpisodeRow
+from detector.results.nearest import nearest_moments
 from detector.results.series import Series, SubjectTrace
 from tests.driving import POSITION, Drive, a_detector, a_rule, at, place, speed
 from wayside.expressions import UNKNOWN, CelType, Environment
@@ -110,6 +110,6 @@ def test_what_nearly_happened_is_listed_by_margin_without_the_way_into_an_episod
     values = [-5.0, -0.5, -2.0, -4.0, -0.25, 1.0, 2.0, -1.0, -3.0, -1.5, math.nan, -2.0]
     series = Series(np.array([at(second) for second in range(len(values))], np.int64), np.array(values))
     trace = SubjectTrace("r", "car", ("car",), {"margin": series})
-    episode = Episode("", "r", "car", ("car",), None, "e", at(5), at(5), at(7), "Until", False)
-    found = nearest("", {"r": rule}, [trace], [episode])
+    episode = EpisodeRow("", "r", "car", ("car",), None, "e", at(5), at(5), at(7), "Until", False)
+    found = nearest_moments("", {"r": rule}, [trace], [episode])
     assert [(near.time, near.margin) for near in found] == [(at(1), -0.5), (at(9), -1.5), (at(11), -2.0)]
