@@ -50,33 +50,32 @@ def _page(data: Mapping[str, Any]) -> str:
     own = resources.files("detector.results") / "page"
     scripts = resources.files("bokeh") / "server" / "static" / "js"
     packed = gzip.compress(json.dumps(data, separators=(",", ":"), allow_nan=False).encode(), 9, mtime=0)
-    parts = {
-        "title": escape(f"Replay of {data['recording']}"),
-        "style": (own / "report.css").read_text("utf-8"),
-        "body": (own / "report.html").read_text("utf-8"),
-        "data": base64.b64encode(packed).decode(),
-        "bokeh": "\n".join((scripts / name).read_text("utf-8") for name in ("bokeh.min.js", "bokeh-api.min.js")),
-        "script": (own / "report.js").read_text("utf-8"),
-    }
-    return _PAGE.format(**parts)
+    body = (own / "report.html").read_text("utf-8")
+    bokeh = "\n".join((scripts / name).read_text("utf-8") for name in ("bokeh.min.js", "bokeh-api.min.js"))
+    script = (own / "report.js").read_text("utf-8")
+    return html_page(
+        f"Replay of {data['recording']}",
+        f'{body}\n<script type="text/plain" id="data">{base64.b64encode(packed).decode()}</script>\n'
+        f"<script>{bokeh}</script>\n<script>{script}</script>",
+        style=(own / "report.css").read_text("utf-8"),
+        policy="script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; font-src data:",
+    )
 
 
-_PAGE = """<!doctype html>
+def html_page(title: str, body: str, *, style: str, policy: str) -> str:
+    """A page that loads nothing; `policy` is the part of its Content-Security-Policy after `default-src 'none'`."""
+    return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline'; \
-style-src 'unsafe-inline'; img-src data: blob:; font-src data:">
-<title>{title}</title>
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; {policy}">
+<title>{escape(title)}</title>
 <style>{style}</style>
 </head>
 <body>
 {body}
-<script type="text/plain" id="data">{data}</script>
-<script>{bokeh}</script>
-<script>{script}</script>
 </body>
 </html>
 """
