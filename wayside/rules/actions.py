@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Protocol
 
 from wayside.api import Detector
 from wayside.api.actions.action import Action
+from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.window import Window, WindowClients
 from wayside.api.base import JsonValue
 from wayside.api.detector import DetectorSpec
@@ -16,7 +17,6 @@ from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
 from wayside.expressions import CompiledTemplate, Environment
 from wayside.rules.compiled import CompiledAction, CompiledWindow
-from wayside.rules.database import database_problems
 
 
 class Compiler(Protocol):
@@ -64,7 +64,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
         name: compiler.template((*at, *below), {name: value}, environment) for name, value in values.items()
     }  # one by one: what cannot be rendered takes nothing else with it
     if action.database is not None:
-        for path, text in database_problems(action.database, compiler.detector):
+        for path, text in _database_problems(action.database, compiler.detector):
             compiler.problem((*at, *path), text)
     window = action.window
     return CompiledAction(
@@ -117,3 +117,18 @@ def window_of(
 def _of_one(stream: Stream) -> bool:
     """Whether all its samples belong to a client named by the Detector."""
     return stream.client is not None and not stream.names_by_message
+
+
+def _database_problems(action: DatabaseAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
+    """The missing fields; the paths begin at the action."""
+    database = detector.spec.database
+    if database is None:
+        yield (
+            ("database",),
+            f"Detector {detector.name} has no spec.database: add it, e.g. {{uriVariable: MONGODB_URI}}",
+        )
+    elif action.files is not None and database.files is None:
+        yield (
+            ("database", "files"),
+            f"Detector {detector.name} has no spec.database.files: add it with a path, or remove files",
+        )

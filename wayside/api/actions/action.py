@@ -10,11 +10,11 @@ from pydantic import Field, model_validator
 from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.notify import NotifyAction
-from wayside.api.actions.plugin import ActionPlugin
 from wayside.api.actions.record import RecordAction
 from wayside.api.actions.trigger import TriggerAction
 from wayside.api.actions.window import Window
 from wayside.api.base import JsonValue, Model, ObjectName, validations
+from wayside.api.plugin import ActionPlugin
 
 _KINDS = ("deploy", "record", "database", "trigger", "notify", "plugin")
 _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
