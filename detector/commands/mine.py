@@ -172,10 +172,10 @@ class _Bar:
         self._progress.stop()
 
     def expect(self, recordings: int, amount: int) -> None:
-        """See `mining.Watch`."""
+        """See `MiningProgress`."""
         self._progress.update(self._task, total=amount, recordings=recordings)
 
     def done(self, amount: int) -> None:
-        """See `mining.Watch`."""
+        """See `MiningProgress`."""
         self._recordings += 1
         self._progress.update(self._task, advance=amount, done=self._recordings)

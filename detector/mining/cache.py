@@ -23,7 +23,7 @@ class CacheEntry(msgspec.Struct):
     keys: dict[str, str]
     """By rule, its key (see `keys`)."""
     mined: bytes
-    """As `work.mine` gave it."""
+    """As `work.mine_recording` gave it."""
     clips: str | None = None
     """The name of its folder of clips."""
     failed: bool = False

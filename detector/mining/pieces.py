@@ -204,7 +204,7 @@ class _Recorder:
         """Whether there are values that are neither numbers, booleans nor texts."""
 
     def attend(self, engine: Engine) -> None:
-        """See `Onlooker`."""
+        """See `ReplayObserver`."""
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
         """See `Observer`."""
