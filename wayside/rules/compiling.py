@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from wayside.api import Detector, EventRule
-from wayside.api.actions.action import Action
 from wayside.api.base import JsonValue
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Samples, Signal
@@ -27,9 +26,8 @@ from wayside.expressions import (
 )
 from wayside.expressions.expanding import POSITION, NamedPlaces
 from wayside.geometry import Shape
-from wayside.rules.actions import canonical_json, compile_actions
+from wayside.rules.actions import canonical_json, compile_actions, compile_deploys
 from wayside.rules.compiled import (
-    CompiledDeploy,
     CompiledPlugin,
     CompiledRule,
     CompiledSignal,
@@ -128,13 +126,13 @@ class _RuleCompiler:
         for field, condition in (("when", when), ("until", until)):
             for text in () if condition is None else statistics_read(condition, derived):
                 self.problem(("spec", field), text)
-        deploys = [self._deploy(index, action.name, environment) for index, action in self._actions(deploy=True)]
-        actions = compile_actions(self, self._actions(deploy=False), environment)
+        deploys = compile_deploys(self, enumerate(self.spec.actions), environment)
+        actions = compile_actions(self, enumerate(self.spec.actions), environment)
         elements = with_signals(elements, element_of(self.spec), [each for each in signals if each is not None])
         for path, text in element_problems(elements, models):
             self.problem(path, text)
         if subject is not None:
-            templates = [deploy.parameters for deploy in deploys if deploy]
+            templates = [deploy.parameters for deploy in deploys]
             templates += [template for action in actions for template in action.templates.values()]
             embedded = [each.expression for template in templates for each in template.embedded]
             subject = self._closing(subject, (when, until, *(each.of for each in derived), *embedded))
@@ -154,7 +152,7 @@ class _RuleCompiler:
             unknown_timeout_ns=(spec.unknown_timeout or self.detector.spec.client_timeout).ns,
             enabled=spec.enabled,
             dry_run=spec.dry_run,
-            deploys=tuple(deploy for deploy in deploys if deploy is not None),
+            deploys=tuple(deploys),
             actions=tuple(actions),
             classification=None if spec.classification is None else spec.classification.to_json(),
             digest=_digest(self._written, self.rule, self.detector, self._used),
@@ -214,35 +212,6 @@ class _RuleCompiler:
             signal.name, episode_stream(rule, ends=ends), signal.aggregate, value, where, over, self.parameters, rule,
             quantile=signal.quantile, client=signal.client,
         )  # fmt: skip
-
-    def _actions(self, *, deploy: bool) -> list[tuple[int, Action]]:
-        """The actions that deploy, or those that do not, with their places."""
-        return [each for each in enumerate(self.spec.actions) if (each[1].deploy is not None) is deploy]
-
-    def _deploy(self, index: int, action: str, environment: Environment) -> CompiledDeploy | None:
-        deploy = self.spec.actions[index].deploy
-        if deploy is None:
-            return None
-        at: FieldPath = ("spec", "actions", index, "deploy", "parameters")
-        parameters = self.template(at, dict(deploy.parameters), environment)
-        if parameters is None:
-            return None
-        one_by_one = {
-            name: compile_template(value, environment, path=name)
-            for name, value in deploy.parameters.items()
-            if deploy.follow
-        }
-        source = canonical_json(deploy.parameters)
-        return CompiledDeploy(
-            action,
-            deploy.template_name,
-            deploy.priority,
-            source,
-            parameters,
-            deploy.follow,
-            one_by_one,
-            deploy.operation,
-        )
 
     def template(
         self, path: FieldPath, value: Mapping[str, JsonValue], environment: Environment
