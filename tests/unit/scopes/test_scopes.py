@@ -320,7 +320,7 @@ def test_a_signal_over_another_rule_may_pick_the_episodes_of_its_own_element() -
     )
     starts = {
         "name": "starts",
-        "rule": "passed",
+        "ruleName": "passed",
         "where": "msg.element == site.name",
         "over": "9s",
         "aggregate": "Count",
