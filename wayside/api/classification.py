@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import Field, field_validator
 from pydantic.alias_generators import to_snake
 
-from wayside.api.base import Model
+from wayside.api.base import SET_LIST, Model
 from wayside.api.scheme import (
     SCHEME,
     ActingEntity,
@@ -35,7 +35,7 @@ def _dimension(values: type[CharacteristicValue]) -> Any:
         default_factory=list,
         description=_DESCRIPTIONS[values],
         max_length=len(values),
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
 
 

@@ -9,6 +9,8 @@ from pydantic import Field, model_validator
 
 from wayside.api.asn1 import Asn1Module
 from wayside.api.base import (
+    ATOMIC_LIST,
+    SET_LIST,
     ClientName,
     Condition,
     Duration,
@@ -18,6 +20,7 @@ from wayside.api.base import (
     PositiveDuration,
     PositiveQuantity,
     conditions_field,
+    map_list,
     validations,
 )
 from wayside.api.constants import Constants
@@ -130,51 +133,51 @@ class DetectorSpec(Model):
         max_length=64,
         description="The service accounts whose pods may run the detector. Only these accounts get the detector's "
         "permissions. Only with mode Sidecar.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     zenoh: Zenoh = Field(default=Zenoh(), description="The Zenoh session.")
     sources: list[DataSource] = Field(
         default_factory=list,
         max_length=16,
         description="Sources of streams other than Zenoh.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     clients: list[KnownClient] = Field(
         default_factory=list,
         max_length=1024,
         description="Clients that are known in advance. Other clients appear with their first sample.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     streams: list[Stream] = Field(
         min_length=1,
         max_length=128,
         description="The data that the detector receives.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     asn1: list[Asn1Module] = Field(
         default_factory=list,
         max_length=32,
         description="ASN.1 modules for uper streams: for messages that no package defines, such as etsi/cpm, or to "
         "replace the versions of the packages. All modules that they import must be included.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     messages: list[MessageDefinition] = Field(
         default_factory=list,
         max_length=256,
         description="Definitions of ROS 2 message types that the common packages lack or define differently.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     places: list[Place] = Field(
         default_factory=list,
         max_length=512,
         description='The areas, lines and lanes that rules can name, as in at(position, "crossing").',
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     maps: list[MapFile] = Field(
         default_factory=list,
         max_length=16,
         description="Files with more places. Lanelet2 maps, and origin, need the extra maps.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     buffer: BufferLimits = Field(default=BufferLimits(), description="The limits of the buffer of samples.")
     client_timeout: PositiveDuration = Field(

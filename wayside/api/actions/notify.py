@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.actions.http import HttpAccess, HttpUrl, SecretKey
-from wayside.api.base import Duration, Identifier, JsonValue, Model, PositiveDuration, validations
+from wayside.api.base import SET_LIST, Duration, Identifier, JsonValue, Model, PositiveDuration, validations
 
 _TLS_ONCE = "give tls or tlsSecretName, not both"
 _URL_ONCE = "give exactly one of url and urlSecretKeyRef"
@@ -97,7 +97,7 @@ class Grouping(Model):
         max_length=8,
         description="The names of labels. Events with the same values of these labels share a message. Default: all "
         "events of the rule share messages.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     maximum: int = Field(
         default=20,
@@ -132,7 +132,7 @@ class NotifyAction(Model):
         min_length=1,
         max_length=2,
         description="The events that cause a notification. Default: Started and Ended.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     title: Template | None = Field(
         default=None, description="The title of the message, with ${…}; the summary of an alert."
